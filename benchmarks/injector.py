@@ -23,7 +23,7 @@ import numpy as np
 
 from mavfi_cli.attack.campaign import Plan, TargetRuns, run_campaign
 from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.program import OutputComparison, ProgramTarget, Workplace
+from mavfi_cli.attack.program import OutputComparison, ProgramTarget
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
@@ -79,7 +79,7 @@ def milliseconds(seconds: list[float]) -> str:
 
 def seconds_per_hit(program: Path, mechanism: Mechanism) -> float:
     """Slope of the time to reach the k-th execution, over k."""
-    place = Workplace(target_of(program, 3000, mechanism))
+    place = target_of(program, 3000, mechanism).open()
     counts, took = [1, 500, 1000, 2000], []
     for count in counts:
         best = np.inf
@@ -99,7 +99,7 @@ def seconds_per_hit(program: Path, mechanism: Mechanism) -> float:
 
 def starts(program: Path, runs: int = 40) -> tuple[list[float], list[float]]:
     """Times to start a program traced, at its entry point, and to run it plainly."""
-    place = Workplace(target_of(program, 50))
+    place = target_of(program, 50).open()
     traced, plain = [], []
     for _ in range(runs):
         start = time.perf_counter()

@@ -37,19 +37,19 @@ from mavfi_cli.attack.campaign import Plan, Record, completed, one_processor, ru
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
-from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import (
     CountedStop,
     FaultModel,
+    InstructionCorruption,
     InstructionFault,
     Role,
     Site,
-    explicit_corruption,
+    strategy,
 )
-from mavfi_cli.fi.tracer.sampling import strategy
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
@@ -94,7 +94,7 @@ def exact_stops(faults: int, rng: np.random.Generator) -> tuple[int, int]:
         subprocess.run([compiler, "-O1", "-o", str(program), str(source)], check=True)
         command = Program.of([str(program)])
         target = ProgramTarget(command=command, comparison=OutputComparison(), function="take")
-        with one_processor(), closing(Workplace(target)) as place:
+        with one_processor(), closing(target.open()) as place:
             attacker = Attacker(place=place, golden=golden_run(place))
             fault = taken_fault(place.profile(rng, windows=1))
             met = 0
@@ -120,7 +120,13 @@ def taken_fault(profile: TargetProfile):
             execution=execution,
             instruction=instruction.text,
             instruction_bytes=instruction.raw,
-            corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+            corruption=InstructionCorruption(
+                site=Site.GENERAL,
+                role=Role.DESTINATION,
+                register="r10",
+                operand="r10",
+                bits=(bit,),
+            ),
         )
 
     return fault

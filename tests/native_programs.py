@@ -257,3 +257,14 @@ def start(native_program, tmp_path):
     yield begin
     for tracee in tracees:
         tracee.kill()
+
+
+def register_corruption(register, bit, role=None):
+    """The corruption of one bit of a general register or the flags."""
+    from mavfi_cli.fi.tracer.arch import register_kind
+    from mavfi_cli.fi.tracer.fault import InstructionCorruption, Role, Site
+
+    return InstructionCorruption(
+        site=Site(register_kind(register)), role=role or Role.SOURCE, register=register,
+        operand=register, bits=(bit,),
+    )  # fmt: skip

@@ -27,7 +27,6 @@ UNCALLED = {
     "format_options": "click calls it",
     "checkMotion": "OMPL calls it",
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
-    "explicit_corruption": "for faults that are written by hand; the tests of the tracer do",
     "occupied_voxels": "what a map holds, for tests of the map",
     "capturing": "what a camera does, for tests of the camera",
 }

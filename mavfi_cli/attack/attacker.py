@@ -17,11 +17,10 @@ from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
-from mavfi_cli.fi.tracer.sampling import Rule, Strategy
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 GOLDEN_RUNS = 3

@@ -32,8 +32,7 @@ from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, TargetPro
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault
-from mavfi_cli.fi.tracer.sampling import Rule, Strategy, strategy
+from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy, strategy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -168,12 +168,12 @@ class ProgramTarget:
             folder=None if plan["folder"] is None else Path(plan["folder"]),
         )
 
-    def open(self) -> Workplace:
+    def open(self) -> _Workplace:
         """Make a scratch folder for its runs."""
-        return Workplace(self)
+        return _Workplace(self)
 
 
-class Workplace:
+class _Workplace:
     """A scratch folder of one worker, with a folder in which the program runs, new for every run.
 
     Nothing outside it is ever removed.

@@ -17,9 +17,9 @@ import numpy as np
 from mavfi_cli.attack.difference import Difference
 from mavfi_cli.attack.outcome import RunOutcome, Window
 from mavfi_cli.fi.tracer.counted import CountedRun
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
-from mavfi_cli.fi.tracer.sampling import Strategy, Stratum, draw_fault
+from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 from mavfi_cli.stats.clusters import Total, estimated_total
 

@@ -23,7 +23,7 @@ from mavfi_cli.fi.source.fault import (
 from mavfi_cli.spec.platform import KERNELS
 
 if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.sampling import Strategy
+    from mavfi_cli.fi.tracer.fault import Strategy
 
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
@@ -270,8 +270,7 @@ class InstructionConfig:
             UnknownName: A name does not exist.
             FaultSpecError: The rule is not repeatable.
         """
-        from mavfi_cli.fi.tracer.fault import FaultModel
-        from mavfi_cli.fi.tracer.sampling import Rule, strategy
+        from mavfi_cli.fi.tracer.fault import FaultModel, Rule, strategy
 
         model = FaultModel.named(
             sites=self.sites, roles=self.roles, field=self.field, bits=self.bits

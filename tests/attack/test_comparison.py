@@ -12,7 +12,6 @@ from mavfi_cli.attack.comparison import OutputComparison, magnitude
 from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.program import (
     ProgramTarget,
-    Workplace,
     absolute_arguments,
 )
 from mavfi_cli.cli.kernels import kernels
@@ -201,7 +200,7 @@ def test_standard_input_reaches_the_program(native_program, tmp_path):
     given = tmp_path / "given.txt"
     given.write_text("21\n")
     program = Program.of([str(native_program("writing")), "o"], stdin=given)
-    where = Workplace(ProgramTarget(command=program, comparison=OutputComparison.of(["file:o"])))
+    where = ProgramTarget(command=program, comparison=OutputComparison.of(["file:o"])).open()
     assert golden_run(where).output == b"21 42\n"
     where.close()
 

@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from native_programs import register_corruption
 
 from mavfi_cli.attack.attacker import attack_live
 from mavfi_cli.attack.profile import profile_call, profile_calls
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux, record, tracee
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, strategy
 from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping, scope_of
 from mavfi_cli.fi.tracer.inject import BitActivation
-from mavfi_cli.fi.tracer.sampling import strategy
 from mavfi_cli.fi.tracer.thread import EntryCounter
 from mavfi_cli.fi.tracer.tracee import Tracee
 
@@ -237,7 +237,7 @@ def test_a_fault_hits_exactly_its_invocation(profiled, node, tmp_path):
         execution=1,
         instruction=first.text,
         instruction_bytes=first.raw,
-        corruption=explicit_corruption("rsi", 0, Role.SOURCE),  # n: 3 becomes 2
+        corruption=register_corruption("rsi", 0, Role.SOURCE),  # n: 3 becomes 2
     )
     path = tmp_path / "fault.json"
     tracer = Tracer(attack_live, node.pid, fault, path=path, kernel="test")
@@ -271,7 +271,7 @@ def test_drawn_faults_repeat_in_the_node(profiled, node, tmp_path):
 
 def test_a_node_that_crashes_is_reported(profiled, node, tmp_path):
     fault = profiled.draw(strategy("instruction-uniform"), np.random.default_rng(0))
-    wild = replace(fault, corruption=explicit_corruption("rip", 45, Role.DESTINATION))
+    wild = replace(fault, corruption=register_corruption("rip", 45, Role.DESTINATION))
     tracer = Tracer(attack_live, node.pid, wild, path=tmp_path / "fault.json")
     node.stdin.write("1 2 3\n")
     node.stdin.flush()
@@ -313,7 +313,7 @@ def test_a_kernel_without_a_file_is_a_region(library, compiled_nodes, tmp_path):
             execution=1,
             instruction=first.text,
             instruction_bytes=first.raw,
-            corruption=explicit_corruption("rsi", 0, Role.SOURCE),
+            corruption=register_corruption("rsi", 0, Role.SOURCE),
         )
         path = tmp_path / "fault.json"
         tracer = Tracer(attack_live, process.pid, fault, path=path, regions=regions)

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from native_programs import register_corruption
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.journal import read_runs
 from mavfi_cli.attack.outcome import RunOutcome, Struck, shares
-from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import RunLimits, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
@@ -32,7 +33,6 @@ from mavfi_cli.fi.tracer.fault import (
     InstructionFault,
     Role,
     Site,
-    explicit_corruption,
 )
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
@@ -66,7 +66,7 @@ def workplace():
     places = []
 
     def make(target):
-        places.append(Workplace(target))
+        places.append(target.open())
         return places[-1]
 
     yield make
@@ -91,7 +91,7 @@ def victim_fault(place, target, bit):
         execution=1,
         instruction=instruction.text,
         instruction_bytes=instruction.raw,
-        corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+        corruption=register_corruption("r10", bit, Role.DESTINATION),
     )
 
 
@@ -263,7 +263,7 @@ def test_a_program_that_does_not_repeat_itself_is_refused(tmp_path, native_progr
     script = tmp_path / "random"
     script.write_text("od -An -N8 -tx8 /dev/urandom\n")
     program = ProgramTarget(command=Program.of(["sh", str(script)]), comparison=OutputComparison())
-    place = Workplace(program)
+    place = program.open()
     with pytest.raises(TargetError, match="fault-free runs differ"):
         golden_run(place)
     place.close()

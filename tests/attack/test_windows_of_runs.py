@@ -8,10 +8,10 @@ import pytest
 
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.profile import function_of, profile_calls, profile_run, started
-from mavfi_cli.attack.program import ProgramTarget, Workplace
+from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError, UnknownName
-from mavfi_cli.fi.tracer.fault import FaultModel, Site
-from mavfi_cli.fi.tracer.sampling import WindowTooLong, record_window, strategy
+from mavfi_cli.fi.tracer.fault import FaultModel, Site, strategy
+from mavfi_cli.fi.tracer.sampling import WindowTooLong, record_window
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
 
@@ -49,7 +49,7 @@ def place(native_program):
     def make(name, *arguments, **options):
         command = Program.of([str(native_program(name)), *arguments])
         target = ProgramTarget(command=command, comparison=OutputComparison(), **options)
-        places.append(Workplace(target))
+        places.append(target.open())
         return places[-1]
 
     yield make

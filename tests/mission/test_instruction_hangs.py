@@ -5,6 +5,7 @@ import os
 
 import pytest
 from missions import POSTS
+from native_programs import register_corruption
 
 from mavfi_cli.attack.kernels.scope import kernel_scope
 from mavfi_cli.autonomy.warm import warm_up
@@ -12,7 +13,7 @@ from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED, decode
 from mavfi_cli.fi.tracer.doctor import check_tracing
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
@@ -60,7 +61,7 @@ def endless(world_to_search):
         execution=EXECUTION,
         instruction=found.text,
         instruction_bytes=found.raw,
-        corruption=explicit_corruption(register, 49, Role.DESTINATION),
+        corruption=register_corruption(register, 49, Role.DESTINATION),
     )
     return records.planned(
         fault, image, node_invocation=world_to_search[1], scope=[], **SEARCHES, **UNKNOWN

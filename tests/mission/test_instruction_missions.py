@@ -21,7 +21,7 @@ from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, Unk
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
-from mavfi_cli.fi.tracer.sampling import Rule
+from mavfi_cli.fi.tracer.fault import Rule
 from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup

@@ -1,18 +1,26 @@
-"""Instruction-level faults, fully resolved: trigger and corruption, and how they are drawn."""
+"""Instruction-level faults, fully resolved, and the strategies by which they are drawn.
+
+Every result names its strategy: a sampling rule with a fault model, or another injector that is
+imitated so that published numbers can be compared. The released sources are the reference: ROSFI as
+in MAVBench/MAV_apps, branch mavfi, and PINFI as in DependableSystemsLab/pinfi, e14c129.
+docs/reference/instructions.md says what they do and where we differ.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import BitOutsideWidth, FaultError, named_member
+from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.tracer.arch import (
+    JUMP_FLAGS,
     TRAITS,
     Detour,
     Instruction,
@@ -147,29 +155,6 @@ def draw_corruption(
     return replace(operand, bits=tuple(sorted(available[int(index)] for index in picked)))
 
 
-def site_of(register: str) -> Site:
-    """The site that a full register is."""
-    return Site(register_kind(register))
-
-
-def explicit_corruption(register: str, bit: int, role: Role = Role.SOURCE) -> InstructionCorruption:
-    """Make the corruption that the user names.
-
-    Raises:
-        FaultError: no such register.
-        BitOutsideWidth: the register has no such bit.
-    """
-    try:
-        width = width_of(register)
-    except KeyError:
-        raise FaultError(f"no register {register!r} on this processor") from None
-    if not 0 <= bit < width:
-        raise BitOutsideWidth(bit, register, width)
-    return InstructionCorruption(
-        site=site_of(register), role=role, register=register, operand=register, bits=(bit,)
-    )
-
-
 def _operands(instruction: Instruction, model: FaultModel) -> list[_Operand]:
     found: list[_Operand] = []
     for role, uses in ((Role.SOURCE, instruction.reads), (Role.DESTINATION, instruction.writes)):
@@ -196,7 +181,7 @@ def _registers(
 ) -> list[_Operand]:
     merged: dict[str, _Operand] = {}
     for use in uses:
-        site = site_of(use.register)
+        site = _site_of(use.register)
         if not (use.mask and site in model.sites and (use.explicit or model.implicit)):
             continue
         mask, name = use.mask & _field_mask(instruction, model, role, site), use.operand
@@ -240,3 +225,182 @@ def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
         mask = (1 << 8 * len(instruction.raw)) - 1
         found.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
     return found
+
+
+def _site_of(register: str) -> Site:
+    """The site that a full register is."""
+    return Site(register_kind(register))
+
+
+# -- strategies
+
+
+Draw = Callable[
+    [Instruction, Instruction | None, np.random.Generator], InstructionCorruption | None
+]
+
+
+class Rule(Enum):
+    """How the moment of a fault is drawn."""
+
+    INSTRUCTION = "instruction-uniform"  # every executed instruction in scope is equally likely
+    CPU_TIME = "cpu-time"  # a moment of the CPU time of the fault-free run
+    WALL_CLOCK = "wall-clock"  # a moment of the duration of the fault-free run
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Strategy:
+    """A sampling rule with its peculiarities."""
+
+    name: str
+    rule: Rule
+    model: FaultModel
+    imitates: Draw | None = None  # another injector, instead of the model
+    attempts: int = 1  # time rules: how many moments are tried
+    retry_s: float = 0.0  # time rules: how much later
+    whole_process: bool = False  # hits code out of scope as well
+    in_system_calls: bool = False  # hits a thread that waits in the operating system as well
+
+    def draw_at(
+        self,
+        instruction: Instruction,
+        rng: np.random.Generator,
+        following: Instruction | None = None,
+    ) -> InstructionCorruption | None:
+        """Draw a corruption of an instruction, given the next one; None gives it up."""
+        if self.imitates is not None:
+            return self.imitates(instruction, following, rng)
+        return draw_corruption(instruction, self.model, rng)
+
+
+def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
+    """The strategy of a sampling rule, or of another injector that is imitated.
+
+    Raises:
+        UnknownName: no such rule or compatibility mode; names the nearest.
+        FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
+    """
+    if compat is not None:
+        if compat not in _COMPAT:
+            raise UnknownName("compatibility mode", compat, _COMPAT)
+        if model not in (None, FaultModel()):
+            raise FaultSpecError(f"{compat} chooses sites, roles, field and bits by its own rule")
+        return _COMPAT[compat]
+    rule = named_member(Rule, "sampling rule", name)
+    return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
+
+
+# -- other injectors
+
+_ROSFI_MODEL = FaultModel(sites=frozenset((Site.GENERAL, Site.VECTOR)))
+# ROSFI refuses these registers, so that r8 to r13 and XMM get nearly all faults (regManip.cpp,
+# rosfi.cpp).
+_ROSFI_REFUSED = frozenset(
+    "rip rax rbx rcx rdx rsi rdi rbp rsp r14 r15 esi edi eax ecx edx bl cl dl".split()  # noqa: SIM905
+)
+_PINFI_MODEL = FaultModel(roles=frozenset((Role.DESTINATION,)))
+_FLAGS_WIDTH = 64
+_VECTOR = re.compile(r"([xyz])mm\d*(\d)$")
+
+
+def _draw_rosfi(
+    instruction: Instruction, _following: Instruction | None, rng: np.random.Generator
+) -> InstructionCorruption | None:
+    """ROSFI: moves bits 52 to 62 (110 to 126 of XMM) to byte 0, and refuses most registers."""
+    drawn = draw_corruption(instruction, _ROSFI_MODEL, rng)
+    if drawn is None or drawn.operand in _ROSFI_REFUSED:
+        return None
+    wide = drawn.site is Site.VECTOR
+    bit = int(rng.integers(110, 127) if wide else rng.integers(52, 63))
+    return replace(drawn, bits=(bit % 8,))
+
+
+def _draw_pinfi(
+    instruction: Instruction, following: Instruction | None, rng: np.random.Generator
+) -> InstructionCorruption | None:
+    """PINFI: one bit of a register that the instruction writes, after it has executed.
+
+    The flags are struck only where no other register is written: to invert the conditional jump
+    that follows, or else as 64 bits, most of which are no flag and change nothing. Without such a
+    jump, an instruction that also writes memory has a bit of its memory operand struck before it
+    executes.
+    """
+    written = [use for use in instruction.writes if use.mask]
+    if instruction.branches or not written:
+        return None
+    registers = [use for use in written if _site_of(use.register) is not Site.FLAGS]
+    if registers:
+        return _register_bit(registers[int(rng.integers(len(registers)))], rng)
+    if following is not None and following.mnemonic in JUMP_FLAGS:
+        return _inverted_jump(following.mnemonic)
+    for index, use in enumerate(instruction.memory):
+        if use.writes:
+            bit = int(rng.integers(8 * use.size))
+            return InstructionCorruption(
+                site=Site.MEMORY, role=Role.SOURCE, register="", operand=use.operand,
+                bits=(bit,), memory_operand=index,
+            )  # fmt: skip
+    bit = int(rng.integers(_FLAGS_WIDTH))
+    return _flags((bit,) if bit in bits.bits_of(TRAITS.flags) else ())
+
+
+def _draw_pinfi_with_bugs(
+    instruction: Instruction, following: Instruction | None, rng: np.random.Generator
+) -> InstructionCorruption | None:
+    """PINFI with its bugs: it numbers a vector register by the last digit of its name.
+
+    So xmm10 to xmm15 are taken for xmm0 to xmm5. A bit of a YMM register is sought in its upper
+    half.
+    """
+    drawn = _draw_pinfi(instruction, following, rng)
+    if drawn is None or (match := _VECTOR.match(drawn.operand)) is None:
+        return drawn
+    upper = tuple(128 + bit for bit in drawn.bits) if match[1] == "y" else drawn.bits
+    return replace(drawn, register=f"{drawn.register[:3]}{match[2]}", bits=upper)
+
+
+def _register_bit(use: RegisterUse, rng: np.random.Generator) -> InstructionCorruption:
+    site = _site_of(use.register)
+    available = range(64) if site is Site.VECTOR else bits.bits_of(use.mask)
+    bit = int(available[int(rng.integers(len(available)))])
+    return InstructionCorruption(
+        site=site, role=Role.DESTINATION, register=use.register, operand=use.operand, bits=(bit,)
+    )
+
+
+def _inverted_jump(jump: str) -> InstructionCorruption:
+    tested = JUMP_FLAGS[jump]
+    return replace(_flags(tested), inverts=jump if len(tested) > 1 else "")
+
+
+def _flags(struck: tuple[int, ...]) -> InstructionCorruption:
+    name = TRAITS.flags_register
+    return InstructionCorruption(
+        site=Site.FLAGS, role=Role.DESTINATION, register=name, operand=name, bits=struck
+    )
+
+
+_COMPAT = {
+    "rosfi-2021": Strategy(
+        name="rosfi-2021 (wall-clock, low byte only, most registers refused)",
+        rule=Rule.WALL_CLOCK,
+        model=_ROSFI_MODEL,
+        imitates=_draw_rosfi,
+        attempts=100,
+        retry_s=500e-6,
+        whole_process=True,
+        in_system_calls=True,
+    ),
+    "pinfi": Strategy(
+        name="pinfi (instruction-uniform, one register that is written)",
+        rule=Rule.INSTRUCTION,
+        model=_PINFI_MODEL,
+        imitates=_draw_pinfi,
+    ),
+    "pinfi-bugs": Strategy(
+        name="pinfi-bugs (as pinfi, xmm10 to xmm15 taken for xmm0 to xmm5)",
+        rule=Rule.INSTRUCTION,
+        model=_PINFI_MODEL,
+        imitates=_draw_pinfi_with_bugs,
+    ),
+}

@@ -43,7 +43,7 @@ class Function(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ElfFacts:
+class _ElfFacts:
     """Build id, code and functions of one ELF file."""
 
     path: str
@@ -82,7 +82,7 @@ class ElfFacts:
 
 
 @functools.lru_cache(maxsize=256)
-def _elf_facts(path: str, _modified_ns: int) -> ElfFacts:
+def _elf_facts(path: str, _modified_ns: int) -> _ElfFacts:
     """Read an ELF file; the hash of its contents replaces a missing build id.
 
     Raises:
@@ -99,7 +99,7 @@ def _elf_facts(path: str, _modified_ns: int) -> ElfFacts:
         raise FaultError(f"{path}: not a readable ELF object ({error})") from None
     if not build_id:
         build_id = "sha256:" + hashlib.sha256(Path(path).read_bytes()).hexdigest()[:40]
-    return ElfFacts(path=path, build_id=build_id, text=text, first_segment=first)
+    return _ElfFacts(path=path, build_id=build_id, text=text, first_segment=first)
 
 
 def _build_id(elf: Any) -> str:
@@ -171,7 +171,7 @@ class _LoadedObject:
     """An ELF object or a named region in a process."""
 
     name: str
-    facts: ElfFacts | None  # None for a region
+    facts: _ElfFacts | None  # None for a region
     bias: int  # address = bias + offset
     start: int
     end: int

@@ -91,7 +91,9 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
     return result
 
 
-def apply(tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption) -> Injection:
+def _apply(
+    tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
+) -> Injection:
     """Invert the bits at the stop in front of `instruction`.
 
     A destination is corrupted after the instruction has executed. The result is read back: a
@@ -166,7 +168,7 @@ def _number(data: bytes) -> int:
     return int.from_bytes(data, "little")
 
 
-def follow(
+def _follow(
     tracee: Tracee,
     instruction: Instruction,
     corruption: InstructionCorruption,
@@ -215,9 +217,9 @@ def strike(
         raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
     if fault.corruption is None:
         return None, NOTHING
-    injection = apply(tracee, instruction, fault.corruption)
+    injection = _apply(tracee, instruction, fault.corruption)
     steps = window if tracee.ended is None else 0
-    return injection, follow(tracee, instruction, fault.corruption, injection, window=steps)
+    return injection, _follow(tracee, instruction, fault.corruption, injection, window=steps)
 
 
 def _touch(

@@ -1,6 +1,6 @@
-"""The population from which a fault is drawn: sampling rules, and windows of executed instructions.
+"""The population from which a fault is drawn: windows of executed instructions.
 
-Every result names its rule. A window of the golden run is single-stepped and the address of each
+A window of the golden run is single-stepped and the address of each
 instruction in scope is recorded, so that sampling can be uniform over them. Code out of scope runs
 natively. Meanwhile every byte of the code in scope is a breakpoint instruction, so that no way back
 in (return, callback, exception) is missed.
@@ -11,44 +11,23 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import (
-    FaultError,
-    FaultSpecError,
-    TargetError,
-    UnknownName,
-    named_member,
-)
+from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.arch import (
     TRAITS,
     Detour,
-    Instruction,
     decode,
     record_steps,
     return_address,
 )
 from mavfi_cli.fi.tracer.arch.interface import StepEnd
-from mavfi_cli.fi.tracer.compat import (
-    PINFI_MODEL,
-    ROSFI_MODEL,
-    draw_pinfi,
-    draw_pinfi_with_bugs,
-    draw_rosfi,
-)
 from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, Locate, detour_at
-from mavfi_cli.fi.tracer.fault import (
-    CountedStop,
-    FaultModel,
-    InstructionCorruption,
-    InstructionFault,
-    draw_corruption,
-)
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Ended, Tracee
@@ -110,7 +89,7 @@ class Stratum:
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
         """The trigger of one executed instruction, and k, the number of its execution."""
-        return plan_trigger(*self._at(position), locate, code_at)
+        return _plan_trigger(*self._at(position), locate, code_at)
 
     def _at(self, position: int) -> tuple[Segment, int]:
         """The segment and index of one executed instruction, counted over all segments."""
@@ -243,7 +222,7 @@ class _Way:
 _cost = attrgetter("cost")
 
 
-def plan_trigger(
+def _plan_trigger(
     segment: Segment, index: int, locate: Locate, code_at: CodeAt
 ) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
@@ -300,87 +279,6 @@ def _through(
         stages.append(CountedStop(locate(int(target)), after))
         cost += after + _STAGE_COST
     return _Way(cost=cost, stages=tuple(stages))
-
-
-Draw = Callable[
-    [Instruction, Instruction | None, np.random.Generator], InstructionCorruption | None
-]
-
-
-class Rule(Enum):
-    """How the moment of a fault is drawn."""
-
-    INSTRUCTION = "instruction-uniform"  # every executed instruction in scope is equally likely
-    CPU_TIME = "cpu-time"  # a moment of the CPU time of the fault-free run
-    WALL_CLOCK = "wall-clock"  # a moment of the duration of the fault-free run
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Strategy:
-    """A sampling rule with its peculiarities."""
-
-    name: str
-    rule: Rule
-    model: FaultModel
-    imitates: Draw | None = None  # another injector, instead of the model
-    attempts: int = 1  # time rules: how many moments are tried
-    retry_s: float = 0.0  # time rules: how much later
-    whole_process: bool = False  # hits code out of scope as well
-    in_system_calls: bool = False  # hits a thread that waits in the operating system as well
-
-    def draw_at(
-        self,
-        instruction: Instruction,
-        rng: np.random.Generator,
-        following: Instruction | None = None,
-    ) -> InstructionCorruption | None:
-        """Draw a corruption of an instruction, given the next one; None gives it up."""
-        if self.imitates is not None:
-            return self.imitates(instruction, following, rng)
-        return draw_corruption(instruction, self.model, rng)
-
-
-_COMPAT = {
-    "rosfi-2021": Strategy(
-        name="rosfi-2021 (wall-clock, low byte only, most registers refused)",
-        rule=Rule.WALL_CLOCK,
-        model=ROSFI_MODEL,
-        imitates=draw_rosfi,
-        attempts=100,
-        retry_s=500e-6,
-        whole_process=True,
-        in_system_calls=True,
-    ),
-    "pinfi": Strategy(
-        name="pinfi (instruction-uniform, one register that is written)",
-        rule=Rule.INSTRUCTION,
-        model=PINFI_MODEL,
-        imitates=draw_pinfi,
-    ),
-    "pinfi-bugs": Strategy(
-        name="pinfi-bugs (as pinfi, xmm10 to xmm15 taken for xmm0 to xmm5)",
-        rule=Rule.INSTRUCTION,
-        model=PINFI_MODEL,
-        imitates=draw_pinfi_with_bugs,
-    ),
-}
-
-
-def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
-    """The strategy of a sampling rule, or of another injector that is imitated.
-
-    Raises:
-        UnknownName: no such rule or compatibility mode; names the nearest.
-        FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
-    """
-    if compat is not None:
-        if compat not in _COMPAT:
-            raise UnknownName("compatibility mode", compat, _COMPAT)
-        if model not in (None, FaultModel()):
-            raise FaultSpecError(f"{compat} chooses sites, roles, field and bits by its own rule")
-        return _COMPAT[compat]
-    rule = named_member(Rule, "sampling rule", name)
-    return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
 
 
 def draw_fault(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from native_programs import register_corruption
 
 from mavfi_cli.attack import served
 from mavfi_cli.attack.attacker import Attacker, golden_run
@@ -16,7 +17,7 @@ from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, explicit_corruption
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
 
 TAKING = """
 import numpy as np
@@ -89,7 +90,7 @@ def fault_in_r10(place, profile, bit):
                 execution=1,
                 instruction=instruction.text,
                 instruction_bytes=instruction.raw,
-                corruption=explicit_corruption("r10", bit, Role.DESTINATION),
+                corruption=register_corruption("r10", bit, Role.DESTINATION),
             )
     raise AssertionError("r10 is not set")
 

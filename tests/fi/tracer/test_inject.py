@@ -3,11 +3,18 @@
 import signal
 
 import pytest
+from native_programs import register_corruption
 
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import InstructionCorruption, Role, Site, explicit_corruption
+from mavfi_cli.fi.tracer.fault import (
+    CountedStop,
+    InstructionCorruption,
+    InstructionFault,
+    Role,
+    Site,
+)
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.inject import BitActivation, apply, follow, instruction_at
+from mavfi_cli.fi.tracer.inject import BitActivation, instruction_at, strike
 from mavfi_cli.fi.tracer.tracee import Ended
 
 
@@ -24,8 +31,18 @@ def stop_at(start, label):
     return tracee, instruction_at(tracee, tracee.registers.ip)
 
 
+def struck(tracee, instruction, corruption, window=0):
+    """Injection and fate of a corruption of the instruction in front of which we stand."""
+    here = Image(tracee.pid).locate(instruction.address)
+    fault = InstructionFault(
+        trigger=(CountedStop(here, 1),), execution=1, instruction=instruction.text,
+        instruction_bytes=instruction.raw, corruption=corruption,
+    )  # fmt: skip
+    return strike(tracee, fault, window=window)
+
+
 def destination(register, bit):
-    return explicit_corruption(register, bit, Role.DESTINATION)
+    return register_corruption(register, bit, Role.DESTINATION)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +51,7 @@ def destination(register, bit):
 )
 def test_a_destination_is_corrupted_after_its_write(start, label, register, written):
     tracee, instruction = stop_at(start, label)
-    done = apply(tracee, instruction, destination(register, 33))
+    done, _ = struck(tracee, instruction, destination(register, 33))
     assert done.applied
     assert (done.before, done.after) == (written, written ^ (1 << 33))
     assert tracee.registers.read(register) == written ^ (1 << 33)
@@ -44,7 +61,7 @@ def test_a_destination_is_corrupted_after_its_write(start, label, register, writ
 def test_the_stack_pointer_after_a_call(start):
     tracee, instruction = stop_at(start, "at_call")
     before = tracee.registers.sp
-    done = apply(tracee, instruction, destination("rsp", 3))
+    done, _ = struck(tracee, instruction, destination("rsp", 3))
     assert done.before == before - 8
     assert tracee.registers.sp == (before - 8) ^ 8
 
@@ -55,7 +72,7 @@ def test_the_return_address_that_a_call_wrote(start):
     corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(2,)
     )
-    done = apply(tracee, instruction, corruption)
+    done, _ = struck(tracee, instruction, corruption)
     assert (done.address, done.before) == (stack - 8, instruction.next_address)
     assert tracee.memory.read(stack - 8, 8) == (instruction.next_address ^ 4).to_bytes(8, "little")
 
@@ -63,7 +80,7 @@ def test_the_return_address_that_a_call_wrote(start):
 def test_a_repeated_string_instruction_completes_first(start, tmp_path):
     tracee, instruction = stop_at(start, "at_movs")
     target = tracee.registers.read("rdi")
-    done = apply(tracee, instruction, destination("rcx", 4))
+    done, _ = struck(tracee, instruction, destination("rcx", 4))
     assert (done.before, done.after) == (0, 16)
     assert tracee.registers.ip == instruction.next_address
     assert tracee.registers.read("rdi") == target + 36
@@ -76,17 +93,16 @@ def test_a_stored_value_is_corrupted_in_memory(start, tmp_path):
     corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(4,)
     )
-    assert apply(tracee, instruction, corruption).applied
+    assert struck(tracee, instruction, corruption)[0].applied
     tracee.resume()
     assert (tmp_path / "stdout").read_text().endswith(" 25\n")
 
 
 def test_a_discarded_flag_is_not_injected(start):
     tracee, instruction = stop_at(start, "at_add")
-    done = apply(tracee, instruction, explicit_corruption("rflags", 9))
+    done, followed = struck(tracee, instruction, register_corruption("rflags", 9), window=10)
     assert not done.applied
     assert done.reason == "discarded by the operating system: bits [9]"
-    followed = follow(tracee, instruction, explicit_corruption("rflags", 9), done, window=10)
     assert followed.activation is BitActivation.NOT_INJECTED
 
 
@@ -95,7 +111,7 @@ def test_a_refused_segment_base_is_not_injected(start):
     corruption = InstructionCorruption(
         site=Site.GENERAL, role=Role.SOURCE, register="fs_base", operand="fs_base", bits=(60,)
     )
-    done = apply(tracee, instruction, corruption)
+    done, _ = struck(tracee, instruction, corruption)
     assert not done.applied
     assert done.reason.startswith("refused by the operating system")
 
@@ -106,23 +122,22 @@ def test_opcode_bytes_execute_once_and_are_whole_again(start, tmp_path):
     corruption = InstructionCorruption(
         site=Site.OPCODE, role=Role.SOURCE, register="", operand="opcode", bits=(bit,)
     )
-    assert apply(tracee, instruction, corruption).applied
+    assert struck(tracee, instruction, corruption)[0].applied
     assert tracee.registers.read("rax") == 4
     assert tracee.memory.read(instruction.address, len(instruction.raw)) == instruction.raw
 
 
 def test_a_wild_instruction_pointer_crashes(start):
     tracee, instruction = stop_at(start, "at_mov")
-    corruption = explicit_corruption("rip", 44, Role.DESTINATION)
-    assert apply(tracee, instruction, corruption).applied
+    corruption = register_corruption("rip", 44, Role.DESTINATION)
+    assert struck(tracee, instruction, corruption)[0].applied
     assert tracee.resume() == Ended(exit_code=None, signal=signal.SIGSEGV)
 
 
 def test_overwritten_before_it_is_read(start):
     tracee, instruction = stop_at(start, "at_pop")  # rdx: nobody reads it in the parade
     corruption = destination("rdi", 3)  # lea into(%rip), %rdi comes
-    done = apply(tracee, instruction, corruption)
-    followed = follow(tracee, instruction, corruption, done, window=10)
+    _, followed = struck(tracee, instruction, corruption, window=10)
     assert followed.activation is BitActivation.OVERWRITTEN
     assert followed.instruction.startswith("lea rdi")
 
@@ -130,8 +145,7 @@ def test_overwritten_before_it_is_read(start):
 def test_read_by_the_next_instruction(start):
     tracee, instruction = stop_at(start, "at_mov")
     corruption = destination("rax", 3)
-    done = apply(tracee, instruction, corruption)
-    followed = follow(tracee, instruction, corruption, done, window=10)
+    _, followed = struck(tracee, instruction, corruption, window=10)
     assert (followed.activation, followed.after_instructions) == (BitActivation.READ, 1)
     assert followed.instruction.startswith("add rax")
 
@@ -139,8 +153,7 @@ def test_read_by_the_next_instruction(start):
 def test_not_read_within_the_window(start):
     tracee, instruction = stop_at(start, "at_pop")
     corruption = destination("r14", 3)
-    done = apply(tracee, instruction, corruption)
-    followed = follow(tracee, instruction, corruption, done, window=4)
+    _, followed = struck(tracee, instruction, corruption, window=4)
     assert (followed.activation, followed.after_instructions) == (
         BitActivation.NOT_READ_IN_WINDOW,
         4,
@@ -156,6 +169,5 @@ def test_corrupted_memory_is_followed_to_its_reader(start):
     corruption = InstructionCorruption(
         site=Site.MEMORY, role=Role.DESTINATION, register="", operand="", bits=(0,)
     )
-    done = apply(tracee2, push, corruption)
-    followed = follow(tracee2, push, corruption, done, window=3)
+    _, followed = struck(tracee2, push, corruption, window=3)
     assert (followed.activation, followed.instruction) == (BitActivation.READ, "popfq")

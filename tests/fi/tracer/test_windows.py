@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.tracer.fault import FaultModel, Site
+from mavfi_cli.fi.tracer.fault import FaultModel, Site, strategy
 from mavfi_cli.fi.tracer.image import Image, scope_of
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.sampling import (
     Segment,
+    Stratum,
     WindowTooLong,
     draw_fault,
-    plan_trigger,
     record_window,
-    strategy,
 )
 from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism
 
@@ -25,6 +24,11 @@ def profile_of(start, name, *arguments, limit=100_000):
     image = Image(tracee.pid)
     scope = scope_of(image, [name])
     return record_window(tracee, scope, limit=limit, program=name), image, scope
+
+
+def whole(trace):
+    """The population of a run that is one window."""
+    return Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
 
 
 def stepped_in_python(start, name, *arguments):
@@ -100,12 +104,12 @@ def test_a_window_that_is_too_long_is_refused(start):
 @pytest.mark.parametrize(("name", "arguments"), [("counting", ("60",)), ("flows", ())])
 def test_every_trigger_stops_before_its_execution(start, name, arguments):
     trace, image, _ = profile_of(start, name, *arguments)
-    segment = Segment(start=(), trace=trace)
+    stratum = whole(trace)
     code = start(name, *arguments).memory
     indices = np.random.default_rng(5).integers(len(trace), size=24)
     detours = 0
     for index in map(int, indices):
-        trigger, k = plan_trigger(segment, index, image.locate, lambda at: code.read(at, 16))
+        trigger, k = stratum.trigger(index, image.locate, lambda at: code.read(at, 16))
         assert k == int((trace[: index + 1] == trace[index]).sum())
         tracee = start(name, *arguments)
         for stage in trigger:
@@ -119,9 +123,8 @@ def test_every_trigger_stops_before_its_execution(start, name, arguments):
 def test_a_two_level_trigger_counts_less():
     """An outer instruction every 1000 executions of an inner one."""
     trace = np.array(([1] + [2, 3] * 1000) * 20, np.int64)
-    segment = Segment(start=(), trace=trace)
     index = 2001 * 15 + 9
-    trigger, k = plan_trigger(segment, index, lambda address: address, lambda _: b"")
+    trigger, k = whole(trace).trigger(index, lambda address: address, lambda _: b"")
     assert k == 15 * 1000 + int(np.sum(trace[2001 * 15 : index + 1] == trace[index]))
     assert [(stage.location, stage.count) for stage in trigger] == [(1, 16), (int(trace[index]), 5)]
 
@@ -140,12 +143,10 @@ def test_faults_are_uniform_over_executed_instructions(start):
     """Chi-square of the drawn addresses against the profile's counts."""
     from scipy.stats import chisquare
 
-    from mavfi_cli.fi.tracer.sampling import Stratum
-
     trace, image, _ = profile_of(start, "counting", "40")
     tracee = start("counting", "40")
     plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
-    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
+    profile = whole(trace)
     rng = np.random.default_rng(11)
     drawn = Counter(
         image.address(
@@ -182,11 +183,9 @@ def test_unknown_rules_objects_and_functions_name_the_nearest(start):
 
 
 def test_a_scope_without_a_matching_operand_is_an_error(start):
-    from mavfi_cli.fi.tracer.sampling import Stratum
-
     trace, image, _ = profile_of(start, "sorting")
     tracee = start("sorting")
-    profile = Stratum(segments=(Segment(start=(), trace=trace),), windows_in_run=1)
+    profile = whole(trace)
     plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
     with pytest.raises(FaultError, match="no executed instruction in scope has an operand"):
         draw_fault(

@@ -11,13 +11,12 @@ if platform.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
 from test_inject import stop_at
+from test_inject import struck as injected
 
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.arch import JUMP_FLAGS, decode, inverting_bits
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, Site
-from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.inject import BitActivation, apply, strike
-from mavfi_cli.fi.tracer.sampling import strategy
+from mavfi_cli.fi.tracer.fault import Role, Site, strategy
+from mavfi_cli.fi.tracer.inject import BitActivation
 
 
 def of(code):
@@ -149,7 +148,7 @@ def test_every_conditional_jump_is_inverted_whatever_the_flags_are():
 def test_the_flags_are_chosen_at_the_stop(start):
     tracee, instruction = stop_at(start, "at_add")  # add $3, %rax: 8, no flag but AF at most
     (corruption,) = struck(CMP, JLE, count=1)
-    done = apply(tracee, instruction, corruption)
+    done, _ = injected(tracee, instruction, corruption)
     assert done.applied
     assert done.before ^ done.after == 1 << 6  # neither less nor equal: becomes equal
 
@@ -157,12 +156,7 @@ def test_the_flags_are_chosen_at_the_stop(start):
 def test_a_bit_that_is_no_flag_changes_nothing(start):
     tracee, instruction = stop_at(start, "at_add")
     nothing = next(each for each in struck(CMP) if not each.bits)
-    here = Image(tracee.pid).locate(instruction.address)
-    fault = InstructionFault(
-        trigger=(CountedStop(here, 1),), execution=1, instruction=instruction.text,
-        instruction_bytes=instruction.raw, corruption=nothing,
-    )  # fmt: skip
-    injection, followed = strike(tracee, fault, window=3)
+    injection, followed = injected(tracee, instruction, nothing, window=3)
     assert injection.applied
     assert injection.before == injection.after
     assert followed.activation is BitActivation.NOT_READ_IN_WINDOW
