@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.attack.campaign import Plan, TargetRuns, run_campaign
-from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.program import OutputComparison, ProgramTarget
+from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism

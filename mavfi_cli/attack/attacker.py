@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.attack.outcome import RunOutcome
-from mavfi_cli.attack.target import Golden, JudgedPlace, RunVerdict
+from mavfi_cli.attack.target import Golden, JudgedPlace, RunOutcome, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Rule, Strategy

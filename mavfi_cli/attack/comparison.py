@@ -1,20 +1,56 @@
-"""Which outputs of a program are compared with those of the golden run, and how."""
+"""Differences from the golden run: their size, and which outputs of a program are compared.
+
+The templates of kernels import this and no tracer: what they load is copied for every run.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from mavfi_cli.attack.difference import Difference
 from mavfi_cli.core.errors import ConfigError
 
 STDOUT = "stdout"
 LARGEST_BYTES = 64 << 20  # of one compared output
 _SEPARATORS = re.compile(rb"[\s,;:=()\[\]]+")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Difference:
+    """The difference between an output and the golden one.
+
+    Attributes:
+        relative: the value to compare with a tolerance; inf if the outputs cannot be compared
+            number by number (another shape, another kind of answer, not a number).
+        absolute: the same in `unit`, or inf.
+        unit: unit of `absolute`.
+        text: the difference in words.
+        noticeable: whether it is beyond what the taker of the output tolerates.
+        parts: what the difference consists of, by name.
+    """
+
+    relative: float
+    absolute: float
+    unit: str = ""
+    text: str = ""
+    noticeable: bool = True
+    parts: Mapping[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Entries of a record; a size that is not a number is null."""
+        finite = math.isfinite(self.relative)
+        return {
+            "relative": self.relative if finite else None,
+            "absolute": self.absolute if finite else None,
+            "unit": self.unit,
+            "text": self.text,
+            "noticeable": self.noticeable,
+            "parts": dict(self.parts),
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +129,7 @@ class OutputComparison:
         """True if two outputs are equal, or differ only in numbers within the tolerance."""
         if golden == output:
             return True
-        size = magnitude(golden, output) if self.tolerance > 0.0 else None
+        size = _magnitude(golden, output) if self.tolerance > 0.0 else None
         return size is not None and size <= self.tolerance
 
 
@@ -146,11 +182,11 @@ def _beginning(path: Path) -> bytes:
 
 def compared(golden: bytes, output: bytes) -> Difference | None:
     """The difference between the numbers of two texts; None if anything else differs."""
-    size = magnitude(golden, output)
+    size = _magnitude(golden, output)
     return None if size is None else Difference(relative=size, absolute=size)
 
 
-def magnitude(golden: bytes, output: bytes) -> float | None:
+def _magnitude(golden: bytes, output: bytes) -> float | None:
     """Largest relative difference between the numbers of two texts.
 
     It is relative to the golden number's size, absolute if that is 0, and infinite if one of the

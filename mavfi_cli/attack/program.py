@@ -24,7 +24,6 @@ import numpy as np
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison, compared, joined
 from mavfi_cli.attack.counts import callgrind, read_counts, run_counted
-from mavfi_cli.attack.outcome import signal_name
 from mavfi_cli.attack.profile import (
     function_of,
     profile_calls,
@@ -40,6 +39,7 @@ from mavfi_cli.attack.target import (
     Watch,
     digest,
     judged,
+    signal_name,
 )
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
 
-from mavfi_cli.attack.difference import Difference
-from mavfi_cli.attack.outcome import RunOutcome, Window
+from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.fi.tracer.counted import CountedRun
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
@@ -23,8 +24,24 @@ from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 from mavfi_cli.stats.clusters import Total, estimated_total
 
+Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
 # Called with the instructions stepped since the last call, or with what goes on, in words.
 Watch = Callable[[int | str], None]
+
+
+class RunOutcome(Enum):
+    """The outcome of one run of an isolated program or kernel."""
+
+    BENIGN = "benign"
+    CRASH = "crash"
+    HANG = "hang"
+    SDC = "sdc"
+    NOT_INJECTED = "not_injected"
+
+    @property
+    def title(self) -> str:
+        """The name in tables."""
+        return "SDC" if self is RunOutcome.SDC else self.value.replace("_", " ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,3 +313,9 @@ def judged(
 def digest(output: bytes) -> str:
     """SHA-256 of an output."""
     return hashlib.sha256(output).hexdigest()
+
+
+def signal_name(number: int) -> str:
+    """The name of a signal."""
+    known = {each.value for each in signal.Signals}
+    return signal.Signals(number).name if number in known else f"signal {number}"

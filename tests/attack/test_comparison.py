@@ -8,12 +8,12 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
-from mavfi_cli.attack.comparison import OutputComparison, magnitude
-from mavfi_cli.attack.outcome import RunOutcome
+from mavfi_cli.attack.comparison import OutputComparison, compared
 from mavfi_cli.attack.program import (
     ProgramTarget,
     absolute_arguments,
 )
+from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import ConfigError, TargetError
 from mavfi_cli.fi.tracer.spawn import Program
@@ -220,7 +220,8 @@ def test_standard_input_reaches_the_program(native_program, tmp_path):
     ],
 )
 def test_magnitude(golden, output, size):
-    assert magnitude(golden, output) == size
+    found = compared(golden, output)
+    assert (found and found.relative) == size
 
 
 def test_what_can_be_compared():

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import math
 import re
 from dataclasses import replace
 from operator import itemgetter
@@ -18,10 +17,9 @@ from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.journal import read_runs
-from mavfi_cli.attack.outcome import RunOutcome, Struck, shares
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.replay import replay_runs
-from mavfi_cli.attack.target import RunLimits, digest
+from mavfi_cli.attack.target import RunLimits, RunOutcome, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
@@ -39,8 +37,6 @@ from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
 from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, runs_csv, summarise_program
-from mavfi_cli.stats.clusters import design_effect
-from mavfi_cli.stats.shares import wilson
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
@@ -401,36 +397,6 @@ def test_a_damaged_record_is_a_clear_error():
         record.fault_of({"version": record.VERSION, "trigger": [{}], "corruption": None})
     with pytest.raises(RecordError, match="version 2"):
         record.fault_of({"version": 1})  # of masks that were whole registers
-
-
-# -- numbers
-
-
-def test_not_injected_runs_are_no_part_of_the_other_shares():
-    result = shares(
-        [RunOutcome.SDC, RunOutcome.BENIGN, RunOutcome.NOT_INJECTED, RunOutcome.NOT_INJECTED]
-    )
-    assert (result[RunOutcome.SDC].share, result[RunOutcome.SDC].total) == (0.5, 2)
-    assert (result[RunOutcome.NOT_INJECTED].share, result[RunOutcome.NOT_INJECTED].total) == (
-        0.5,
-        4,
-    )
-    assert math.isnan(wilson(0, 0).share)
-
-
-def test_independent_runs_count_in_full():
-    rng = np.random.default_rng(5)
-    hits = (rng.random(400) < 0.3).tolist()
-    assert design_effect(hits, [None] * 400) == pytest.approx(1.0, abs=0.01)
-    strata = [(number % 2, number) for number in range(400)]
-    assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
-    assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0
-    half = [RunOutcome.SDC, RunOutcome.BENIGN] * 50
-    alone = shares(half)[RunOutcome.SDC]
-    windows = Struck(windows=[("f", number % 2) for number in range(100)], sampled={"f": 2})
-    alike = shares(half, windows)[RunOutcome.SDC]
-    assert alike.share == alone.share == 0.5
-    assert alike.high - alike.low > 2.0 * (alone.high - alone.low)
 
 
 # -- command

@@ -92,3 +92,11 @@ def test_clusters_that_no_run_hit_count_as_sampled():
 @pytest.mark.parametrize("freedom", [3, 5, 15, 200])
 def test_quantiles_are_students(freedom):
     assert _student([1.0], [freedom]) == pytest.approx(t.ppf(0.975, freedom), abs=0.03)
+
+
+def test_independent_runs_count_in_full():
+    hits = (np.random.default_rng(5).random(400) < 0.3).tolist()
+    assert design_effect(hits, [None] * 400) == pytest.approx(1.0, abs=0.01)
+    strata = [(number % 2, number) for number in range(400)]
+    assert design_effect(hits, strata) == pytest.approx(1.0, abs=0.02)
+    assert design_effect([True] * 9, [("f", 1)] * 9) == 1.0

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.attack.difference import Difference
+from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.kernels.inputs import KernelInputs
 from mavfi_cli.attack.kernels.outputs import (
     A_TICK_S,

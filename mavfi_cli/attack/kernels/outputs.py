@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.attack.difference import Difference
+from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.kernels.tree import read_tree
 from mavfi_cli.autonomy.octree import occupied_leaves
 

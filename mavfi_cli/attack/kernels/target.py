@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
-from mavfi_cli.attack.difference import Difference
+from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.outputs import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
-from mavfi_cli.attack.outcome import RunOutcome
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import (
     Golden,
     RunLimits,
+    RunOutcome,
     RunVerdict,
     TargetProfile,
     Watch,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,20 +12,10 @@ from mavfi_cli.analysis.kernel_runs import KERNELS
 from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.outcome import (
-    RunOutcome,
-    Struck,
-    Window,
-    counted,
-    share_of,
-    share_to_json,
-    shares,
-    shares_to_json,
-    signal_name,
-)
+from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.report.tables.columns import blocks, csv_text
-from mavfi_cli.stats.shares import Share
+from mavfi_cli.stats.clusters import Cluster, clustered_share
 
 SCHEMA = 2
 _OF_EVERY_RUN = (
@@ -40,34 +31,59 @@ _SHOWN = tuple(RunOutcome)
 
 
 def _counts(runs: TargetRuns) -> dict[str, Any]:
-    """The counts of one target."""
+    """The counts of one target; shares are those of the *injected* runs."""
     records = runs.records
-    found = shares((RunOutcome(entry["outcome"]) for entry in records), _struck(runs))
     return {
-        "outcomes": shares_to_json(found),
-        "crashes": counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
-        "not_injected": counted(
+        "outcomes": {
+            outcome.value: _share(
+                runs,
+                [entry["outcome"] == outcome.value for entry in records],
+                of_all=outcome is RunOutcome.NOT_INJECTED,
+            )
+            for outcome in RunOutcome
+        },
+        "crashes": _counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
+        "not_injected": _counted(
             entry["not_injected_reason"] for entry in records if entry["not_injected_reason"]
         ),
-        "activation": counted(entry["activation"]["activation"] for entry in records),
+        "activation": _counted(entry["activation"]["activation"] for entry in records),
     }
 
 
-def _struck(runs: TargetRuns) -> Struck:
-    """The sampled windows that the runs hit, over all inputs."""
-    windows: list[Window | None] = []
-    for run, entry in enumerate(runs.records):
-        number = runs.input_of(run)
-        profile = runs.inputs[number].profile
-        window = None if profile is None else profile.window_of(entry)
-        windows.append(window and ((number, window[0]), window[1]))
+def _share(runs: TargetRuns, hits: Sequence[bool], *, of_all: bool = False) -> dict[str, Any]:
+    """The share of hits in the injected runs, or in all, with its 95 % interval.
+
+    Where windows are sampled, the spread between them widens the interval. A share of nothing is
+    null.
+    """
+    chosen: list[bool] = []
+    windows: list[Cluster | None] = []
+    for run, (hit, entry) in enumerate(zip(hits, runs.records, strict=True)):
+        if of_all or entry["outcome"] != RunOutcome.NOT_INJECTED.value:
+            number = runs.input_of(run)
+            profile = runs.inputs[number].profile
+            window = None if profile is None else profile.window_of(entry)
+            windows.append(window and ((number, window[0]), window[1]))
+            chosen.append(hit)
     sampled = {
         (number, stratum): count
         for number, each in enumerate(runs.inputs)
         if each.profile is not None
         for stratum, count in each.profile.sampled.items()
     }
-    return Struck(windows=windows, sampled=sampled)
+    share = clustered_share(chosen, windows, sampled)
+    return {
+        "count": share.count,
+        "of": share.total,
+        "share": None if math.isnan(share.share) else share.share,
+        "wilson95": [share.low, share.high],
+    }
+
+
+def _counted(names: Iterable[str]) -> dict[str, int]:
+    """Count each name, the most frequent first."""
+    counts = Counter(names)
+    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
 
 
 def _with(records: Iterable[Record], outcome: RunOutcome) -> Iterator[Record]:
@@ -121,7 +137,7 @@ def _kernel(runs: TargetRuns) -> dict[str, Any]:
             "largest": finite[-1] if finite else None,
             "incomparable": len(sizes) - len(finite),
         },
-        "sdc_noticeable": {"tolerance": kernel.tolerance, **share_to_json(_noticeable(runs))},
+        "sdc_noticeable": {"tolerance": kernel.tolerance, **_noticeable(runs)},
         "sdc_parts": _parts(records),
         "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
         "prepare_s": runs.prepare_s,
@@ -141,7 +157,7 @@ def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
         "instructions": None if length is None else length.total,
         "instructions95": None if length is None else [length.low, _finite(length.high)],
         "golden": {"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
-        "outcomes": counted(entry["outcome"] for entry in records),
+        "outcomes": _counted(entry["outcome"] for entry in records),
     }
 
 
@@ -149,11 +165,12 @@ def _finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _noticeable(runs: TargetRuns) -> Share:
-    """The share of injected runs with a silent corruption beyond the kernel's own tolerance."""
-    sdc, injected = RunOutcome.SDC.value, RunOutcome.NOT_INJECTED.value
-    noticed = [e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in runs.records]
-    return share_of(noticed, [e["outcome"] != injected for e in runs.records], _struck(runs))
+def _noticeable(runs: TargetRuns) -> dict[str, Any]:
+    """The share of runs with a silent corruption beyond the kernel's own tolerance."""
+    sdc = RunOutcome.SDC.value
+    return _share(
+        runs, [e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in runs.records]
+    )
 
 
 def _parts(records: Sequence[Record]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.attack.outcome import RunOutcome
+from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
