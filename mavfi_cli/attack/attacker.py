@@ -1,15 +1,21 @@
-"""Runs one fault: reach the location, flip, follow, run to the end, judge."""
+"""Runs one fault: reach the location, flip, follow, run to the end, judge.
+
+A fault in a process that keeps running, such as a node of a mission, is applied in a thread of its
+own, because ptrace obeys only the thread that attached.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -20,7 +26,13 @@ from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Rule, Strat
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import (
+    Ended,
+    ExecutionCounter,
+    Mechanism,
+    Tracee,
+    best_mechanism,
+)
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
@@ -193,6 +205,7 @@ def run_out(tracee: Tracee) -> Ended:
 # -- a process that keeps running
 
 Notice = Callable[[], None]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,3 +267,75 @@ def attack_live(
     return LiveAttack(
         injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
     )
+
+
+class TracerThread(Generic[T]):
+    """Runs work that traces a node in a thread of its own.
+
+    Args:
+        work: gets a function to call once the node runs towards the awaited event.
+    """
+
+    def __init__(self, work: Callable[[Notice], T]) -> None:
+        self._armed, self._done = threading.Event(), Future[T]()
+
+        def run() -> None:
+            try:
+                self._done.set_result(work(self._armed.set))
+            except BaseException as error:  # the thread's boundary: `result` raises it again
+                self._done.set_exception(error)
+            finally:
+                self._armed.set()
+
+        threading.Thread(target=run, daemon=True).start()
+
+    def await_armed(self) -> None:
+        """Wait until the node runs towards the awaited event; raise any earlier error."""
+        self._armed.wait()
+        if self._done.done():
+            self._done.result()
+
+    def result(self) -> T:
+        """Wait for the end of the work; return its result or raise its error."""
+        return self._done.result()
+
+
+class EntryCounter:
+    """Counts the executions of one instruction in a node that keeps running.
+
+    If the operating system cannot count, a tracer stops at each execution. The count is still right
+    whenever the node has answered, because it answers after its last stop.
+
+    Args:
+        pid: the node; closing the counter may end it.
+    """
+
+    def __init__(self, pid: int, address: int) -> None:
+        self._pid, self._address, self._stops = pid, address, 0
+        self._counter: ExecutionCounter | None = None
+        self._tracer: TracerThread[None] | None = None
+        if best_mechanism() is Mechanism.PERF:
+            self._counter = ExecutionCounter(pid, address)
+        else:
+            self._tracer = TracerThread(self._count)
+            self._tracer.await_armed()
+
+    def read(self) -> int:
+        """Executions since the counter was made."""
+        return self._stops if self._counter is None else self._counter.read()
+
+    def close(self) -> None:
+        """Remove the counter, and end the node if it had to be traced."""
+        if self._counter is not None:
+            self._counter.close()
+        if self._tracer is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._tracer.result()
+
+    def _count(self, armed: Notice) -> None:
+        tracee = Tracee.attach(self._pid)
+        tracee.breakpoint_at(self._address)
+        armed()
+        while not isinstance(tracee.resume(), Ended):
+            self._stops += tracee.registers.ip == self._address

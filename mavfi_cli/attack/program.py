@@ -23,7 +23,6 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison, compared, joined
-from mavfi_cli.attack.counts import callgrind, read_counts, run_counted
 from mavfi_cli.attack.profile import (
     function_of,
     profile_calls,
@@ -43,6 +42,7 @@ from mavfi_cli.attack.target import (
 )
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.counted import callgrind, read_counts, run_counted
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong

@@ -7,13 +7,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from mavfi_cli.attack import counts
 from mavfi_cli.attack import profile as profiles
 from mavfi_cli.attack import program as programs
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import counted as counting
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.report.tables.attacks import program_table, summarise_program
@@ -67,16 +67,16 @@ def test_a_long_program_is_attacked_whole(native_program):
 
 
 def test_it_tells_how_long_callgrind_counts_and_may_count(place, monkeypatch):
-    monkeypatch.setattr(counts, "_TOLD_EVERY_S", 0.01)
+    monkeypatch.setattr(counting, "_TOLD_EVERY_S", 0.01)
     told = []
     watch = profiles.steps_told(told.append)
     place("counting", "300000").profile(np.random.default_rng(1), watch=watch)
-    counting = [text for text in told if "callgrind" in text]
-    assert len(counting) > 5
+    waiting = [text for text in told if "callgrind" in text]
+    assert len(waiting) > 5
     form = re.compile(r"profile, counted by callgrind, \d+ s of at most (\d+) s")
-    limits = {form.fullmatch(text)[1] for text in counting}
+    limits = {form.fullmatch(text)[1] for text in waiting}
     assert len(limits) == 1
-    assert told.index(counting[0]) > 0  # stepped first
+    assert told.index(waiting[0]) > 0  # stepped first
 
 
 def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):

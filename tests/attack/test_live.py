@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from native_programs import register_corruption
 
-from mavfi_cli.attack.attacker import attack_live
+from mavfi_cli.attack.attacker import EntryCounter, attack_live
 from mavfi_cli.attack.profile import profile_call, profile_calls
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux, record, tracee
@@ -18,7 +18,6 @@ from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, strategy
 from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping, scope_of
 from mavfi_cli.fi.tracer.inject import BitActivation
-from mavfi_cli.fi.tracer.thread import EntryCounter
 from mavfi_cli.fi.tracer.tracee import Tracee
 
 KERNEL = """

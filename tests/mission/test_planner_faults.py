@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from missions import POSTS
 
+from mavfi_cli.attack.attacker import TracerThread
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.doctor import check_tracing
-from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.instruction.injection import draw_invocation
 from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup

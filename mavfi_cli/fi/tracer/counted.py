@@ -4,21 +4,33 @@ The k-th execution of an instruction is reached by counting. Instructions that a
 together have the same counts; so a hot one is counted at a place among them where a detour fits,
 that is, where nothing jumps between the replaced instructions: one of them leads to the next, and
 both are executed equally often.
+
+valgrind's callgrind counts: exactly, in one run.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
+import shutil
+import signal
+import subprocess
+import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.arch import TRAITS, Detour, Flow, flow
 from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Location
+from mavfi_cli.fi.tracer.spawn import Program
 
 Locate = Callable[[int], Location]
 CodeAt = Callable[[int], bytes]  # 16 bytes of code
@@ -202,3 +214,93 @@ def _places(detours: Sequence[Detour | None], joined: list[bool]) -> list[int]:
             places += [each if detours[each] or not fits else fits[0] for each in block]
             start = at + 1
     return places
+
+
+# -- counting by valgrind's callgrind
+
+_SLOWER = 200.0  # callgrind takes 10 to 60 times as long as the program
+_START_S = 60.0
+_TOLD_EVERY_S = 1.0
+
+
+def callgrind() -> str | None:
+    """Path of valgrind; None if it is not installed."""
+    return shutil.which("valgrind")
+
+
+def run_counted(
+    command: Program,
+    *,
+    stdout: Path,
+    stderr: Path,
+    counts: Path,
+    wall_s: float,
+    tell: Callable[[str], None] = lambda _: None,
+) -> int:
+    """Run a program under callgrind and return its exit code.
+
+    Args:
+        counts: file to which callgrind writes.
+        wall_s: duration of the program without it.
+        tell: called every second with how long it has been running, in words.
+
+    Raises:
+        TargetError: it does not end in time, or a signal kills it.
+    """
+    name, limit_s = Path(command.argv[0]).name, _SLOWER * wall_s + _START_S
+    tool = [
+        str(callgrind()), "--quiet", "--tool=callgrind", "--dump-instr=yes", "--compress-pos=no",
+        "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
+        f"--callgrind-out-file={counts}", "--",
+    ]  # fmt: skip
+    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
+        process = subprocess.Popen(
+            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
+            stdin=given, stdout=out, stderr=err, start_new_session=True,
+        )  # fmt: skip
+    try:
+        code = _await_end(process, name, limit_s, tell)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    if code < 0:
+        raise TargetError(name, f"is killed by signal {-code} under callgrind")
+    return code
+
+
+def _await_end(
+    process: subprocess.Popen[bytes], name: str, limit_s: float, tell: Callable[[str], None]
+) -> int:
+    """Wait for the exit code; tell how long it takes."""
+    begun_s = time.monotonic()
+    while (elapsed_s := time.monotonic() - begun_s) < limit_s:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(min(_TOLD_EVERY_S, limit_s - elapsed_s))
+        tell(f"counted by callgrind, {elapsed_s:.0f} s of at most {limit_s:.0f} s")
+    raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s")
+
+
+def read_counts(path: Path, objects: Iterable[str]) -> dict[str, Counter[int]]:
+    """Executions of each instruction, by the path of its object and its linked address.
+
+    Args:
+        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
+            the cost of the called function.
+        objects: paths of the wanted objects.
+    """
+    found: dict[str, Counter[int]] = {each: Counter() for each in objects}
+    current: Counter[int] | None = None
+    of_callee = False
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.startswith("0x"):
+                if current is not None and not of_callee:
+                    address, _, count = line.split()
+                    current[int(address, 16)] += int(count)
+                of_callee = False
+            elif line.startswith("ob="):
+                current = found.get(os.path.realpath(line[3:].rstrip("\n")))
+            elif line.startswith("calls="):
+                of_callee = True
+    return found

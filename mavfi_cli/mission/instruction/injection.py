@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mavfi_cli.attack.attacker import LiveAttack, attack_live
+from mavfi_cli.attack.attacker import LiveAttack, TracerThread, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
 from mavfi_cli.attack.served import ServedProcess, served_process
 from mavfi_cli.attack.target import TargetProfile
@@ -32,7 +32,6 @@ from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.thread import TracerThread
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.attack.attacker import EntryCounter, TracerThread
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import served_process
@@ -23,7 +24,6 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.fault import CountedStop
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
-from mavfi_cli.fi.tracer.thread import EntryCounter, TracerThread
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup

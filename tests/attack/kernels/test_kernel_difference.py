@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mavfi_cli.attack.kernels.outputs import checks, maps, numbers, pack, paths, unpack
-from mavfi_cli.attack.kernels.tree import read_tree
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.core.types import PointCloud
 
@@ -84,27 +83,36 @@ def test_what_cannot_be_compared_is_infinitely_different(other):
     assert found.to_json()["relative"] is None
 
 
-def test_the_whole_tree_is_read(mapped):
-    tree = read_tree(unpack(mapped)["tree"].tobytes())
-    assert (tree.depths[0], tree.depths.max(), tree.codes[0]) == (0, 16, 0)
-    assert (tree.values[tree.leaf] > 0.0).sum() == 3
-    assert (np.diff(tree.codes[tree.leaf]) > 0).all()
-    for damage in (b"", b"\ndata\n", b"\ndata\n" + bytes(4), b"\ndata\n" + bytes([0, 0, 0, 0, 1])):
-        assert read_tree(damage) is None
-    assert read_tree(b"\ndata\n" + bytes([0, 0, 0, 0, 1]) * 40) is None
+@pytest.mark.parametrize(
+    "damage",
+    [
+        b"",
+        b"\ndata\n",
+        b"\ndata\n" + bytes(4),
+        b"\ndata\n" + bytes([0, 0, 0, 0, 1]),
+        b"\ndata\n" + bytes([0, 0, 0, 0, 1]) * 40,
+    ],
+)
+def test_what_is_no_tree_cannot_be_compared(mapped, damage):
+    golden = unpack(mapped)
+    found = maps(golden, golden | {"tree": np.frombuffer(damage, np.uint8)})
+    assert (found.relative, found.text) == (math.inf, "the tree cannot be read")
 
 
 def test_maps_differ_by_nodes_and_by_what_a_planner_sees(mapped):
     golden = unpack(mapped)
-    tree = read_tree(golden["tree"].tobytes())
-    hit = int(np.flatnonzero(tree.leaf & (tree.values > 0.0))[0])
-    miss = int(np.flatnonzero(tree.leaf & (tree.values < 0.0))[0])
+    _, _, data = golden["tree"].tobytes().partition(b"\ndata\n")
+    nodes = np.frombuffer(data, [("value", "<f4"), ("children", "u1")])
+    leaf = nodes["children"] == 0
+    hits = np.flatnonzero(leaf & (nodes["value"] > 0.0))
+    hit, miss = int(hits[0]), int(np.flatnonzero(leaf & (nodes["value"] < 0.0))[0])
+    assert len(hits) == 3
     same = maps(golden, golden)
     assert (same.relative, same.noticeable) == (0.0, False)
     unseen = maps(golden, changed(mapped, miss, value=-1.5))
     assert (unseen.absolute, unseen.unit, unseen.noticeable) == (1.0, "nodes", False)
-    assert unseen.parts["log_odds"] == pytest.approx(1.5 + tree.values[miss])
-    assert unseen.relative == 1.0 / len(tree.values)
+    assert unseen.parts["log_odds"] == pytest.approx(1.5 + nodes["value"][miss])
+    assert unseen.relative == 1.0 / len(nodes)
     free = maps(golden, changed(mapped, hit, value=-0.5))
     occupied = maps(golden, changed(mapped, miss, value=0.5))
     assert (free.parts["false_free"], free.parts["false_occupied"]) == (1, 0)
