@@ -27,8 +27,14 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
 from mavfi_cli.attack.journal import Journal
-from mavfi_cli.attack.profile import steps_told
-from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, TargetProfile, places_of
+from mavfi_cli.attack.target import (
+    AttackTarget,
+    Golden,
+    JudgedPlace,
+    TargetProfile,
+    Watch,
+    places_of,
+)
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.fi.tracer import record
@@ -189,7 +195,7 @@ def _prepare(
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
             profiles = [
-                each.profile(rng, windows=plan.windows, watch=steps_told(stage))
+                each.profile(rng, windows=plan.windows, watch=_steps_told(stage))
                 for each in places_of(place)
             ]
         undo.pop_all()
@@ -204,6 +210,20 @@ def _prepare(
         prepare_s=time.perf_counter() - begun,
     )
     return prepared, place
+
+
+def _steps_told(stage: Callable[[str], None]) -> Watch:
+    """Make a watch that tells `stage` how many instructions were stepped so far, or other news."""
+    total = 0
+
+    def watch(news: int | str) -> None:
+        nonlocal total
+        if isinstance(news, int):
+            total += news
+            news = f"{total} instructions stepped"
+        stage(f"profile, {news}")
+
+    return watch
 
 
 def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:

@@ -43,20 +43,6 @@ Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
 
 
-def steps_told(stage: Callable[[str], None]) -> Watch:
-    """Make a watch that tells `stage` how many instructions were stepped so far, or other news."""
-    total = 0
-
-    def watch(news: int | str) -> None:
-        nonlocal total
-        if isinstance(news, int):
-            total += news
-            news = f"{total} instructions stepped"
-        stage(f"profile, {news}")
-
-    return watch
-
-
 def profile_run(
     place: AttackPlace,
     rng: np.random.Generator,
@@ -154,17 +140,20 @@ def profile_calls(
 
 def profile_counted(
     place: AttackPlace,
+    rng: np.random.Generator,
     counts: Callable[[Sequence[str]], Mapping[str, Mapping[int, int]]],
     begun: float,
 ) -> TargetProfile:
     """The profile of a whole run whose executions have been counted.
+
+    Some counts are checked in runs of the place: the largest, and others in proportion to them.
 
     Args:
         counts: function from the paths of objects to the executions of each linked address.
         begun: when the counting began, `time.perf_counter`.
 
     Raises:
-        TargetError: no instruction in scope executes.
+        TargetError: no instruction in scope executes, or one more or less often than counted.
     """
     image, code, scope = _code(place)
     objects = {each.path: each for each in map(image.named, scope.objects) if each.path is not None}
@@ -178,33 +167,28 @@ def profile_counted(
         raise TargetError(place.name, _NOTHING)
     run = CountedRun.of(executions, lambda address: code_of(code, address))
     cost_s = time.perf_counter() - begun
+    _require_counts(place, run, image, rng)
     return TargetProfile(counted=run, image=image, code=code, cost_s=cost_s)
 
 
-def require_counts(place: AttackPlace, profile: TargetProfile, rng: np.random.Generator) -> None:
-    """Check some counts in runs of the place: the largest, and others in proportion to them.
-
-    Raises:
-        TargetError: an instruction is executed more or less often.
-    """
-    run = profile.counted
-    assert run is not None
+def _require_counts(
+    place: AttackPlace, run: CountedRun, image: Image, rng: np.random.Generator
+) -> None:
     drawn = rng.choice(len(run.counts), size=_CHECKED, p=run.reached / run.executed)
     for index in sorted({int(np.argmax(run.reached)), *drawn.tolist()}):
         if run.reached[index] < run.counts[index]:
             continue
         count, address = int(run.counts[index]), int(run.addresses[index])
         with started(place) as tracee:
-            stages = run.stages(index, count, profile.image.locate)
             reached = all(
-                tracee.run_to(profile.image.address(each.location), each.count, each.detour)
-                for each in stages
+                tracee.run_to(image.address(each.location), each.count, each.detour)
+                for each in run.stages(index, count, image.locate)
             )
             more = reached and tracee.run_to(address, 2)
         if more or not reached:
             raise TargetError(
                 place.name,
-                f"executes {profile.image.locate(address)} {'more' if more else 'less'} often than "
+                f"executes {image.locate(address)} {'more' if more else 'less'} often than "
                 f"the {count} times that callgrind counts: its way depends on the processor, on "
                 "addresses or on time; name a function or other objects",
             )

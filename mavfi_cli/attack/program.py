@@ -28,7 +28,6 @@ from mavfi_cli.attack.profile import (
     profile_calls,
     profile_counted,
     profile_run,
-    require_counts,
 )
 from mavfi_cli.attack.target import (
     Golden,
@@ -296,9 +295,8 @@ class _Workplace:
             wall_s=self._known_golden().wall_s, tell=watch or (lambda _: None),
         )  # fmt: skip
         self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
-        profile = profile_counted(self, lambda paths: read_counts(self._counts, paths), begun)
+        profile = profile_counted(self, rng, lambda paths: read_counts(self._counts, paths), begun)
         self._counts.unlink()
-        require_counts(self, profile, rng)
         return profile
 
     def _require_golden(self, how: str, ended: Ended) -> None:

@@ -66,17 +66,19 @@ def test_a_long_program_is_attacked_whole(native_program):
     assert "counted by callgrind; 0 % of the executions are not reached" in program_table(summary)
 
 
-def test_it_tells_how_long_callgrind_counts_and_may_count(place, monkeypatch):
+def test_it_tells_how_long_callgrind_counts_and_may_count(native_program, monkeypatch):
     monkeypatch.setattr(counting, "_TOLD_EVERY_S", 0.01)
     told = []
-    watch = profiles.steps_told(told.append)
-    place("counting", "300000").profile(np.random.default_rng(1), watch=watch)
+    command = Program.of([str(native_program("counting")), "300000"])
+    target = ProgramTarget(command=command, comparison=OutputComparison())
+    run_campaign(Plan(runs=1, seed=1), [target], stage=told.append)
     waiting = [text for text in told if "callgrind" in text]
     assert len(waiting) > 5
     form = re.compile(r"profile, counted by callgrind, \d+ s of at most (\d+) s")
     limits = {form.fullmatch(text)[1] for text in waiting}
     assert len(limits) == 1
-    assert told.index(waiting[0]) > 0  # stepped first
+    stepped = next(text for text in told if text.endswith("instructions stepped"))
+    assert told.index(stepped) < told.index(waiting[0])
 
 
 def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):

@@ -301,22 +301,18 @@ def _how(summary: Mapping[str, Any]) -> str:
 # -- both
 
 
-def runs_csv(columns: Sequence[str], campaign: Iterable[TargetRuns]) -> str:
-    """Return one line per run below the names of the columns; entries without a value are empty."""
-    return csv_text(
-        (_cells(entry, columns) for runs in campaign for entry in runs.records), columns
-    )
-
-
 def save_runs(
     folder: Path, told: Mapping[str, Any], campaign: Iterable[TargetRuns], columns: Sequence[str]
 ) -> None:
     """Write kernels.csv, a line a run, and kernels.json, the summary.
 
+    Entries without a value are empty.
+
     Raises:
         RecordError: a file cannot be written.
     """
-    write_text(folder / "kernels.csv", runs_csv(columns, campaign))
+    rows = (_cells(entry, columns) for runs in campaign for entry in runs.records)
+    write_text(folder / "kernels.csv", csv_text(rows, columns))
     write_json(folder / KERNELS, told)
 
 

@@ -1,7 +1,6 @@
 """Isolated campaigns on our own kernels: repeatable, resumable, tolerant, told in full."""
 
 import csv
-import io
 import json
 from functools import partial
 
@@ -18,7 +17,7 @@ from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, Unkno
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
-from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, runs_csv, summarise, table
+from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise, table
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 
@@ -222,7 +221,9 @@ def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     text = table(summary)
     assert "sampling: instruction-uniform" in text
     assert "input 4: all" in text
-    rows = list(csv.reader(io.StringIO(runs_csv(KERNEL_COLUMNS, campaign))))
+    save_runs(tmp_path, summary, campaign, KERNEL_COLUMNS)
+    assert json.loads((tmp_path / "kernels.json").read_text()) == summary
+    rows = list(csv.reader((tmp_path / "kernels.csv").read_text().splitlines()))
     assert rows[0] == KERNEL_COLUMNS
     assert len(rows) == 31
     for name in ("one.svg", "two.svg"):
