@@ -258,12 +258,12 @@ class Spec:
         fixed_world: has missions in a world share one; None: the world changes with the seed.
     """
 
-    name: str
-    about: str = ""
+    name: str  # name of the folder below campaigns/
+    about: str = ""  # description, which `plan` prints
     seed: int = 1
     first_seed: int = 1
     repetitions: int = 1
-    keep: Keep = Keep.FAILURES
+    keep: Keep = Keep.FAILURES  # run folders to keep: none, failures, sampled or all
     fixed: Mapping[str, Any] = field(default_factory=dict)
     axes: Axes = field(default_factory=dict)
     settings: tuple[Setting, ...] = (Setting(),)

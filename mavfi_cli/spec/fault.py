@@ -50,13 +50,13 @@ class FaultConfig:
     seed: int = 1
     at: str = "random"
     together: bool = False
-    effect: str = "flip"
-    bits: int = 1
-    field: str = "any"
+    effect: str = "flip"  # flip, zero or random
+    bits: int = 1  # number of distinct bits to flip
+    field: str = "any"  # field of the bits: sign, exponent, mantissa or any
     exact_bits: tuple[int, ...] | None = None
-    persistence: str = "transient"
+    persistence: str = "transient"  # transient, stuck-at or intermittent
     duration_s: float | None = None  # None: until the end of the mission
-    period_s: float = 1.0
+    period_s: float = 1.0  # time between two strikes of an intermittent fault
 
     @property
     def attacks_detector(self) -> bool:
@@ -238,7 +238,7 @@ class InstructionConfig:
     compat: str | None = None
     sites: tuple[str, ...] = ()
     roles: tuple[str, ...] = ()
-    field: str = "any"
+    field: str = "any"  # field of the bits: sign, exponent, mantissa or any
     bits: int = 1
     null: bool = False
 

@@ -70,10 +70,10 @@ class PlatformProfile:
 class _KernelEntry:
     """A kernel in a file: a latency, or a factor on the base's latency."""
 
-    latency_s: float | None = None
-    scale: float | None = None
+    latency_s: float | None = None  # median latency of one invocation
+    scale: float | None = None  # factor on the base's latency, instead of latency_s
     spread: float | None = None  # None: that of the base, or 0
-    source: str = ""
+    source: str = ""  # of the number
 
     def __post_init__(self) -> None:
         if (self.latency_s is None) is (self.scale is None):
@@ -86,17 +86,17 @@ class _KernelEntry:
 class _PlatformFile:
     """A platform's TOML file: the keys of `PlatformProfile`, with other kernels."""
 
-    name: str
-    cores: int
-    kernels: dict[str, _KernelEntry] = field(default_factory=dict)
+    name: str  # of the platform
+    cores: int  # number of nodes that compute at the same time
+    kernels: dict[str, _KernelEntry] = field(default_factory=dict)  # kernel -> its entry
     base: str = ""  # a shipped platform
     scale: float = 1.0  # factor on the base's latencies of kernels without an entry
-    description: str = ""
-    carried: bool = True
-    power_w: float | None = None
-    mass_kg: float | None = None
-    heatsink_kgpw: float | None = None
-    sources: dict[str, str] = field(default_factory=dict)
+    description: str = ""  # which `mavfi platforms` prints
+    carried: bool = True  # false: it stays on the ground, without mass and power for the vehicle
+    power_w: float | None = None  # thermal design power
+    mass_kg: float | None = None  # of the board, without the heat sink
+    heatsink_kgpw: float | None = None  # mass of the heat sink for each watt
+    sources: dict[str, str] = field(default_factory=dict)  # key -> source of its value
 
     def __post_init__(self) -> None:
         for kernel in self.kernels:

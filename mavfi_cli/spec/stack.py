@@ -81,13 +81,13 @@ class Stack:
         sources: Source of the value of each key.
     """
 
-    name: str
+    name: str  # of the stack; by default that of the file
     stretches_clock: bool
     skips_endless_slices: bool
     guards_tracking: bool
-    tracking_guard_m: float
+    tracking_guard_m: float  # see guards_tracking
     refuses_far_waypoints: bool
-    farthest_waypoint_m: float
+    farthest_waypoint_m: float  # see refuses_far_waypoints
     shifts_path_to_vehicle: bool
     owns_sequence_numbers: bool
     stops_on_report: bool
@@ -108,8 +108,8 @@ class Stack:
     turns_before_departure: bool
     rejected_plan_pause_s: float
     slows_where_blind: bool
-    description: str = ""
-    base: str = ""
+    description: str = ""  # which `mavfi stacks` prints
+    base: str = ""  # name of a shipped stack that has the other values
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

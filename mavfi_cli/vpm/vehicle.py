@@ -39,20 +39,20 @@ class _Calibration:
 class ModelVehicle:
     """A quadrotor of the model; a number is None until it has been calibrated."""
 
-    name: str
+    name: str  # of the vehicle
     mass_kg: float  # frame, rotors and battery, without the boards
     rotor_pull_n: float | None = None  # thrust of all rotors at full throttle
     response_s: float | None = None  # from sensing to acting, if no platform is named
     range_m: float  # range of the sensor
-    sensor_hz: float
+    sensor_hz: float  # frame rate of the sensor
     hover_power_w: float  # at mass_kg
-    battery_wh: float
-    tilt_deg: float = 0.0
+    battery_wh: float  # energy of the full battery
+    tilt_deg: float = 0.0  # tilt of the rotors while braking
     board: str = ""  # a shipped board, if no platform is named
     flies_as: str = ""  # the simulated vehicle that stands in for it; empty: one of its size
-    description: str = ""
+    description: str = ""  # for readers of the file
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
-    calibration: _Calibration | None = None
+    calibration: _Calibration | None = None  # the number that a published ratio determines
 
     def __post_init__(self) -> None:
         for key in (
@@ -103,11 +103,11 @@ class ModelVehicle:
 class Board:
     """One copy of the computer that the vehicle carries."""
 
-    name: str
+    name: str  # of the board
     mass_kg: float  # without the heat sink
     power_w: float  # thermal design power
     heatsink_kgpw: float  # mass of the heat sink for each watt of power_w
-    description: str = ""
+    description: str = ""  # for readers of the file
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
 
     def __post_init__(self) -> None:

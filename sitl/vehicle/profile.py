@@ -287,15 +287,15 @@ class _StandIn:
     and drag stay those of the base. None keeps the value of the base.
     """
 
-    name: str
+    name: str  # of the vehicle
     base: str  # name of a shipped profile
-    description: str = ""
+    description: str = ""  # for readers of the file
     mass_kg: float | None = None  # ready to fly, without payload
-    extra_payload_kg: float = 0.0
+    extra_payload_kg: float = 0.0  # mass of a payload at the vehicle's centre
     rotor_pull_n: float | None = None  # static thrust of all rotors at full throttle
     acceleration_mps2: float | None = None  # horizontal acceleration that the tilt limit must allow
     hover_power_w: float | None = None  # electrical power of the rotors in hover at mass_kg
-    battery_wh: float | None = None
+    battery_wh: float | None = None  # energy of the full battery
     avionics_w: float | None = None  # power of everything except the rotors
 
     def __post_init__(self) -> None:
