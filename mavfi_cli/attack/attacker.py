@@ -131,7 +131,7 @@ class Attacker:
                 cpu_s=moment_s if cpu else None,
                 wall_s=None if cpu else moment_s,
             )
-            if isinstance(tracee.resume_until_alarm(alarm), Ended):
+            if tracee.resume_until_alarm(alarm) is not None:
                 return None, f"the {self.place.kind} ended before the moment"
             moment_s = plan.retry_s
             fault, reason = _fault_here(tracee, image, scope, plan, rng)
@@ -337,5 +337,5 @@ class EntryCounter:
         tracee = Tracee.attach(self._pid)
         tracee.breakpoint_at(self._address)
         armed()
-        while not isinstance(tracee.resume(), Ended):
+        while tracee.resume() is None:
             self._stops += tracee.registers.ip == self._address

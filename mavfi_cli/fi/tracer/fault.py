@@ -134,7 +134,7 @@ class FaultModel:
 _Operand = tuple[InstructionCorruption, int]  # a corruption without bits, and those to draw from
 
 
-def draw_corruption(
+def _draw_corruption(
     instruction: Instruction, model: FaultModel, rng: np.random.Generator
 ) -> InstructionCorruption | None:
     """Draw an operand of the instruction uniformly, then distinct bits of it uniformly.
@@ -270,7 +270,7 @@ class Strategy:
         """Draw a corruption of an instruction, given the next one; None gives it up."""
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
-        return draw_corruption(instruction, self.model, rng)
+        return _draw_corruption(instruction, self.model, rng)
 
 
 def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
@@ -307,7 +307,7 @@ def _draw_rosfi(
     instruction: Instruction, _following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
     """ROSFI: moves bits 52 to 62 (110 to 126 of XMM) to byte 0, and refuses most registers."""
-    drawn = draw_corruption(instruction, _ROSFI_MODEL, rng)
+    drawn = _draw_corruption(instruction, _ROSFI_MODEL, rng)
     if drawn is None or drawn.operand in _ROSFI_REFUSED:
         return None
     wide = drawn.site is Site.VECTOR

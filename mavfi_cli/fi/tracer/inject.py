@@ -19,7 +19,7 @@ from mavfi_cli.fi.tracer.arch import (
 )
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee, Trap
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
 class BitActivation(Enum):
@@ -78,17 +78,17 @@ def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
         return None
 
 
-def clean_step(tracee: Tracee, instruction: Instruction | None) -> Trap | Ended:
-    """Execute one whole instruction without leaving a trace of the trap flag in the target."""
+def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
+    """Execute one whole instruction without leaving a trace of the trap flag in the target.
+
+    Returns:
+        The end of the program, if it ended.
+    """
     if instruction is not None and instruction.run_over:
-        if tracee.run_to(instruction.next_address):
-            return Trap(code=0)
-        assert tracee.ended is not None
-        return tracee.ended
-    result = tracee.step()
-    if not isinstance(result, Ended) and instruction is not None:
+        tracee.run_to(instruction.next_address)
+    elif tracee.step() is None and instruction is not None:
         erase_trap(tracee.registers, tracee.memory, instruction)
-    return result
+    return tracee.ended
 
 
 def _apply(
@@ -104,7 +104,7 @@ def _apply(
     if corruption.site is Site.MEMORY:
         use = instruction.memory[corruption.memory_operand]
         place = address_of(use, instruction, tracee.registers.read)
-    if corruption.role is Role.DESTINATION and isinstance(clean_step(tracee, instruction), Ended):
+    if corruption.role is Role.DESTINATION and clean_step(tracee, instruction) is not None:
         return _not_applied("the program ended in the instruction", place, 0, start)
     try:
         before, after = _invert(tracee, instruction, corruption, place)
@@ -159,7 +159,7 @@ def _execute_corrupted(
     tracee.memory.write(instruction.address, corrupted)
     seen = tracee.memory.read(instruction.address, len(corrupted))
     decoded = decode(tracee.memory.read(instruction.address, 16), instruction.address)
-    if not isinstance(clean_step(tracee, decoded), Ended):
+    if clean_step(tracee, decoded) is None:
         tracee.memory.write(instruction.address, instruction.raw)
     return _number(instruction.raw), _number(seen)
 
@@ -192,7 +192,7 @@ def _follow(
         if read or (corruption.bits and not remaining):
             what = BitActivation.READ if read else BitActivation.OVERWRITTEN
             return Followed(activation=what, after_instructions=distance, instruction=current.text)
-        if isinstance(clean_step(tracee, current), Ended):
+        if clean_step(tracee, current) is not None:
             return Followed(activation=BitActivation.ENDED_BEFORE_READ, after_instructions=distance)
     what = BitActivation.NOT_READ_IN_WINDOW if window else BitActivation.NOT_FOLLOWED
     return Followed(activation=what, after_instructions=window)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
-import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -19,7 +18,6 @@ from pathlib import Path
 from types import TracebackType
 
 from mavfi_cli.core.errors import TracingForbidden
-from mavfi_cli.fi.tracer import linux
 
 PEEKUSER, POKEUSER = 3, 6
 CONT, SINGLESTEP, DETACH, SYSCALL = 7, 9, 17, 24
@@ -33,7 +31,6 @@ TRACE_OPTIONS = (
 EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
 WALL = 0x4000_0000
 ADDR_NO_RANDOMIZE = 0x0040000
-_AT_ENTRY, _AT_RANDOM = 9, 25
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ptrace = _libc.ptrace
@@ -180,27 +177,6 @@ def cpu_time_s(pid: int) -> float:
         return 0.0
 
 
-def entry_point(pid: int) -> int | None:
-    """The address at which a program begins."""
-    return _auxiliary(pid, _AT_ENTRY)
-
-
-def fix_random_bytes(pid: int, memory: Memory) -> None:
-    """Replace the random bytes that the kernel hands to a program that has not begun.
-
-    libc makes its stack canary of them.
-    """
-    place = _auxiliary(pid, _AT_RANDOM)
-    if place is not None:
-        memory.write(place, bytes(range(1, 17)))
-
-
-def _auxiliary(pid: int, key: int) -> int | None:
-    """A value of the auxiliary vector of a program."""
-    words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
-    return next((value for name, value in words if name == key), None)
-
-
 @dataclass(frozen=True, slots=True)
 class Status:
     """One report of waitpid about one thread."""
@@ -258,7 +234,7 @@ class ProcessTimer:
         self._pid = pid
         self._signal = number
         self._process = os.pidfd_open(pid)
-        self._cpu_end = None if cpu_s is None else linux.cpu_time_s(pid) + cpu_s
+        self._cpu_end = None if cpu_s is None else cpu_time_s(pid) + cpu_s
         self._wall_end = None if wall_s is None else time.monotonic() + wall_s
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -291,7 +267,7 @@ class ProcessTimer:
         """Lower bound of the time left; CPU time passes no faster than wall time."""
         left = []
         if self._cpu_end is not None:
-            left.append(self._cpu_end - linux.cpu_time_s(self._pid))
+            left.append(self._cpu_end - cpu_time_s(self._pid))
         if self._wall_end is not None:
             left.append(self._wall_end - time.monotonic())
         return min(left)

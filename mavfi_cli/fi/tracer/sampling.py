@@ -30,7 +30,7 @@ from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, Locate, detour_at
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
-from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Ended, Tracee
+from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Tracee
 
 _CHUNK = 16384
 _STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
@@ -158,16 +158,16 @@ def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[ND
     while tracee.ended is None:
         trace = np.empty(_CHUNK, np.int64)
         tracee.registers.forget()
-        steps = record_steps(tracee.tid, spans, trace, stop)
-        yield trace[: steps.count]
-        if steps.why is StepEnd.WINDOW_END:
+        recorded, why, status = record_steps(tracee.tid, spans, trace, stop)
+        yield trace[:recorded]
+        if why is StepEnd.WINDOW_END:
             return
-        if steps.why is StepEnd.OTHER_STATUS:
-            tracee.handle(linux.Status(tracee.tid, steps.status), linux.SINGLESTEP)
-        elif steps.why is StepEnd.NEEDS_CARE:
+        if why is StepEnd.OTHER_STATUS:
+            tracee.handle(linux.Status(tracee.tid, status), linux.SINGLESTEP)
+        elif why is StepEnd.NEEDS_CARE:
             yield np.array([tracee.registers.ip], np.int64)
             clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
-        elif steps.why is StepEnd.OUT_OF_SCOPE and not blanket.run_native(stop):
+        elif why is StepEnd.OUT_OF_SCOPE and not blanket.run_native(stop):
             return
 
 
@@ -188,7 +188,7 @@ class _Blanket:
         try:
             self._write(covered=True)
             while True:
-                if isinstance(tracee.resume(), Ended):
+                if tracee.resume() is not None:
                     return False
                 entered = tracee.registers.ip - TRAITS.breakpoint_advance
                 if entered in self._scope:

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import socket
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ _LAUNCHER = (
 
 
 MEMORY_BYTES = 2 << 30
+_AT_ENTRY, _AT_RANDOM = 9, 25
 _KEPT = frozenset(("HOME", "LANG", "LANGUAGE", "LD_LIBRARY_PATH", "PATH", "TZ"))
 _KEPT_BEGINNINGS = ("LC_", "OMP_", "OPENBLAS_", "MKL_")
 
@@ -104,7 +106,7 @@ def spawn(
             ours.send(b"\n")
             undo.pop_all()
     _await_exec(tracee, command)
-    linux.fix_random_bytes(tracee.pid, tracee.memory)
+    _fix_random_bytes(tracee)
     return tracee
 
 
@@ -114,7 +116,7 @@ def run_to_entry(tracee: Tracee) -> bool:
     Returns:
         False if the program ended first, for example because a library is missing.
     """
-    entry = linux.entry_point(tracee.pid)
+    entry = _auxiliary(tracee.pid, _AT_ENTRY)
     return entry is not None and tracee.run_to(entry)
 
 
@@ -149,3 +151,19 @@ def _await_exec(tracee: Tracee, command: Program) -> None:
             return
         number = status.signal if status.event == 0 else 0
         linux.request(linux.CONT, tracee.pid, 0, number)
+
+
+def _fix_random_bytes(tracee: Tracee) -> None:
+    """Replace the random bytes that the kernel hands to a program that has not begun.
+
+    libc makes its stack canary of them.
+    """
+    place = _auxiliary(tracee.pid, _AT_RANDOM)
+    if place is not None:
+        tracee.memory.write(place, bytes(range(1, 17)))
+
+
+def _auxiliary(pid: int, key: int) -> int | None:
+    """A value of the auxiliary vector of a program (getauxval(3))."""
+    words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
+    return next((value for name, value in words if name == key), None)

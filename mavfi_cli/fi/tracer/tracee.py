@@ -38,8 +38,6 @@ from mavfi_cli.fi.tracer.arch import (
 )
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 
-TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL = 1, 2, 4, 6, 0x80
-
 DETOUR_COST = 20  # counted hits from which a detour is quicker; to make one takes some 15 hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
@@ -108,7 +106,7 @@ def perf_allowed() -> str | None:
     return None
 
 
-_TRACER_TRAPS = frozenset((TRAP_BRKPT, TRAP_TRACE, TRAP_HWBKPT, TRAP_PERF, SI_KERNEL))
+_TRACER_TRAPS = frozenset((1, 2, 4, 6, 0x80))  # TRAP_BRKPT, _TRACE, _HWBKPT, _PERF, SI_KERNEL
 _NOT_FROM_OTHERS = 0x2000_0000  # __WNOTHREAD: only tracees and children of this thread
 _ANY_CHILD = -1
 
@@ -119,13 +117,6 @@ class Ended:
 
     exit_code: int | None
     signal: int | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trap:
-    """A stop of the target thread by our own trap."""
-
-    code: int  # si_code: TRAP_TRACE, TRAP_PERF, ...
 
 
 @dataclass(slots=True)
@@ -180,15 +171,15 @@ class Tracee:
         self._await()
         self._interrupting = False
 
-    def step(self) -> Trap | Ended:
-        """Execute one instruction (one iteration of a repeated string instruction)."""
+    def step(self) -> Ended | None:
+        """Execute one instruction, or one iteration of a repeated one; return as `resume`."""
         return self._go(linux.SINGLESTEP)
 
-    def resume(self) -> Trap | Ended:
-        """Run until our own trap stops the target thread, or to the end."""
+    def resume(self) -> Ended | None:
+        """Run until our own trap stops the target thread: None; or to the end."""
         return self._go(linux.CONT)
 
-    def resume_until_alarm(self, alarm: ProcessTimer) -> Trap | Ended:
+    def resume_until_alarm(self, alarm: ProcessTimer) -> Ended | None:
         """Run until `alarm` sends its SIGTRAP, which is not delivered to the program."""
         self._expecting_alarm = True
         try:
@@ -223,7 +214,7 @@ class Tracee:
         if self.mechanism is Mechanism.PERF:
             counter = ExecutionCounter(self.tid, address)
             try:
-                while not isinstance(self.resume(), Ended):
+                while self.resume() is None:
                     pass
                 return counter.read()
             finally:
@@ -231,7 +222,7 @@ class Tracee:
         count = 0
         breakpoint_ = self.breakpoint_at(address)
         try:
-            while not isinstance(self.resume(), Ended):
+            while self.resume() is None:
                 count += self.registers.ip == address
             return count
         finally:
@@ -273,7 +264,7 @@ class Tracee:
 
     # -- waiting
 
-    def _go(self, how: int) -> Trap | Ended:
+    def _go(self, how: int) -> Ended | None:
         self.registers.forget()
         linux.request(how, self.tid, 0, self._take_signal())
         return self._await(how)
@@ -284,11 +275,11 @@ class Tracee:
             self.signals.append(number)
         return number
 
-    def _await(self, how: int = linux.CONT) -> Trap | Ended:
+    def _await(self, how: int = linux.CONT) -> Ended | None:
         """Handle reports until the target thread stops for us or the process ends."""
         return self.handle(self._wait(), how)
 
-    def handle(self, status: linux.Status, how: int) -> Trap | Ended:
+    def handle(self, status: linux.Status, how: int) -> Ended | None:
         """Handle a report and all that follow, until the target stops for us or ends.
 
         Args:
@@ -297,12 +288,10 @@ class Tracee:
         while True:
             if status.ended:
                 if self._note_end(status):
-                    assert self.ended is not None
                     return self.ended
             elif status.tid == self.tid:
-                trap = self._target_stopped(status)
-                if trap is not None:
-                    return trap
+                if self._trapped(status):
+                    return None
                 self._continue(status, how)
             else:
                 self._continue(status, linux.CONT)
@@ -334,22 +323,21 @@ class Tracee:
             else:
                 self._continue(status, linux.CONT)
 
-    def _target_stopped(self, status: linux.Status) -> Trap | None:
-        """The trap that the caller waits for; None for a passing stop."""
+    def _trapped(self, status: linux.Status) -> bool:
+        """True if the caller waits for this stop of the target; False if it passes."""
         if status.event == linux.EVENT_STOP:
-            return Trap(code=TRAP_BRKPT) if self._interrupting else None
+            return self._interrupting
         if status.trapped:
             code = linux.signal_code(self.tid)
-            if self._expecting_alarm and code <= 0:  # sent by a process
-                return Trap(code=code)
-            return Trap(code=code) if code in _TRACER_TRAPS else None
+            sent = self._expecting_alarm and code <= 0  # by a process
+            return sent or code in _TRACER_TRAPS
         if self._interrupting and status.event == 0:
             # A signal came first. It is delivered when the thread goes on; the interrupt is
             # still pending and would stop the thread again: consume it now.
             self._pending_signal = status.signal
             self._interrupting = False
-            return Trap(code=TRAP_BRKPT)
-        return None
+            return True
+        return False
 
     def _continue(self, status: linux.Status, how: int) -> None:
         """Resume a thread from a passing stop; signals are delivered."""
@@ -386,7 +374,7 @@ class Tracee:
             return None
         replaced = {place: self.memory.read(place, len(jump)) for place, jump in way.jumps.items()}
         self._write({**way.pages, **way.jumps})
-        while not isinstance(self.resume(), Ended):
+        while self.resume() is None:
             if self.registers.ip == way.stop:
                 self._write(replaced)
                 self.registers.write(TRAITS.instruction_pointer, address)
@@ -428,7 +416,7 @@ class Tracee:
             return self._run_to_stepwise(address, count)
         try:
             while True:
-                if isinstance(self.resume(), Ended):
+                if self.resume() is not None:
                     return False
                 if self.registers.ip == address:
                     return True
@@ -439,7 +427,7 @@ class Tracee:
         breakpoint_ = DebugBreakpoint(self.tid, address)
         try:
             while count:
-                if isinstance(self.resume(), Ended):
+                if self.resume() is not None:
                     return False
                 count -= self.registers.ip == address
             return True

@@ -11,7 +11,7 @@ if platform.machine() != "x86_64":
 
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import FaultModel, Role, Site, draw_corruption
+from mavfi_cli.fi.tracer.fault import FaultModel, Role, Site, strategy
 
 
 def of(code):
@@ -19,8 +19,8 @@ def of(code):
 
 
 def drawn(instruction, model, count=300, seed=1):
-    rng = np.random.default_rng(seed)
-    return [draw_corruption(instruction, model, rng) for _ in range(count)]
+    plan, rng = strategy("instruction-uniform", model), np.random.default_rng(seed)
+    return [plan.draw_at(instruction, rng) for _ in range(count)]
 
 
 ADD = of("01c3")  # add ebx, eax
@@ -126,8 +126,7 @@ def test_sites_beyond_data_registers_are_asked_for():
 def test_the_flags_of_an_instruction_are_one_operand():
     add = decode(bytes.fromhex("4801d8"), 0)  # add rax, rbx
     model = FaultModel(sites=frozenset((Site.FLAGS,)))
-    rng = np.random.default_rng(1)
-    found = [draw_corruption(add, model, rng) for _ in range(200)]
+    found = drawn(add, model, 200)
     assert {(c.operand, c.register, c.role) for c in found} == {
         ("rflags", "rflags", Role.DESTINATION)
     }

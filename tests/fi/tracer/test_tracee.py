@@ -70,7 +70,7 @@ def test_a_stop_inside_a_blocking_system_call_resumes_correctly(start, tmp_path)
     begin = time.monotonic()
     alarm = ProcessTimer(tracee.pid, signal.SIGTRAP, cpu_s=None, wall_s=0.05)
     stopped = tracee.resume_until_alarm(alarm)
-    assert not isinstance(stopped, Ended)
+    assert stopped is None
     assert tracee.registers.system_call in (35, 230)  # nanosleep, clock_nanosleep
     unused = tracee.registers.read("r15")
     tracee.registers.write("r15", unused ^ 1)
@@ -131,7 +131,7 @@ def test_stepping_through_thread_creation_does_not_deadlock(start, tmp_path):
     tracee = start("threads")
     assert tracee.run_to(entry(tracee, "threads", "main"))
     for _ in range(2000):
-        if isinstance(clean_step(tracee, instruction_at(tracee, tracee.registers.ip)), Ended):
+        if clean_step(tracee, instruction_at(tracee, tracee.registers.ip)) is not None:
             break
     if tracee.ended is None:
         tracee.resume()
@@ -179,12 +179,13 @@ def test_counting_without_stopping(start):
 
 
 def test_attach_to_a_running_process_and_detach(native_program):
-    process = subprocess.Popen([native_program("sleeper")], stdout=subprocess.PIPE)
+    native_program("counting")  # skips where nothing can be traced
+    process = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     tracee = Tracee.attach(process.pid)
     assert tracee.registers.ip
     tracee.detach()
-    output, _ = process.communicate(timeout=10)
-    assert (process.returncode, output) == (0, b"0\n")
+    output, _ = process.communicate(b"on", timeout=60)
+    assert (process.returncode, output) == (0, b"on")
 
 
 def test_attaching_to_nothing_is_a_clear_error():

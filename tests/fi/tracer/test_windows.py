@@ -16,7 +16,7 @@ from mavfi_cli.fi.tracer.sampling import (
     draw_fault,
     record_window,
 )
-from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism
+from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism
 
 
 def profile_of(start, name, *arguments, limit=100_000):
@@ -40,7 +40,7 @@ def stepped_in_python(start, name, *arguments):
         here = tracee.registers.ip
         if here in scope:
             trace.append(here)
-        if isinstance(clean_step(tracee, instruction_at(tracee, here)), Ended):
+        if clean_step(tracee, instruction_at(tracee, here)) is not None:
             return trace
 
 

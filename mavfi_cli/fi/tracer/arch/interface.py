@@ -1,4 +1,4 @@
-"""Types that are the same on every processor: operands of one instruction, traits, steps."""
+"""Types that are the same on every processor: operands of an instruction, traits, ends of steps."""
 
 from __future__ import annotations
 
@@ -120,14 +120,5 @@ class StepEnd(IntEnum):
     FULL = 0  # no room for more
     OUT_OF_SCOPE = 1  # foreign code is next
     NEEDS_CARE = 2  # the next instruction leaves traces of the stepping
-    OTHER_STATUS = 3  # the report was not a step: see `status`
+    OTHER_STATUS = 3  # the wait status was not that of a step
     WINDOW_END = 4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Steps:
-    """The result of a run of single steps."""
-
-    count: int  # addresses recorded
-    why: StepEnd
-    status: int  # the last wait status

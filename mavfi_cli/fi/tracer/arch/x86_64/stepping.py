@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch.interface import Instruction, StepEnd, Steps
+from mavfi_cli.fi.tracer.arch.interface import Instruction, StepEnd
 from mavfi_cli.fi.tracer.arch.x86_64.registers import TRAP_FLAG, Registers
 
 _USER_OFFSETS = (128, 152)  # of rip and rsp in `struct user`
@@ -17,20 +17,24 @@ _DEBUG_REGISTERS = 848  # offset of debug register 0 in `struct user`
 
 def record_steps(
     tid: int, spans: NDArray[np.int64], trace: NDArray[np.int64], stop: NDArray[np.int64]
-) -> Steps:
+) -> tuple[int, StepEnd, int]:
     """Single-step a stopped thread and record the address of each instruction in scope.
 
     Args:
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start; a repeated string instruction is one entry.
-        stop: (2,) the window ends at this address once the stack pointer is above the second.
+        stop: (2 + n,) the window ends at the first address once the stack pointer is above the
+            second number, and at each of the other addresses.
+
+    Returns:
+        The number of recorded addresses, why the recording ended, and the last wait status.
     """
     from mavfi_cli.fi.tracer.arch.x86_64 import stepper  # numba takes half a second to import
 
     status = np.zeros(1, np.int32)
     offsets = np.array(_USER_OFFSETS, np.int64)
     count, why = stepper.run(tid, spans, trace, stop, offsets, status)
-    return Steps(count=int(count), why=StepEnd(int(why)), status=int(status[0]))
+    return int(count), StepEnd(int(why)), int(status[0])
 
 
 def erase_trap(registers: Registers, memory: linux.Memory, instruction: Instruction) -> None:
