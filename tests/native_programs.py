@@ -233,9 +233,10 @@ def tracing_problem():
 
     if platform.machine() != "x86_64":
         return f"instruction-level injection does not know {platform.machine()}"
-    from mavfi_cli.fi.tracer.doctor import check_tracing
+    from mavfi_cli.mission.machine import OK, check_tracing
 
-    return check_tracing().problem
+    found = check_tracing()
+    return None if found.verdict == OK else found.found
 
 
 @pytest.fixture

@@ -16,8 +16,14 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.processes import PYTHON
+
+if TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.arch import Registers
+    from mavfi_cli.fi.tracer.tracee import Mechanism
 
 OK = "ok"
 LIMITED = "limited"  # flying works, but something else does not
@@ -61,6 +67,11 @@ sys.exit(0 if height_m > 1.0 else 1)
 _ALLOW_PTRACE = (
     "allow ptrace: sysctl kernel.yama.ptrace_scope=1; in a container --cap-add SYS_PTRACE"
 )
+_PERF_REMEDY = (
+    "perf_event_open needs Linux 5.13, kernel.perf_event_paranoid at most 2, and in a container a "
+    "seccomp profile that allows it"
+)
+_COUNTING = "counted breakpoints"
 _INSTALL = "pip install -e . in the project's folder"
 _EXTRAS = {
     "train": "torch", "cluster": "distributed", "pandas": "pandas", "report": "jinja2",
@@ -154,16 +165,68 @@ def _physics() -> Check:
 def _injection() -> Iterator[Check]:
     """Test tracing and counted breakpoints on a real program."""
     from mavfi_cli.fi.tracer.arch import SUPPORTED
-    from mavfi_cli.fi.tracer.doctor import check_counting, check_tracing
 
     if not SUPPORTED:
         remedy = "instruction-level injection is not available here"
         yield _check("Tracing", "not Linux on x86-64", remedy=remedy)
         return
-    for capability in (check_tracing(), check_counting()):
-        failed = capability.problem is not None
-        yield _check(
-            capability.name,
-            capability.problem or capability.found,
-            remedy=capability.remedy or (_ALLOW_PTRACE if failed else ""),
-        )
+    yield check_tracing()
+    yield _counting()
+
+
+def check_tracing(mechanism: Mechanism | None = None) -> Check:
+    """Start a program, stop it at its entry point, flip a register there and back, let it go.
+
+    Args:
+        mechanism: How executions are counted; by default the best that is allowed.
+    """
+    from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
+
+    problem = ""
+    with tempfile.TemporaryDirectory(prefix="mavfi-doctor-") as folder:
+        output = Path(folder) / "output"
+        try:
+            command = Program.of(["true"], environment=dict(os.environ))
+            tracee = spawn(command, stdout=output, stderr=output, mechanism=mechanism)
+            try:
+                problem = (
+                    _flip_and_back(tracee.registers)
+                    if run_to_entry(tracee)
+                    else "a hardware breakpoint never hit"
+                )
+            finally:
+                tracee.kill()
+        except (MavfiError, OSError) as error:
+            problem = str(error)
+    if problem:
+        return _check("ptrace", problem, remedy=_ALLOW_PTRACE)
+    return _check("ptrace", "a program was stopped, a register flipped and read back")
+
+
+def _flip_and_back(registers: Registers) -> str:
+    """Flip a bit of two registers and restore them; return the problem, if there is one."""
+    from mavfi_cli.fi.tracer.arch import widest_vector
+
+    for register in ("rbx", f"{widest_vector()}15"):
+        before = registers.read(register)
+        registers.write(register, before ^ 1)
+        if registers.read(register) != before ^ 1:
+            return f"a flip of {register} did not stick"
+        registers.write(register, before)
+    return ""
+
+
+def _counting() -> Check:
+    """Find the mechanism that counts executions here; the worse one is tried."""
+    from mavfi_cli.fi.tracer.tracee import Mechanism, perf_allowed
+
+    refused = perf_allowed()
+    if refused is None:
+        return _check(_COUNTING, "by the kernel (perf_event_open)")
+    tried = check_tracing(Mechanism.DEBUG)
+    if tried.verdict != OK:
+        found = f"perf_event_open: {refused}; debug registers: {tried.found}"
+        return _check(_COUNTING, found, remedy=_ALLOW_PTRACE)
+    slower = "by debug registers, about three times slower a hit"
+    found = f"{slower}: perf_event_open is refused ({refused})"
+    return _check(_COUNTING, found, remedy=_PERF_REMEDY)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from missions import POSTS
-from native_programs import native_program, start  # noqa: F401
+from native_programs import native_program, start, tracing_problem  # noqa: F401
 
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
@@ -17,13 +17,7 @@ from mavfi_cli.spec.mission import MissionConfig
 @pytest.fixture(scope="session")
 def tracing():
     """Skips where nothing can be traced."""
-    import platform
-
-    if platform.machine() != "x86_64":
-        pytest.skip("instruction-level injection does not know this processor")
-    from mavfi_cli.fi.tracer.doctor import check_tracing
-
-    problem = check_tracing().problem
+    problem = tracing_problem()
     if problem:
         pytest.skip(problem)
 

@@ -10,8 +10,8 @@ from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import write_parquet
 from mavfi_cli.fi.tracer.arch import SUPPORTED
-from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission import run as run_module
+from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.repetition import paired_golden
@@ -20,7 +20,7 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 CUT_OFF = "interrupted: the mission was not flown to its end"
 traced = pytest.mark.skipif(
-    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+    not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
 )
 
 

@@ -12,9 +12,9 @@ from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED, decode
-from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
 from mavfi_cli.fi.tracer.image import Image, Location
+from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
@@ -28,7 +28,7 @@ UNKNOWN = {"stamp_s": 0.0, "sampling": "chosen", "windows": "none", "seed": 0, "
            "profiled_instructions": 0}  # fmt: skip
 
 pytestmark = pytest.mark.skipif(
-    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+    not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
 )
 
 

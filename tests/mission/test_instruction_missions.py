@@ -20,11 +20,11 @@ from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
-from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.fi.tracer.fault import Rule
 from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
@@ -34,7 +34,7 @@ from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 traced = pytest.mark.skipif(
-    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+    not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
 )
 OF_THE_FAULT = ("host", "fault", "config", "seeds")
 

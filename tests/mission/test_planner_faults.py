@@ -14,10 +14,10 @@ from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
-from mavfi_cli.fi.tracer.doctor import check_tracing
 from mavfi_cli.mission.instruction.injection import draw_invocation
 from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
+from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.replay import config_of
@@ -26,7 +26,7 @@ from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 traced = pytest.mark.skipif(
-    not SUPPORTED or check_tracing().problem is not None, reason="nothing can be traced here"
+    not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
 )
 SEGMENT, PIECES, OMPL = "numba:segment_free", "numba:path_free", "libompl.so"
 READER = "numba:decode_leaves"
