@@ -141,6 +141,8 @@ def _error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
+    """Over the flights that have a flight time; a mission that was cut off has none."""
+    alarms, hours = alarms[hours > 0.0], hours[hours > 0.0]
     total = float(hours.sum())
     if total > 0.0 and not alarms.any():
         return Interval(value=0.0, low=0.0, high=_NOTHING_SEEN / total, count=len(alarms))

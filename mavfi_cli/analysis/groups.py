@@ -194,5 +194,5 @@ def _parts(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> lis
     mine = group_of[whole["cell"].to_numpy()]
     ordered = whole.take(np.argsort(mine, kind="stable"))
     ends = np.searchsorted(np.sort(mine), np.arange(len(members)), side="right").tolist()
-    begins = [0, *ends[:-1]]
+    begins = [0, *ends][:-1]
     return [ordered.slice(a, b - a) for a, b in zip(begins, ends, strict=True)]

@@ -85,7 +85,7 @@ class _Match:
         return found
 
 
-def _against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+def _against_golden(groups: Sequence[Group], confidence: float) -> list[dict[str, Any]]:
     """Compare each setting with faults with the golden setting that shares most pairs.
 
     Returns:
@@ -104,7 +104,7 @@ def _against_golden(groups: Sequence[Group], confidence: float = 0.95) -> list[d
     return _compared(found, confidence)
 
 
-def _protection(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
+def _protection(groups: Sequence[Group], confidence: float) -> list[dict[str, Any]]:
     """Compare each protected setting with the unprotected one that has the same faults.
 
     Returns:

@@ -115,7 +115,7 @@ def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
 
 
 def interval_of_rows(
-    count: int, statistic: Callable[[IntArray], FloatArray], *, resamples: int = RESAMPLES
+    count: int, statistic: Callable[[IntArray], FloatArray], *, resamples: int
 ) -> Interval:
     """A statistic of several columns with its interval, by resampling their rows together.
 

@@ -54,6 +54,12 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     assert told[4].endswith("  collision 1, not activated 1, not injected 1, null 1")
 
 
+def test_a_campaign_that_was_killed_before_it_had_a_list_has_no_row(book):
+    told = summarise(book.ledger)
+    assert (told["missions"], told["cells"], told["faults"]) == (0, [], [])
+    assert "over" in campaign_lines(told)[0]
+
+
 def test_errors_are_counted_nowhere_else(book):
     fill(book)
     book.ledger.plan([PlannedMission(config=MissionConfig(seed=99), labels={"setting": "golden"})])

@@ -50,6 +50,13 @@ def test_no_alarm_at_all_still_has_an_upper_limit():
     assert math.exp(-found.alarms_per_hour.high) == pytest.approx(0.025)
 
 
+def test_missions_without_a_flight_time_have_no_part_in_the_rate():
+    cut_off = error_free(watched=flown("crash", None))
+    found = error_free_metrics([error_free(seed=2, watched=flown(alarms_s=(1.0,))), cut_off])
+    assert (found.alarms_per_hour.value, found.alarms_per_hour.count) == (36.0, 1)
+    assert math.isnan(error_free_metrics([cut_off]).alarms_per_hour.value)
+
+
 def test_missions_lost_and_lengthened_by_false_alarms():
     pairs = [
         error_free(flown(), flown(time_s=102.0), seed=0),
