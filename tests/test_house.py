@@ -28,7 +28,6 @@ UNCALLED = {
     "checkMotion": "OMPL calls it",
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
     "occupied_voxels": "what a map holds, for tests of the map",
-    "capturing": "what a camera does, for tests of the camera",
 }
 COMMANDS = ("mavfi_cli/cli/", "sitl/world/command.py")  # functions that click calls by decorator
 

@@ -288,15 +288,13 @@ class Codec:
             neither.
 
     Attributes:
-        decoded: Number of decoded messages.
         bad_bytes: Number of received bytes that belong to no frame.
         unknown: Number of skipped frames with an id that the dialect lacks.
         refused: Number of frames that signing rejected.
     """
 
     __slots__ = (
-        "_rest", "_sequence", "_signing", "bad_bytes", "component", "decoded", "refused", "system",
-        "unknown",
+        "_rest", "_sequence", "_signing", "bad_bytes", "component", "refused", "system", "unknown",
     )  # fmt: skip
 
     def __init__(self, system: int, component: int, *, signing: Signing | None = None) -> None:
@@ -305,7 +303,6 @@ class Codec:
         self._signing = signing
         self._sequence = 0
         self._rest = b""
-        self.decoded = 0
         self.bad_bytes = 0
         self.unknown = 0
         self.refused = 0
@@ -356,7 +353,6 @@ class Codec:
                 self.bad_bytes += 1
                 position += 1
         self._rest = buffer[position:]
-        self.decoded += len(messages)
         return messages
 
     def _take(self, buffer: bytes, start: int, end: int, messages: list[Message]) -> bool:

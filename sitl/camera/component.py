@@ -142,11 +142,6 @@ class Camera:
             self._boot_ms, *offset, 0.0, 0.0, 0.0
         )
 
-    @property
-    def capturing(self) -> bool:
-        """True while frames are streamed."""
-        return self._frames is not None
-
     def handle(self, message: Message) -> list[Message]:
         """Return the answer to a message, or nothing if it is not for a camera."""
         kind = message.get_type()

@@ -27,7 +27,7 @@ from mavfi_cli.core.frames import Vector, rotation_matrix
 
 LEVELS_PER_M = 10.0
 NOTHING = 255
-MAX_RANGE_M = 25.5
+_MAX_RANGE_M = 25.5
 
 _NEAR_M = 1e-6
 _TOUCHING_M = 1e-3
@@ -47,7 +47,6 @@ def render_depth(
     columns: int,
     rows: int,
     hfov_rad: float,
-    max_range_m: float = MAX_RANGE_M,
 ) -> Image:
     """Render a depth image (rows, columns), uint8, 0.1 m per level, 255 if nothing is in range.
 
@@ -59,7 +58,6 @@ def render_depth(
         columns: Image width, at least 1.
         rows: Image height, at least 1.
         hfov_rad: Horizontal field of view, between 0 and pi, rad.
-        max_range_m: Planar depth limit of the range, at most 25.5 m.
 
     Raises:
         ValueError: The image size or field of view is invalid.
@@ -71,7 +69,7 @@ def render_depth(
     image = np.empty((rows, columns), dtype=np.uint8)
     boxes = np.ascontiguousarray(boxes_enu_m, dtype=np.float64)
     rotation = rotation_matrix(quaternion_flu_enu)
-    _render(boxes, position_enu_m, rotation, focal_px, max_range_m, _EDGES, depth, image)
+    _render(boxes, position_enu_m, rotation, focal_px, _EDGES, depth, image)
     return image
 
 
@@ -81,7 +79,6 @@ def _render(
     position: Vector,
     rotation: Vector,
     focal_px: float,
-    max_range_m: float,
     edges: NDArray[np.int64],
     depth: Vector,
     image: Image,
@@ -97,7 +94,7 @@ def _render(
         if _touches(boxes[box], position):
             window[:] = 0
             window[1], window[3] = depth.shape
-        elif corners[:, 0].max() < 0.0 or corners[:, 0].min() > max_range_m:
+        elif corners[:, 0].max() < 0.0 or corners[:, 0].min() > _MAX_RANGE_M:
             continue
         else:
             _window(corners, edges, focal_px, depth.shape, window)
@@ -105,7 +102,7 @@ def _render(
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             level = math.inf
-            if depth[row, column] < max_range_m:
+            if depth[row, column] < _MAX_RANGE_M:
                 level = math.floor(depth[row, column] * LEVELS_PER_M)
             image[row, column] = NOTHING if level >= NOTHING else np.uint8(level)
 

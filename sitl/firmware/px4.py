@@ -74,8 +74,6 @@ class Px4Link:
 
     Attributes:
         port: TCP port of the connection, which numbers the instances of PX4.
-        unanswered: Number of steps without an answer since the first answer. Lockstep held in all
-            others.
     """
 
     step_s = STEP_S
@@ -91,7 +89,6 @@ class Px4Link:
         self._steps = 0
         self._heard = False
         self._answers = False
-        self.unanswered = 0
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
@@ -208,7 +205,6 @@ class Px4Link:
                 self._answers = True
                 return
             if remaining_s <= 0.0:
-                self.unanswered += self._answers or self.unanswered > 0
                 self._answers = False
                 return
 

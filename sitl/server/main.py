@@ -23,6 +23,7 @@ from mavfi_cli.link.codec import Signing, dialect, key_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import memory_pair, open_transport
 from sitl.autopilot.streams import STEP_US, TICK_US, Preset
+from sitl.camera.component import Camera
 from sitl.command_line import exit_code, stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.peers import Peers
@@ -337,26 +338,20 @@ def _simulation(
     options: ServerOptions, world: World, profile: VehicleProfile, *, logs: bool
 ) -> Simulation:
     columns, rows = options.camera_size
+    camera = Camera(
+        world.boxes_enu_m, columns=columns, rows=rows, rate_hz=options.camera_rate_hz,
+        heartbeat_hz=options.camera_heartbeat_hz, system=options.system_id,
+        mount_offset_flu_m=profile.camera_mount_flu_m,
+    )  # fmt: skip
     settings: dict[str, Any] = {
-        "system_id": options.system_id,
-        "camera_columns": columns,
-        "camera_rows": rows,
-        "camera_rate_hz": options.camera_rate_hz,
-        "camera_heartbeat_hz": options.camera_heartbeat_hz,
-        "trusted": options.trusted,
-        "logs": logs,
-    }
+        "camera": camera, "system_id": options.system_id, "logs": logs,
+    }  # fmt: skip
     if options.firmware_kind is None:
-        return Simulation(world, profile, **settings)
+        return Simulation(world, profile, trusted=options.trusted, **settings)
     return FirmwareSimulation(
-        world,
-        profile,
-        options.firmware_kind,
-        options.firmware,
-        seed=options.firmware_seed,
-        url=options.firmware_link,
-        **settings,
-    )
+        world, profile, options.firmware_kind, options.firmware,
+        seed=options.firmware_seed, url=options.firmware_link, **settings,
+    )  # fmt: skip
 
 
 def _announce(options: ServerOptions, simulation: Simulation) -> None:

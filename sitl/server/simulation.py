@@ -36,13 +36,10 @@ class Simulation:
     Args:
         world: world of the flight, which begins at the world's start, facing the goal.
         profile: profile of the vehicle.
+        camera: its depth camera; None for one with default settings.
         system_id: MAVLink system id.
-        camera_columns: depth image width, pixels.
-        camera_rows: depth image height, pixels.
-        camera_rate_hz: frames per second for clients that request no interval.
         step_s: physics step.
         autopilot: real firmware in the place of the autopilot; None for our own.
-        camera_heartbeat_hz: heartbeats of the camera per second; 0 for none.
         trusted: MAVLink systems that may command; empty for all.
         logs: keep the truth of every tick for `save_truth`.
 
@@ -59,27 +56,18 @@ class Simulation:
         world: World,
         profile: VehicleProfile,
         *,
+        camera: Camera | None = None,
         system_id: int = 1,
-        camera_columns: int = 64,
-        camera_rows: int = 48,
-        camera_rate_hz: float = 10.0,
         step_s: float = _STEP_S,
         autopilot: FirmwareAutopilot | None = None,
-        camera_heartbeat_hz: float = 1.0,
         trusted: Sequence[int] = (),
         logs: bool = True,
     ) -> None:
         self._world, self._profile = world, profile
         self._system_id, self._trusted, self._logs = system_id, trusted, logs
         self._step_s, self._firmware_autopilot = step_s, autopilot
-        self.camera = Camera(
-            world.boxes_enu_m,
-            columns=camera_columns,
-            rows=camera_rows,
-            mount_offset_flu_m=profile.camera_mount_flu_m,
-            rate_hz=camera_rate_hz,
-            heartbeat_hz=camera_heartbeat_hz,
-            system=system_id,
+        self.camera = camera or Camera(
+            world.boxes_enu_m, mount_offset_flu_m=profile.camera_mount_flu_m, system=system_id
         )
         self.wall = WallClock()
         self.camera_due: list[Any] = []

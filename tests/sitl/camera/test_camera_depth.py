@@ -137,13 +137,11 @@ def test_inside_a_box_everything_is_at_zero() -> None:
     assert not render_depth(box, np.array([0, 0, 5.0]), LEVEL, 8, 6, HFOV).any()
 
 
-def test_range_ends_where_it_is_told_to() -> None:
-    wall = np.array([[10.05, -500, -500, 11, 500, 500.0]])
+@pytest.mark.parametrize(("away_m", "level"), [(10.05, 100), (25.45, 254), (25.5, 255), (40, 255)])
+def test_the_range_ends_at_the_last_level(away_m: float, level: int) -> None:
+    wall = np.array([[away_m, -500, -500, 50, 500, 500.0]])
     up = np.array([0, 0, 300.0])
-    assert (render_depth(wall, up, LEVEL, 8, 6, HFOV, 10.0) == 255).all()
-    assert (render_depth(wall, up, LEVEL, 8, 6, HFOV, 10.1) == 100).all()
-    far = np.array([[25.5, -500, -500, 26, 500, 500.0]])
-    assert (render_depth(far, up, LEVEL, 8, 6, HFOV, 100.0) == 255).all()
+    assert (render_depth(wall, up, LEVEL, 8, 6, HFOV) == level).all()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])

@@ -44,7 +44,6 @@ def test_motor_outputs_are_those_of_the_armed_frames(wire: Wire, resting: Truth)
     assert outputs[10_004_000].tolist() == [0.0] * 4
     assert outputs[11_816_000] == pytest.approx([0.297, 0.3, 0.3, 0.295], abs=0.005)
     assert outputs[15_000_000] == pytest.approx([0.619, 0.62, 0.62, 0.619], abs=0.002)
-    assert link.unanswered == 0
 
 
 def test_motor_outputs_that_are_no_numbers_turn_nothing(wire: Wire, resting: Truth) -> None:
@@ -96,9 +95,7 @@ def test_a_px4_without_a_controller_does_not_stop_the_clock(wire: Wire, resting:
     for step in range(2, 12):
         link.exchange(step * 4000, resting)
     assert time.monotonic() - begun_s < ANSWER_LIMIT_S + 1.0
-    assert link.unanswered == 10
     _answer(theirs, link, 48_000, resting)
-    assert link.unanswered == 10
 
 
 def test_a_px4_that_has_gone_is_told(wire: Wire, resting: Truth) -> None:
