@@ -272,13 +272,12 @@ def _spread(flights: pa.Table) -> dict[str, Any] | None:
     places = sorted(groups, key=str)
     if not places:
         return None
-    panels = [
-        panel(
-            world,
-            [(told, name, groups.get((world, name), hit[:0])) for name, told in _DETECTORS.items()],
+    panels = {
+        world: panel(
+            (told, name, groups.get((world, name), hit[:0])) for name, told in _DETECTORS.items()
         )
-        for world in dict.fromkeys(world for world, _ in places)
-    ]
+        for world, _ in places
+    }
     rows = [
         {"world": world, "detector": detector or "", "over_golden": f"{ratio:.4f}"}
         for world, detector in places

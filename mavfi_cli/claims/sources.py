@@ -22,6 +22,7 @@ from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.reproduction.flights import flown_missions, pooled
 from mavfi_cli.reproduction.items import FlightsPlan
+from mavfi_cli.reproduction.status import of_kernels
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
@@ -160,7 +161,7 @@ def _read(path: Path) -> CampaignSource | _KernelSource:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
         return _from_export(path)
-    return _KernelSource(path=path, summary=kernel_summary(path))
+    return _from_summary(path)
 
 
 def _from_ledger(folder: Path) -> CampaignSource:
@@ -170,6 +171,16 @@ def _from_ledger(folder: Path) -> CampaignSource:
     found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
     again = "" if spec is None else f"mavfi campaign run {folder}"
     return replace(found, again=again if plan is None else plan.command)
+
+
+def _from_summary(path: Path) -> _KernelSource:
+    summary = kernel_summary(path)
+    try:  # all that the page shows of it
+        of_kernels(summary), [part["runs"] + 0 for part in summary["kernels"]]
+        summary["plan"]["seed"], summary["plan"]["flight"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordError(f"{path}: not a whole summary of `mavfi kernels` ({error!r})") from None
+    return _KernelSource(path=path, summary=summary)
 
 
 def _from_export(path: Path) -> CampaignSource:

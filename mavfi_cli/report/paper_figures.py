@@ -7,7 +7,7 @@ lightness, so they stay apart without colour; markers and hatches differ as well
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -116,40 +116,32 @@ class Strip:
     paper: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StripPanel:
-    """One panel: its title, and its rows from top to bottom."""
-
-    title: str
-    strips: Sequence[Strip]
-
-
 def draw_strips(
-    panels: Sequence[StripPanel],
-    quantity: str,
-    columns: str = "one",
+    panels: Mapping[str, Sequence[Strip]], quantity: str, columns: str = "one"
 ) -> Figure:
     """Each flight as a dot, the middle half of them as a bar, the median, and the paper's largest.
 
     Args:
+        panels: the rows of each panel from top to bottom, by its title; all have the same labels.
         quantity: of the horizontal axis, with its unit.
     """
     across = min(len(panels), 4 if columns == "two" else 2)
     down = math.ceil(len(panels) / across)
-    rows = max(len(panel.strips) for panel in panels)
+    rows = max(map(len, panels.values()))
     figure = print_figure(columns, down * (0.45 + _LINE_IN * rows) + 0.45)
     grid = figure.subplots(down, across, squeeze=False, sharey=True, sharex=True)
-    for axes, panel in zip(grid.flat, panels, strict=False):
-        print_axes(axes, panel.title)
-        for y, strip in enumerate(panel.strips):
+    for axes, (title, strips) in zip(grid.flat, panels.items(), strict=False):
+        print_axes(axes, title)
+        for y, strip in enumerate(strips):
             _strip(axes, y, strip)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
-    strips = panels[0].strips
-    grid[0, 0].set_yticks(range(rows), [strip.label for strip in strips], fontsize=SMALLEST)
+    labels = [strip.label for strip in next(iter(panels.values()))]
+    grid[0, 0].set_yticks(range(rows), labels, fontsize=SMALLEST)
     grid[0, 0].set_ylim(rows - 0.5, -0.5)
     figure.supxlabel(quantity, fontsize=SMALLEST + 0.5, color=INK)
-    _explain_strips(figure, panels)
+    printed = any(strip.paper is not None for strips in panels.values() for strip in strips)
+    _explain_strips(figure, printed)
     return figure
 
 
@@ -172,10 +164,10 @@ def _strip(axes: Axes, y: int, strip: Strip) -> None:
     axes.plot(values.max(), y, "|", color=INK, markersize=7, markeredgewidth=1.4)
 
 
-def _explain_strips(figure: Figure, panels: Sequence[StripPanel]) -> None:
+def _explain_strips(figure: Figure, paper: bool) -> None:
     axes = figure.axes[0]
     handles = axes.plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
-    if any(strip.paper is not None for panel in panels for strip in panel.strips):
+    if paper:
         handles += axes.plot([], [], label="paper's longest", **_PAPER)  # type: ignore[arg-type]
     figure.legend(
         handles=handles, loc="outside upper center", ncols=min(len(handles), 3), frameon=False,

@@ -16,7 +16,6 @@ from mavfi_cli.report.paper_figures import (
     SMALLEST,
     WIDTHS_IN,
     Strip,
-    StripPanel,
     draw_dots,
     draw_histograms,
     draw_stack,
@@ -62,24 +61,21 @@ def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
     return DRAWN[table.name](flights, columns)
 
 
-def panel(title: str, rows: Iterable[_Row], paper: float | None = None) -> StripPanel:
+def panel(rows: Iterable[_Row], paper: float | None = None) -> list[Strip]:
     """Distributions of flights over their golden ones.
 
     Args:
         paper: the largest increase without a detector.
     """
-    return StripPanel(
-        title=title,
-        strips=[
-            Strip(
-                label=label,
-                values=increases(flights),
-                style=_STYLES[detector],
-                paper=None if detector else paper,
-            )
-            for label, detector, flights in rows
-        ],
-    )
+    return [
+        Strip(
+            label=label,
+            values=increases(flights),
+            style=_STYLES[detector],
+            paper=None if detector else paper,
+        )
+        for label, detector, flights in rows
+    ]
 
 
 def _number(name: str, *keys: object) -> float | None:
@@ -92,7 +88,7 @@ def _fig7(flights: pa.Table, columns: str) -> Figure:
         (title, None, faulty(flights, fault_target=node, planner=planner, level="instruction"))
         for title, (node, planner) in KERNELS_FLOWN.items()
     )
-    return draw_strips([panel("fault in", rows)], OVER_GOLDEN, columns)
+    return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
 
 
 def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
@@ -101,33 +97,31 @@ def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
         if not groups:
             raise RecordError(_NOTHING)
         rows = ((str(value), None, those) for (value,), those in groups.items())
-        return draw_strips([panel("fault in", rows)], OVER_GOLDEN, columns)
+        return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
 
     return draw_values
 
 
-def _beside_detectors(title: str, flights: pa.Table, paper: float | None) -> StripPanel:
+def _beside_detectors(flights: pa.Table, paper: float | None) -> list[Strip]:
     """A row for the flights with faults, and one for those with each detector."""
     rows: list[_Row] = [("fault", None, faulty(flights))]
     rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTOR_TITLES]
-    return panel(title, rows, paper)
+    return panel(rows, paper)
 
 
 def _fig12(flights: pa.Table, columns: str) -> Figure:
     flights = comparable(flights)
-    panels = [
-        _beside_detectors(
-            world,
-            chosen(flights, world=world),
-            _number("fig12", "worst_increase_percent", world),
+    panels = {
+        world: _beside_detectors(
+            chosen(flights, world=world), _number("fig12", "worst_increase_percent", world)
         )
         for world in worlds_of(flights)
-    ]
+    }
     return draw_strips(panels, OVER_GOLDEN, columns)
 
 
 def _fig14(flights: pa.Table, columns: str) -> Figure:
-    panels = []
+    panels = {}
     for world in worlds_of(flights):
         here = chosen(flights, world=world)
         rows: list[_Row] = [("no protection", None, faulty(here))]
@@ -136,7 +130,7 @@ def _fig14(flights: pa.Table, columns: str) -> Figure:
             for name in DETECTOR_TITLES
             for stages in PROTECTED
         ]
-        panels.append(panel(world, rows))
+        panels[world] = panel(rows)
     return draw_strips(panels, OVER_GOLDEN, columns)
 
 
@@ -148,11 +142,11 @@ def _short(stages: str) -> str:
 
 
 def _fig16(flights: pa.Table, columns: str) -> Figure:
-    panels = []
+    panels = {}
     for (platform,), here in by_value(flights, "platform").items():
         ratio = _number("fig16", "worst_ratio", platform)
         worst = None if ratio is None else PERCENT * (ratio - 1.0)
-        panels.append(_beside_detectors(platform, here, worst))
+        panels[platform] = _beside_detectors(here, worst)
     return draw_strips(panels, OVER_GOLDEN, columns)
 
 

@@ -138,6 +138,21 @@ def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
     assert "no column 'pair'" in told
 
 
+@pytest.mark.parametrize("lacks", ["title", "runs", "outcomes"])
+def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
+    campaign("whole", 1, 1)
+    summary = json.loads(KERNELS.read_text())
+    if lacks == "outcomes":
+        del summary["kernels"][0]["outcomes"]["crash"]
+    else:
+        del summary["kernels"][0][lacks]
+    (tmp_path / "kernels.json").write_text(json.dumps(summary))
+    found = gather([tmp_path])
+    assert len(found.campaigns) == 1
+    (problem,) = found.problems
+    assert "kernels.json: not a whole summary of `mavfi kernels`" in problem
+
+
 def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
     campaign("whole", 1, 1)
     export("whole/runs/0-sparse-1/trace.parquet", row())
