@@ -255,12 +255,12 @@ def _instruction_lines(fault: Section) -> list[str]:
     corruption, injection = fault["corruption"], fault["injection"]
     if fault["state"] == "not_injected":
         return [*lines, f"            not injected: {fault['reason']}"]
-    bits = ", ".join(map(str, corruption["bits"]))
+    bits = f"bit{'s'[len(corruption['bits']) == 1 :]} {', '.join(map(str, corruption['bits']))}"
     what = corruption["register"] or corruption["site"]
     activation = fault["activation"]["activation"].replace("_", " ")
     return [
         *lines,
-        f"            bit {bits} of {corruption['role']} {what}: "
+        f"            {bits} of {corruption['role']} {what}: "
         f"{injection['before']} -> {injection['after']}; {activation}",
     ]
 

@@ -112,6 +112,16 @@ def test_a_missing_extra_is_named_before_anything_flies(
     assert (done.returncode, done.stdout, done.stderr) == (1, "", f"error: {told}\n")
 
 
+def test_without_a_display_a_file_is_offered_before_anything_flies(
+    short_flight, mavfi, monkeypatch
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    done = mavfi("view", short_flight.path)
+    told = "error: there is no display for rerun's window: use --save FILE.rrd\n"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", told)
+
+
 def test_bad_input_is_one_line(short_flight, mavfi, tmp_path):
     for line, told in (
         ([short_flight.path, "--save", "x.png"], "ends in .rrd (rerun) or .mcap (Foxglove)"),

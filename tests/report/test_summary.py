@@ -116,6 +116,19 @@ def test_a_struck_instruction_is_in_a_function_with_a_plain_name(result):
     assert told.format("liboctomap.so+0x1234") in "\n".join(summary_lines(result))
 
 
+@pytest.mark.parametrize(("bits", "told"), [([3], "bit 3 of"), ([3, 40], "bits 3, 40 of")])
+def test_the_bits_of_a_struck_instruction_are_counted(result, bits, told):
+    result["fault"] = {
+        "level": "instruction", "node": "octomap", "kernel": "octomap", "invocation": 1,
+        "invocations": 2, "stamp_s": 1.0, "sampling": "instruction-uniform", "k": 3, "windows": "",
+        "instruction": "and ebx, 1", "state": "applied", "offset": 1, "symbol": "", "object": "a",
+        "corruption": {"bits": bits, "role": "destination", "register": "rbx", "site": "register"},
+        "injection": {"before": "0x1", "after": "0x9"}, "activation": {"activation": "not_read"},
+    }  # fmt: skip
+    line = f"            {told} destination rbx: 0x1 -> 0x9; not read"
+    assert line in summary_lines(result)
+
+
 def test_events_come_one_a_line_in_order(result):
     lines = event_lines(result)
     assert len(lines) == len(result["events"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +28,7 @@ def require_viewer(path: Path | None) -> None:
 
     Raises:
         ConfigError: The name has another suffix.
-        MavfiError: A package is not installed. Says how to install it.
+        MavfiError: A package is not installed, or there is no display. Says what to do.
         RecordError: There is no such folder.
     """
     suffix = None if path is None else path.suffix.lower()
@@ -38,6 +40,8 @@ def require_viewer(path: Path | None) -> None:
         raise MavfiError(f"{what} needs more packages: pip install 'mavfi[{extra}]'")
     if path is not None:
         require_output(path)
+    elif sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        raise MavfiError("there is no display for rerun's window: use --save FILE.rrd")
 
 
 def save(flights: Sequence[ViewedFlight], path: Path) -> None:

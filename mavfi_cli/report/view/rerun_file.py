@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.states import of_stage
 from mavfi_cli.core.types import Stage
@@ -54,13 +51,7 @@ def write_rrd(flights: Sequence[ViewedFlight], path: Path) -> None:
 
 
 def show(flights: Sequence[ViewedFlight]) -> None:
-    """Open flights in rerun's viewer, which stays open.
-
-    Raises:
-        MavfiError: There is no display.
-    """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        raise MavfiError("there is no display for rerun's window: use --save FILE.rrd")
+    """Open flights in rerun's viewer, which stays open."""
     recording = _recording(flights)
     recording.spawn()
     _log(recording, flights)

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.report.view.entries import Values, entries_of
-from mavfi_cli.report.view.rerun_file import show, write_rrd
+from mavfi_cli.report.view.rerun_file import write_rrd
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +102,3 @@ def test_a_layout_comes_with_it(file):
 def test_a_file_that_cannot_be_written_is_one_line(pair, tmp_path):
     with pytest.raises(RecordError, match="No such file"):
         write_rrd(pair, tmp_path / "none" / "pair.rrd")
-
-
-def test_without_a_display_a_file_is_offered(pair, monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(MavfiError, match=r"no display for rerun's window: use --save FILE\.rrd"):
-        show(pair)
