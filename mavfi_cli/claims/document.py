@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -333,10 +334,10 @@ def _listed(flight: Mapping[str, Any], source: Path) -> dict[str, Any]:
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     what = "golden" if flight["level"] is None else struck_state
     kept = flight["path"] is not None and Path(flight["path"]).is_dir()
-    place = flight["path"] if kept else f"{source} --mission {flight['number']}"
+    place = [flight["path"]] if kept else [str(source), "--mission", str(flight["number"])]
     return {
         **flight,
         "what": " + ".join(filter(None, (what, flight["detector"]))),
         "ratio": flight["over_own"],
-        "command": f"mavfi replay {place}",
+        "command": shlex.join(["mavfi", "replay", *place]),
     }

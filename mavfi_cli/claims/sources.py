@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -169,7 +170,7 @@ def _from_ledger(folder: Path) -> CampaignSource:
         table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
         plan = FlightsPlan.stored(ledger)
     found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
-    again = "" if spec is None else f"mavfi campaign run {folder}"
+    again = "" if spec is None else shlex.join(["mavfi", "campaign", "run", str(folder)])
     return replace(found, again=again if plan is None else plan.command)
 
 

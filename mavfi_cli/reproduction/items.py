@@ -7,6 +7,7 @@ one list, each mission once.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -173,7 +174,8 @@ class FlightsPlan:
     @property
     def command(self) -> str:
         """The command that flies the plan's stack for all items."""
-        return f"mavfi reproduce --stack {self.stack} --scale {self.scale:g} --out {self.out}"
+        asked = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
+        return shlex.join(["mavfi", "reproduce", *asked])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
         """The missions, repetition by repetition, so that all items grow together.

@@ -143,6 +143,11 @@ def test_lost_and_longest_missions_have_their_command(told):
     assert mine["longest"][0]["ratio"] == pytest.approx(1.05)
 
 
+def test_a_command_can_be_pasted_whatever_the_name_of_the_folder():
+    (mine,) = document(evidence([row(outcome="crash")], name="my flights"))["missions"]
+    assert mine["lost"][0]["command"] == "mavfi replay 'my flights.parquet' --mission 0"
+
+
 def test_a_kept_run_is_replayed_from_its_folder_as_long_as_it_is_there(tmp_path):
     rows = [row(), row("planning", outcome="crash", path=str(tmp_path))]
     rows.append(row("control", outcome="crash", path=str(tmp_path / "removed")))

@@ -1,6 +1,7 @@
 """The formats of a table: text of one screen, Markdown, LaTeX and CSV, with the same numbers."""
 
 import csv
+import functools
 import io
 import itertools
 import re
@@ -51,6 +52,11 @@ FLIGHTS = {
 }
 
 
+@functools.cache
+def laid_out(name):
+    return of_flights(name, table(*whole()))
+
+
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_the_text_is_one_screen(name):
     lines = as_text(of_flights(name, FLIGHTS[name])).splitlines()
@@ -61,7 +67,7 @@ def test_the_text_is_one_screen(name):
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 @pytest.mark.parametrize("form", FORMATS)
 def test_every_layout_has_every_format(name, form):
-    assert FORMATS[form](of_flights(name, table(*whole()))).endswith("\n")
+    assert FORMATS[form](laid_out(name)).endswith("\n")
 
 
 def test_the_formats_have_the_same_numbers():
@@ -81,7 +87,7 @@ def test_the_formats_have_the_same_numbers():
 
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 def test_latex_is_a_whole_tabular_of_plain_text(name):
-    text = FORMATS["latex"](of_flights(name, table(*whole())))
+    text = FORMATS["latex"](laid_out(name))
     (form,) = re.findall(r"\\begin\{tabular\}\{([lr]+)\}", text)
     body = text[text.index(r"\begin{tabular}") : text.index(r"\end{tabular}")]
     rows = [line for line in body.splitlines() if line.endswith(r" \\")]
