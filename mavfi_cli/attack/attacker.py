@@ -85,8 +85,11 @@ class Attacker:
         try:
             hits = sum(stage.count for stage in fault.trigger)
             wall_s = self._wall_limit_s + hits * _HIT_LIMIT_S
-            with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
+            with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
                 reason = reach(tracee, self.place.image(tracee), fault)
+            if alarm.fired:
+                late = f"the {self.place.kind} did not reach the instruction in time"
+                return self._result(start, None, fault, None, NOTHING, late)
             if reason:
                 return self._result(start, tracee.ended, fault, None, NOTHING, reason)
             return self._corrupt(start, tracee, fault)
@@ -141,11 +144,15 @@ class Attacker:
 
     def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult:
         """Flip at the stop in front of the attacked instruction, follow, and run to the end."""
+        injection, followed = None, NOTHING
         with self._deadline(tracee) as alarm:
             window = self.place.limits.follow_window
             injection, followed = strike(tracee, fault, window=window)
-            ended = run_out(tracee)
+            run_out(tracee)
+        ended = tracee.kill()
         reason = injection.reason if injection is not None else ""
+        if alarm.fired and injection is None and fault.corruption is not None:
+            reason = f"the {self.place.kind} was stopped before the flip was complete"
         hung = alarm.fired and ended.signal == signal.SIGKILL
         return self._result(start, None if hung else ended, fault, injection, followed, reason)
 

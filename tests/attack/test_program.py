@@ -195,6 +195,21 @@ def test_a_program_that_ends_before_the_trigger_is_not_injected(target, workplac
     assert result.followed.activation is BitActivation.NOT_INJECTED
 
 
+def test_a_program_that_is_stopped_on_its_way_to_the_trigger_is_told_as_such(target, workplace):
+    program = target("sleeper")
+    place = workplace(replace(program, limits=RunLimits(factor=0.0, wall_grace_s=0.0)))
+    (entry,) = attacked(program, runs=1, seed=1).records
+    drawn = record.fault_of(entry)
+    never = replace(drawn, trigger=(CountedStop(drawn.target, 2),))
+    for fault, outcome in (
+        (never, RunOutcome.NOT_INJECTED),
+        (replace(never, corruption=None), RunOutcome.HANG),
+    ):
+        result = Attacker(place=place, golden=golden_run(place)).run(fault)
+        assert result.outcome is outcome
+        assert result.reason == "the program did not reach the instruction in time"
+
+
 def test_another_instruction_at_the_place_is_refused(target, workplace):
     program = target("sdc")
     place = workplace(program)

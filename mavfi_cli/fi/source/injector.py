@@ -332,8 +332,10 @@ class SourceInjector(Injector):
             change = self._change(place, state, changed)
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
-        self.follower.struck(changed, self._tell(moment, self._invocations, changes))
-        result: M = changed
+        # An unchanged message stays the same object: its readers may still read an earlier strike.
+        struck: Any = changed if any(change.bits for change in changes) else message
+        self.follower.struck(struck, self._tell(moment, self._invocations, changes))
+        result: M = struck
         return result
 
     def _change(self, place: int, state: State, message: Message) -> Change:
@@ -468,9 +470,9 @@ class Follower:
         """Note that a message was corrupted; it goes on as `message`."""
         if self.activation is Activation.READ:
             return
-        self._corrupted = {c.state: c.index for c in strike.changes if c.bits}
-        if self._corrupted:
-            self._message = message
+        corrupted = {c.state: c.index for c in strike.changes if c.bits}
+        if corrupted:
+            self._message, self._corrupted = message, corrupted
             self._become(Activation.NOT_READ)
         elif self.activation is Activation.NOT_INJECTED:
             self.activation = Activation.UNCHANGED

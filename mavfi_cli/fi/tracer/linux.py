@@ -224,7 +224,8 @@ class ProcessTimer:
     """A timer on one process; leaving its context cancels it.
 
     It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
-    `wall_s` have passed, whichever is set and comes first. `fired` is true once it has.
+    `wall_s` have passed, whichever is set and comes first. `fired` is true once it has. If it
+    has killed a stopped process, the next request to that leaves the context without an error.
     """
 
     def __init__(
@@ -248,10 +249,11 @@ class ProcessTimer:
         kind: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
-    ) -> None:
+    ) -> bool:
         self._cancelled.set()
         self._thread.join()
         os.close(self._process)
+        return self.fired and kind is ProcessLookupError
 
     def _watch(self) -> None:
         while (left := self._left_s()) > 0:

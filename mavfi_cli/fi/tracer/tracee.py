@@ -184,9 +184,10 @@ class Tracee:
         self._expecting_alarm = True
         try:
             with alarm:
-                return self.resume()
+                self.resume()
         finally:
             self._expecting_alarm = False
+        return self.ended
 
     def run_to(self, address: int, count: int = 1, detour: Detour | None = None) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
@@ -266,7 +267,8 @@ class Tracee:
 
     def _go(self, how: int) -> Ended | None:
         self.registers.forget()
-        linux.request(how, self.tid, 0, self._take_signal())
+        with contextlib.suppress(ProcessLookupError):  # killed at a stop: its end is reported next
+            linux.request(how, self.tid, 0, self._take_signal())
         return self._await(how)
 
     def _take_signal(self) -> int:

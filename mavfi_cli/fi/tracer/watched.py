@@ -49,7 +49,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
     written: dict[str, None] = {}
     terminal = lacked = False
     entering, company, number = True, "", 0
-    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s):
+    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
         while True:
             tracee.registers.forget()
             linux.request(linux.SYSCALL, tracee.pid, 0, number)
@@ -72,6 +72,8 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
                 entering = not entering
             elif status.event == 0:
                 number = status.signal
+    if alarm.fired:
+        tracee.kill()
     return Watched(
         company=company,
         written=tuple(path for path in written if not path.startswith(_DEVICES)),

@@ -19,7 +19,7 @@ from mavfi_cli.fi.source.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.fi.source.injector import MemoryInjector, Moment, SourceInjector, Strike
+from mavfi_cli.fi.source.injector import Activation, MemoryInjector, Moment, SourceInjector, Strike
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,
@@ -232,6 +232,19 @@ def test_an_intermittent_fault_returns_every_period():
     for tick in range(10):
         send(injector, COMMAND, moment(0.02 * tick, tick))
     assert [strike.tick for strike in told] == [0, 3, 6, 9]
+
+
+def test_what_a_second_strike_leaves_as_it_is_may_still_be_read():
+    """The value is zero since the first strike, and nobody has read it yet."""
+    told: list[Strike] = []
+    corruption = {"effect": Effect.ZERO, "persistence": Persistence.INTERMITTENT}
+    injector = make("waypoint_x", told=told, corruption=corruption)
+    struck = injector.strike_latched(TRAJECTORY, moment(0.0), 0)
+    again = injector.strike_latched(struck, moment(1.0), 0)
+    assert [bool(strike.changes[0].bits) for strike in told] == [True, False]
+    injector.follower.settle(lambda message: message is again)
+    injector.follower.read(again, "control", 11.5, {"waypoint_x"}, told[0].changes[0].index)
+    assert injector.follower.activation is Activation.READ
 
 
 def test_zero_and_random_values():

@@ -80,6 +80,16 @@ def test_a_stop_inside_a_blocking_system_call_resumes_correctly(start, tmp_path)
     assert time.monotonic() - begin >= 0.15
 
 
+def test_a_timer_may_kill_a_program_that_is_stopped(start):
+    tracee = start("counting")
+    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=0.0) as alarm:
+        while True:  # until the first request that finds it dead
+            tracee.registers.forget()
+            assert tracee.registers.ip
+    assert alarm.fired
+    assert tracee.resume() == Ended(exit_code=None, signal=signal.SIGKILL)
+
+
 def test_an_interrupt_stops_and_resumes(start, tmp_path):
     tracee = start("sleeper")
     for _ in range(5):
