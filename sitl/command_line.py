@@ -62,8 +62,8 @@ camera_heartbeat = click.option(
     type=click.FloatRange(0.0, 50.0),
     default=1.0,
     show_default=True,
-    help="Rate of the camera's heartbeats, Hz. 0 sends none: MAVProxy takes a camera that has one "
-    "for a second vehicle.",
+    help="Rate of the camera's heartbeats, Hz. 0 turns them off for MAVProxy, which mistakes the "
+    "camera for a second vehicle.",
 )
 
 

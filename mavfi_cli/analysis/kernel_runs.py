@@ -28,7 +28,7 @@ def kernel_summary(path: Path) -> Mapping[str, Any]:
     except OSError as error:
         raise RecordError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: no summary of `mavfi kernels` ({error!r})") from None
+        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({error!r})") from None
     return found
 
 

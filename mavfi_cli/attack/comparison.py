@@ -161,7 +161,7 @@ def _pattern(text: str) -> bytes:
         re.compile(text.encode())
     except re.error as error:
         raise ConfigError(
-            f"{text!r} is no regular expression: {error}", key="ignore_lines"
+            f"{text!r} is not a regular expression: {error}", key="ignore_lines"
         ) from None
     return text.encode()
 

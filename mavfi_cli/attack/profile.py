@@ -189,7 +189,7 @@ def _require_counts(
             raise TargetError(
                 place.name,
                 f"executes {image.locate(address)} {'more' if more else 'less'} often than "
-                f"the {count} times that callgrind counts: its way depends on the processor, on "
+                f"the {count} times that callgrind counts: its path depends on the processor, on "
                 "addresses or on time; name a function or other objects",
             )
 

@@ -89,12 +89,12 @@ def _require_attackable(path: Path) -> None:
             f"is a script; attack its interpreter: --program {program} --args {line!r}",
         )
     if head[:5] != b"\x7fELF\x02" or head[18:20] != b"\x3e\0":
-        raise TargetError(path.name, "is no program for x86-64")
+        raise TargetError(path.name, "is not a program for x86-64")
     if path.stat().st_mode & (stat.S_ISUID | stat.S_ISGID):
         raise TargetError(
             path.name,
-            "is set-uid or set-gid: traced it has only your rights, and corrupted it must not have "
-            "more; attack a copy",
+            "is set-uid or set-gid: it would lose these rights under the tracer, and must not have "
+            "them with a corrupted register; attack a copy",
         )
 
 

@@ -81,10 +81,12 @@ def chosen_spec(
         return spec if scale is None else spec.scaled(scale)
     with Ledger(Path(what)) as ledger:
         if scale is not None or changes or out is not None:
-            raise ConfigError("goes without --scale, --set and --out: it has all", path=Path(what))
+            raise ConfigError(
+                "does not take --scale, --set or --out: the folder stores them", path=Path(what)
+            )
         stored = stored_spec(ledger)
     if stored is None:
-        raise ConfigError("has no specification: a program made its list", path=Path(what))
+        raise ConfigError("has no specification, because a program made its list", path=Path(what))
     return stored
 
 
@@ -236,7 +238,7 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
     here, there = spec.fixed_world, stored.fixed_world if stored else None
     if append and stored and (here and here.rule()) != (there and there.rule()):
         raise ConfigError(
-            "holds a campaign with another [fixed_world]; another folder starts anew", path=folder
+            "holds a campaign with another [fixed_world]; choose another folder", path=folder
         )
     if here is None or there is None or here.rule() != there.rule():
         return spec
@@ -298,7 +300,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     if config.detector is not None:
         detector_of(config.detector, config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
-        raise FaultSpecError("a fault in the detector needs one")
+        raise FaultSpecError("a fault in the detector needs a detector")
     if start:
         ask_vehicle(config)
 

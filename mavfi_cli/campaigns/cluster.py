@@ -126,7 +126,9 @@ def _connect(address: str) -> Client:
     except ValueError:  # the port is not a number
         usable = False
     if not usable:  # dask would retry for half a minute, and then raise a traceback
-        raise CampaignStopped(f"{address}: expected the scheduler's address, as tcp://host:8786")
+        raise CampaignStopped(
+            f"{address}: expected the scheduler's address, such as tcp://host:8786"
+        )
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

@@ -149,7 +149,7 @@ def store_plan(
             found[-1] += f", and {left.total()} are gone"
         elif can_append:
             found.append(can_append)
-        remedy = "another folder starts anew"
+        remedy = "choose another folder"
         raise ConfigError(
             f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
         )
@@ -392,8 +392,7 @@ def require_unchanged(ledger: Ledger) -> None:
     changed = [name for name, digest in _noted(ledger).items() if digest != file_digest(name)]
     if changed:
         raise ConfigError(
-            f"{', '.join(changed)}: not as it was when the campaign was begun; "
-            "another folder starts anew",
+            f"{', '.join(changed)}: changed after the campaign began; choose another folder",
             path=ledger.folder,
         )
 

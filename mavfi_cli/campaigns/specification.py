@@ -72,7 +72,7 @@ def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> Missio
     mission |= _fault(values, fault_seed)
     detector = {_DETECTOR[name]: value for name, value in values.items() if name in _DETECTOR}
     if detector and "name" not in detector:
-        raise ConfigError(f"{', '.join(sorted(detector))}: without a detector")
+        raise ConfigError(f"{', '.join(sorted(detector))}: needs a detector")
     if detector and detector["name"] != "none":
         mission["detector"] = detector
     return structure(mission, MissionConfig)

@@ -28,8 +28,8 @@ _execution = partial(click.option, cls=GroupedOption, group="Execution")
 _output = partial(click.option, cls=GroupedOption, group="Output")
 _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
              help="Replace a factor of the preset or file, as in world=dense. May be repeated. "
-                  "Quote a value with a comma, or give all values as a TOML list. The change "
-                  "becomes part of the folder name.")  # fmt: skip
+                  "Quote a value that contains a comma, or write all values as a TOML list. The "
+                  "change becomes part of the folder name.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` with which it prints everything.
 _FULL = {"full", "by", "confidence", "quality", "overhead", "failures"}
@@ -41,7 +41,7 @@ def campaign() -> None:
 
     WHAT is a preset (fig7 fig8 fig9 fig11 fig13 fig14 fig16 table3 table4 speeds hardening
     ablation), a campaign.toml, or the folder of an existing campaign. Presets and files fly into
-    campaigns/NAME, where status, draw and export look for them. Write ./NAME for a folder with
+    campaigns/NAME, where the other commands look for them. Write ./NAME for a folder with
     the name of a preset.
     """
 
@@ -118,7 +118,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
               help="With --failures: bit flips per hour that reach the injection sites. "
                    "Adds failures per flight hour.")  # fmt: skip
 @click.option("--full", is_flag=True,
-              help="Print all settings and comparisons, not one screen. --by, --confidence, "
+              help="Print all settings and comparisons instead of one screen. --by, --confidence, "
                    "--quality, --overhead and --failures imply it.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the whole summary as JSON.")
 def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
@@ -225,12 +225,13 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 @click.option("--scale", type=float, help="Fraction of the repetitions to run.")
 @_SET
 @click.option("--margin", type=float,
-              help="Print the missions per setting for a confidence interval of this half "
-                   "width.")  # fmt: skip
+              help="Print the number of missions per setting for a confidence interval of this "
+                   "half-width.")  # fmt: skip
 @click.option("--expect", "expected", default=0.5, show_default=True,
               help="With --margin: expected success rate.")  # fmt: skip
 @click.option("--difference", type=float,
-              help="Print the pairs that detect this difference of success rates.")  # fmt: skip
+              help="Print the number of pairs that detects this difference of success "
+                   "rates.")  # fmt: skip
 @click.option("--discordant", default=0.2, show_default=True,
               help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
 @click.option("--power", default=0.8, show_default=True,

@@ -61,7 +61,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     from mavfi_cli.studies.compare import compare as run
 
     if as_json and as_csv:
-        raise click.UsageError("--json or --csv, not both")
+        raise click.UsageError("--json and --csv exclude each other")
     plan = _plan(options)
     with missions_view(quiet=quiet) as view:
         told = run(plan, out, Options(jobs=options["jobs"] or 0), view)

@@ -76,19 +76,20 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--seed", default=3, show_default=True, help="Root seed of all random draws.")
 @_mission("--world-seed", type=int, help="Seed of the world only  [--seed].")
 @_mission("--planner", default="rrtstar", show_default=True,
-          help="rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
+          help="Planner: rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
 @_mission("--platform", default="x86", show_default=True, metavar="NAME|FILE|measured:FACTOR",
-          help="Compute platform whose latencies the flight has. `measured` multiplies the "
-               "kernel times of this host by FACTOR and needs --realtime.")  # fmt: skip
+          help="Computer whose latencies the kernels have; `mavfi platforms` lists them. "
+               "`measured` takes the kernel times of this host times FACTOR and needs "
+               "--realtime.")  # fmt: skip
 @_mission("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
           help="Structure, checks and gains of the companion; `mavfi stacks` lists the "
                "stacks.")  # fmt: skip
 @_mission("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
-          help="solo, spark, or a TOML profile.")  # fmt: skip
+          help="Simulated vehicle: solo, spark, or a TOML file.")  # fmt: skip
 @_mission("--start", type=_Place(), help="Take-off position, ENU, m  [the world's].")
 @_mission("--goal", type=_Place(),
-          help="Goal, ENU, m  [the world's]. A generated world follows start and goal: other "
-               "positions move its bounds, and towers within 3 m of them are left "
+          help="Goal, ENU, m  [the world's]. A generated world is built around start and goal: "
+               "other positions move its bounds, and towers within 3 m of them are left "
                "out.")  # fmt: skip
 @_mission("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
 @_mission("--time-limit", "time_limit_s", default=300.0, show_default=True,
@@ -97,21 +98,21 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @_mission("--eyes", is_flag=True,
-          help="Start depth camera and referee of --world beside the autopilot on --link. It "
-               "takes --vehicle for the vehicle's body.")  # fmt: skip
+          help="Start depth camera and referee of --world beside the autopilot on --link. The "
+               "body is that of --vehicle.")  # fmt: skip
 @_mission("--origin", type=_Place(),
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
 @_mission("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
-          help="Autopilot of the simulated vehicle. A real one is started and ended with the "
-               "mission.")  # fmt: skip
+          help="Autopilot of the simulated vehicle. px4 and ardupilot are started and ended with "
+               "the mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
-          help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
+          help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @_mission("--key-file", metavar="FILE", type=click.Path(dir_okay=False),
           help="File with the signing passphrase of --link.")  # fmt: skip
 @_mission("--loss-limit", "loss_limit_s", default=5.0, show_default=True,
-          help="Time without a new state or depth frame on --link after which it counts as lost, "
-               "on the vehicle's clock and on the wall's, s.")  # fmt: skip
+          help="Time without a new state or depth frame after which --link counts as lost, s. It "
+               "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
           help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @_fault("--inject", metavar="STAGE|STATE|GROUP",
@@ -120,32 +121,35 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
              "process.NODE (the node's process is killed).")  # fmt: skip
 @_fault("--at", default="random", show_default=True,
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
-        help="Trigger; time and ticks count from when the companion takes control.")  # fmt: skip
+        help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
 @_fault("--fault-seed", default=1, show_default=True,
         help="Seed of all random draws of the fault.")  # fmt: skip
-@_fault("--bits", default=1, show_default=True, help="Number of bits that are flipped.")
+@_fault("--bits", default=1, show_default=True, help="Number of bits to flip.")
 @_fault("--field", default="any", show_default=True,
-        help="Field of the bits: sign, exponent, mantissa, any.")  # fmt: skip
+        help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
 @_fault("--bit", "exact_bits", multiple=True, type=int,
-        help="Flip this bit instead of a random one. May be repeated.")  # fmt: skip
+        help="Flip this bit instead of a random one; 0 is the lowest. May be "
+             "repeated.")  # fmt: skip
 @_fault("--all-components", "together", is_flag=True,
         help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
-@_fault("--effect", default="flip", show_default=True, help="flip, zero, random.")
+@_fault("--effect", default="flip", show_default=True,
+        help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
 @_fault("--persistence", default="transient", show_default=True,
-        help="transient, stuck-at, intermittent.")  # fmt: skip
+        help="Persistence: transient (once), stuck-at (held), intermittent (again).")  # fmt: skip
 @_fault("--duration", "duration_s", type=float,
         help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0, show_default=True,
         help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
               show_default=True,
-              help="`instruction` corrupts an operand of one machine instruction of a kernel: "
-                   "--inject point_cloud, octomap, collision_check, planner, control, perception "
-                   "or planning.")  # fmt: skip
+              help="`instruction` corrupts an operand of one machine instruction of a kernel. "
+                   "--inject is then point_cloud, octomap, collision_check, planner, control, "
+                   "perception or planning.")  # fmt: skip
 @_instruction("--site", "sites", multiple=True,
-              help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May "
-                   "be repeated.")  # fmt: skip
-@_instruction("--role", "roles", multiple=True, help="source or destination  [both].")
+              help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, "
+                   "opcode, memory. May be repeated  [the first five: registers].")  # fmt: skip
+@_instruction("--role", "roles", multiple=True,
+              help="Role of the operand: source or destination  [both].")  # fmt: skip
 @_detector("--detector", metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
@@ -157,16 +161,16 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_detector("--model", type=click.Path(exists=True, dir_okay=False),
            help="Model file of the detector  [the one shipped for the stack].")  # fmt: skip
 @_detector("--any-stack-model", "any_stack", is_flag=True,
-           help="Accept a model of another stack. Without --model, use that of the stack on which "
-                "this one is based.")  # fmt: skip
+           help="Accept a model of another stack. Without --model, use the model of the base "
+                "stack.")  # fmt: skip
 @_detector("--watch", default="paper", show_default=True, metavar="paper|extended",
-           help="States that the detector watches: the 13 of the paper; extended adds collision "
-                "and the sequence numbers of plans.")  # fmt: skip
+           help="States that the detector watches. paper has the 13 of the paper; extended adds "
+                "collision and the sequence numbers of plans.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
          show_default=True, help="Parent of the new run folder.")  # fmt: skip
 @_output("--record", metavar="mcap|rrd", type=click.Choice(["mcap", "rrd"]),
-         help="Keep the whole flight with depth frames, clouds and maps, too: flight.mcap for "
-              "Foxglove, flight.rrd for rerun.")  # fmt: skip
+         help="Also record depth frames, clouds and maps: flight.mcap for Foxglove, flight.rrd "
+              "for rerun.")  # fmt: skip
 @_output("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
 @_output("--expect", type=click.Choice(_OUTCOMES),
          help="Exit with code 1 if the outcome differs.")  # fmt: skip

@@ -32,8 +32,9 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 @click.command(cls=GroupedCommand)
 @_target("--kernel", multiple=True, metavar="NAME",
-         help="point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar, control, or a "
-              "Python file with your own kernel. May be repeated  [all].")  # fmt: skip
+         help="Kernel to attack: point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar, "
+              "control, or a Python file with your own kernel. May be repeated  "
+              "[all].")  # fmt: skip
 @_target("--world", default="dense", show_default=True, metavar="NAME|FILE",
          help="World of the golden run that supplies the kernels' inputs.")  # fmt: skip
 @_target("--world-seed", default=3, show_default=True, help="Seed of that golden run.")
@@ -54,19 +55,19 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
          help="Environment variable of the program. May be repeated.")  # fmt: skip
 @_native("--memory", default=2.0, show_default=True, metavar="GB",
          type=click.FloatRange(min=0.0, min_open=True),
-         help="Largest memory of the program.")  # fmt: skip
+         help="Limit on the memory of the program.")  # fmt: skip
 @_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
 @_native("--function", help="Attack only code that executes during calls of this function.")
 @_fault("--sampling", default="instruction-uniform", show_default=True,
-        help="instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
+        help="Sampling rule: instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
 @_fault("--site", multiple=True,
-        help="general, flags, vector, x87, mask, instruction-pointer, opcode, memory. May be "
-             "repeated  [the first five: registers].")  # fmt: skip
-@_fault("--role", multiple=True, help="source or destination  [both].")
+        help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, opcode, "
+             "memory. May be repeated  [the first five: registers].")  # fmt: skip
+@_fault("--role", multiple=True, help="Role of the operand: source or destination  [both].")
 @_fault("--field", default="any", show_default=True,
-        help="Field of the bits: sign, exponent, mantissa, any.")  # fmt: skip
+        help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
 @_fault("--bits", default=1, show_default=True, type=click.IntRange(min=1),
-        help="Number of bits that are flipped.")  # fmt: skip
+        help="Number of bits to flip.")  # fmt: skip
 @_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
         help="Seed of the faults.")  # fmt: skip
 @_fault("--compat", metavar="INJECTOR",

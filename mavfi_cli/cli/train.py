@@ -27,7 +27,7 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 @click.option("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
               help="Autopilot that flies the missions.")  # fmt: skip
 @click.option("--firmware", metavar="PATH",
-              help="SITL binary of a real autopilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
+              help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
               help="Fit to the error-free flights in this folder of run folders, of any "
                    "autopilot, instead of flying.")  # fmt: skip

@@ -102,7 +102,7 @@ def vpm(
     from mavfi_cli.vpm.vehicle import ModelVehicle
 
     if as_json and as_csv:
-        raise click.UsageError("--json or --csv, not both")
+        raise click.UsageError("--json and --csv exclude each other")
     if not fly:
         refuse_given(_FLYING, "needs --fly")
         given = given_options()
@@ -111,7 +111,7 @@ def vpm(
         if "response" in given:
             refuse_given(["chain"], "or --response, not both: either is the response time")
     if options["models"] is not None and options["train"]:
-        raise click.UsageError("--models or --train, not both")
+        raise click.UsageError("--models and --train exclude each other")
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
     require_distinct([vehicle.name for vehicle in chosen], "vehicle")
     choices = _choices(options)
@@ -151,7 +151,7 @@ def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, 
             found[name.strip()] = float(number), "--overhead"
         except ValueError:
             raise click.UsageError(
-                f"--overhead {text}: no such file or folder; for per cent write aad=0.0062"
+                f"--overhead {text}: no such file or folder; for a percentage write aad=0.0062"
             ) from None
     return found
 

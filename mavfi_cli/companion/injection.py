@@ -104,7 +104,7 @@ class SourceInjection(NoInjection):
             self._stage, self._units = PROCESS, {config.target: ""}
         elif config.attacks_detector:
             if protection.gate is None:
-                raise FaultSpecError("a fault in the detector needs one: --detector NAME")
+                raise FaultSpecError("a fault in the detector needs a detector: --detector NAME")
             memory = MemoryInjector(
                 protection.gate.memory,
                 config.detector_part,

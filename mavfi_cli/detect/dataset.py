@@ -105,7 +105,7 @@ class Dataset:
         metadata = table.schema.metadata or {}
         found = tuple(metadata.get(key) for key in _META)
         if found[0] is None:
-            raise ModelError("is no data set of mavfi", path=path)
+            raise ModelError("is not a data set of mavfi", path=path)
         if found != _signature(params) or not set(_STACK) <= set(metadata):
             raise ModelError(
                 "made for another version, table of states or preprocessing; fly it anew", path=path

@@ -113,7 +113,7 @@ class Model:
             raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
         for name, (low, high) in model.extended.items():
             if not -LIMIT <= low <= 0 <= high <= LIMIT:
-                raise ModelError(f"corrupt model file: extended: {name} is no range", path=path)
+                raise ModelError(f"corrupt model file: extended: {name} is not a range", path=path)
         if set(model.arrays) != set(shapes):
             raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
         arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
@@ -161,7 +161,9 @@ def _array(path: Path, name: str, data: object, shape: tuple[int, ...]) -> Float
     try:
         array: NDArray[np.float64] = np.array(data, np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"corrupt model file: array {name!r} is no numbers", path=path) from None
+        raise ModelError(
+            f"corrupt model file: array {name!r} does not contain numbers", path=path
+        ) from None
     if array.shape != shape:
         raise ModelError(
             f"array {name!r} has shape {array.shape}, this version needs {shape}", path=path

@@ -209,7 +209,7 @@ class _FlownPlans:
         self._strikes = sorted(strikes, key=lambda strike: strike.stamp_s)
         self._looked: tuple[Trajectory | None, int] = (None, -1)
         if plans and not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
-            raise ModelError("a trace that does not tell which plan is flown")
+            raise ModelError("the trace does not say which plan is flown")
         if plans:
             self._stamps_s = _reals(trace["trajectory_stamp_s"])
             self._waypoints = _reals(trace["waypoint_index"])
@@ -245,7 +245,7 @@ class _Messages:
         names = ["stamp_s", *_REPORT, *_WAYPOINT, *_COMMAND]
         missing = [name for name in names if name not in trace]
         if missing:
-            raise ModelError(f"a trace without the column {missing[0]!r}")
+            raise ModelError(f"the trace has no column {missing[0]!r}")
         self.stamps_s = _reals(trace["stamp_s"])
         self._reports = np.column_stack([_reals(trace[name]) for name in _REPORT])
         self._waypoints = np.column_stack([_reals(trace[name]) for name in _WAYPOINT])

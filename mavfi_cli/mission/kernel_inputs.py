@@ -118,7 +118,7 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
         another = replace(config, seed=seed)
         found += _hard_tasks(another, _flown(another))
     raise TargetError(
-        _flight_name(config), "has too few plans round an obstacle, as the next seeds"
+        _flight_name(config), "has too few plans around an obstacle, and so have the next seeds"
     )
 
 

@@ -141,17 +141,17 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
     """Refuse a folder that cannot grow to the plan."""
     if stored is None:
         raise ConfigError(
-            "holds a campaign that is no reproduction; another --out starts anew", path=plan.folder
+            "holds a campaign that is not a reproduction; choose another --out", path=plan.folder
         )
     if stored.stack != plan.stack:
         raise ConfigError(
-            f"flies the stack {stored.stack}, not {plan.stack}; another --out starts anew",
+            f"flies the stack {stored.stack}, not {plan.stack}; choose another --out",
             path=plan.folder,
         )
     if plan.scale < stored.scale:
         raise ConfigError(
             f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}; "
-            "another --out starts anew",
+            "choose another --out",
             path=plan.folder,
         )
 

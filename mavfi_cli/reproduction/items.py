@@ -129,7 +129,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
     """
     for name in names:
         if name in LEFT_OUT:
-            raise ConfigError(f"is no experiment: it {LEFT_OUT[name]}", key=name)
+            raise ConfigError(f"is not an experiment: it {LEFT_OUT[name]}", key=name)
         if name not in BY_NAME:
             raise UnknownName("item", name, BY_NAME)
     return tuple(item for item in ITEMS if not names or item.name in names)

@@ -45,7 +45,7 @@ class DetectorConfig:
 
     def __post_init__(self) -> None:
         if not self.protect:
-            raise ConfigError("names no stage", key="protect")
+            raise ConfigError("must name a stage", key="protect")
         for stage in self.protect:
             if stage not in STAGES:
                 raise UnknownName("stage", stage, STAGES)

@@ -167,7 +167,9 @@ class FaultConfig:
             if not target.startswith("waypoint_"):
                 raise UnknownName("state of control's queue", target, _QUEUED)
             if self.trigger().when is When.INVOCATION:
-                raise FaultSpecError(f"{self.target}: a queue is no message, so it has no number")
+                raise FaultSpecError(
+                    f"{self.target}: a queue is not a message, so it has no invocation"
+                )
         return draw_fault(
             target,
             seed=self.seed,

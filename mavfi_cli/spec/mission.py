@@ -155,7 +155,7 @@ class MissionConfig:
         if self.eyes and self.link is None:
             raise ConfigError(_NEEDS_LINK, key="eyes")
         if self.origin is not None and not self.eyes:
-            raise ConfigError("needs --eyes: without them no world is known", key="origin")
+            raise ConfigError("needs --eyes, without which there is no world", key="origin")
         if self.link is not None:
             self._check_foreign()
             return
@@ -188,7 +188,7 @@ class MissionConfig:
             )
         if self.isolate or self.instruction is not None:
             raise ConfigError(
-                f"{self.platform} measures the kernels in the companion's own process: without "
+                f"{self.platform} measures the kernels in the companion's own process: leave out "
                 "isolate and --level instruction",
                 key="platform",
             )

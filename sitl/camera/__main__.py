@@ -93,7 +93,7 @@ from sitl.world import load_world
     default="solo",
     show_default=True,
     metavar="NAME|FILE",
-    help="Profile whose body and energy the referee takes for the vehicle's.",
+    help="Vehicle whose body and energy model the referee uses.",
 )
 @click.option(
     "--truth",

@@ -65,7 +65,7 @@ class FirmwareProcess:
                 )
         except OSError as error:
             self._remove_folder()
-            raise VehicleProcessError(f"{binary} is no firmware: {error.strerror}") from None
+            raise VehicleProcessError(f"{binary} is not a firmware: {error.strerror}") from None
 
     def require_running(self) -> None:
         """Check that it still runs.

@@ -153,7 +153,7 @@ class Px4Link:
         program = require_program(binary)
         startup = program.parent.parent / "etc"
         if not (startup / "init.d-posix" / "rcS").is_file():
-            raise VehicleProcessError(f"{binary} is no PX4: it has no startup files in {startup}")
+            raise VehicleProcessError(f"{binary} is not PX4: it has no startup files in {startup}")
         folder = Path(tempfile.mkdtemp(prefix="mavfi-px4-"))
         instance = self.port - PORT
         settings = [

@@ -109,8 +109,8 @@ class ServerOptions:
 @click.option("--start", "start_enu_m", type=Place(), help="Start, ENU m. See --goal.")
 @click.option(
     "--goal", "goal_enu_m", type=Place(),
-    help="Goal, ENU m. A generated world is built round start and goal: a change moves the bounds, "
-    "and towers within 3 m of start and goal are left out.",
+    help="Goal, ENU m. A generated world is built around start and goal: other positions move its "
+    "bounds, and towers within 3 m of them are left out.",
 )  # fmt: skip
 @click.option(
     "--link", "links", type=_Link(), multiple=True,
@@ -121,7 +121,9 @@ class ServerOptions:
 @click.option("--lockstep", is_flag=True, help="Wait for the companion on --fd at every tick.")
 @click.option("--realtime", is_flag=True, help="The same as --speed 1.")
 @click.option(
-    "--speed", type=_Positive(), help="Times real time  [1; in lockstep as fast as it goes]."
+    "--speed",
+    type=_Positive(),
+    help="Speed, in times real time  [1; in lockstep as fast as possible].",
 )
 @click.option(
     "--answer-limit", "answer_limit_s", type=_Positive(), default=120.0, show_default=True,
@@ -149,11 +151,11 @@ class ServerOptions:
 )  # fmt: skip
 @click.option(
     "--firmware", type=click.Path(path_type=Path),
-    help="SITL binary to start  [somebody else starts it].",
+    help="SITL binary to start  [none: you start it yourself].",
 )  # fmt: skip
 @click.option(
     "--firmware-link", metavar="URL", default=_FIRMWARE_LINK, show_default=True,
-    help="Where a firmware that somebody else starts sends its MAVLink.",
+    help="Endpoint to which a firmware that you start yourself sends its MAVLink.",
 )  # fmt: skip
 @click.option(
     "--firmware-seed", type=click.IntRange(min=0), default=1, show_default=True,

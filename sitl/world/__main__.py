@@ -37,15 +37,21 @@ def _on_world(command: Callable[..., None]) -> Callable[..., None]:
 
     decorators = [
         click.argument("name", metavar="WORLD"),
-        click.option("--seed", type=click.IntRange(min=0), default=3, show_default=True),
+        click.option(
+            "--seed",
+            type=click.IntRange(min=0),
+            default=3,
+            show_default=True,
+            help="Seed of the world.",
+        ),
         click.option("--start", type=Place(), help="Start of flights, ENU m. See --goal."),
         click.option(
             "--goal",
             type=Place(),
-            help="Goal of flights, ENU m. A generated world is built round start and goal: a "
-            "change moves the bounds, and towers within 3 m of start and goal are left out.",
+            help="Goal of flights, ENU m. A generated world is built around start and goal: other "
+            "positions move its bounds, and towers within 3 m of them are left out.",
         ),
-        click.option("--json", "as_json", is_flag=True, help="The result as JSON."),
+        click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
     ]
     decorated: Callable[..., None] = with_world
     for decorate in reversed(decorators):
@@ -64,7 +70,7 @@ def _world() -> None:
 
 
 @_world.command(name="list")
-@click.option("--json", "as_json", is_flag=True, help="The result as JSON.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 def _list(as_json: bool) -> None:
     """List all named worlds."""
     rows = [(name, _describe(name)) for name in world_names()]
@@ -93,7 +99,7 @@ def _describe_pair(pair: GeneratorParams) -> str:
 
 @_world.command(name="make", epilog=_WORLD_HELP, short_help="Write a world as a TOML file.")
 @_on_world
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="File  [standard output].")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="TOML file  [stdout].")
 def _make(
     made: World,
     as_json: bool,
@@ -111,7 +117,7 @@ def _make(
         click.echo(f"{output}: {_boxes(made)}")
 
 
-@_world.command(name="check", epilog=_WORLD_HELP, short_help="Check that it can be flown.")
+@_world.command(name="check", epilog=_WORLD_HELP, short_help="Check that a world can be flown.")
 @_on_world
 @click.option(
     "--clearance",
@@ -120,7 +126,7 @@ def _make(
     show_default=True,
     help="Clearance of the path from every box, m.",
 )
-@click.option("--expect", type=click.Choice(["path"]), help="Exit with 1 if there is no path.")
+@click.option("--expect", type=click.Choice(["path"]), help="Exit with code 1 if there is no path.")
 def _check(
     made: World,
     as_json: bool,

@@ -173,7 +173,7 @@ def test_outputs_that_change_are_refused_and_lines_of_them_can_be_left_out(comma
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["runs"] == 3
     damaged = command("--ignore-lines", "(")
-    assert "--ignore-lines: '(' is no regular expression" in damaged.stderr
+    assert "--ignore-lines: '(' is not a regular expression" in damaged.stderr
 
 
 def test_fault_free_runs_may_differ_within_the_tolerance(place, tmp_path):

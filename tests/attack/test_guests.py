@@ -90,7 +90,7 @@ def test_a_program_for_another_processor(attack, native_program, tmp_path):
     code[18:20] = b"\xb7\0"  # EM_AARCH64
     path.write_bytes(code)
     path.chmod(0o755)
-    assert "is no program for x86-64" in refused(attack(program=path))
+    assert "is not a program for x86-64" in refused(attack(program=path))
 
 
 @pytest.mark.parametrize("length", ["30", "30000"])

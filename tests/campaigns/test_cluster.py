@@ -169,7 +169,7 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port)
     "address", ["nonsense", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://127.0.0.1:port"]
 )
 def test_what_is_no_address_is_refused_at_once(address):
-    with pytest.raises(CampaignStopped, match="expected the scheduler's address, as tcp://"):
+    with pytest.raises(CampaignStopped, match="expected the scheduler's address, such as tcp://"):
         Cluster(address, Keep.NONE)
 
 

@@ -155,7 +155,7 @@ def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     (line,) = run.stderr.splitlines()
     assert line == (
         f"error: {folder}: holds another campaign: field mantissa there, exponent here; 4 missions "
-        "there, 4 here, of which 2 are new, and 2 are gone; another folder starts anew"
+        "there, 4 here, of which 2 are new, and 2 are gone; choose another folder"
     )
 
 

@@ -97,7 +97,7 @@ def test_another_rule_is_another_campaign(begun):
     other = spec_of(SPEC.replace("[5, 6]", "[2, 2]"))
     with pytest.raises(ConfigError, match="rule of fixed worlds the first from 1 on whose golden"):
         begun(other)
-    with pytest.raises(ConfigError, match=r"another \[fixed_world\]; another folder starts anew"):
+    with pytest.raises(ConfigError, match=r"another \[fixed_world\]; choose another folder"):
         begun(other, append=True)
 
 

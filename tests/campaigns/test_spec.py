@@ -235,7 +235,7 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
             r"at tick=600: 12 s into the flight lies beyond the mission's time limit of 11 s \(in ",
         ),
         ("v_max_mps = [99.0]", r"v_max_mps: must be within"),
-        ("threshold = 2.0", r"threshold: without a detector"),
+        ("threshold = 2.0", r"threshold: needs a detector"),
         ("detector = 'gad'\nprotect = ['contrl']", r"did you mean 'control'"),
     ],
 )

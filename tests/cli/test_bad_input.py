@@ -295,7 +295,7 @@ def no_firmware(tmp_path, monkeypatch):
         ("px4", "nothing", "no firmware at {path}"),
         ("px4", "folder", "no firmware at {path}"),
         ("px4", "text", "no permission to execute {path}"),
-        ("px4", "program", "{path} is no PX4: it has no startup files in"),
+        ("px4", "program", "{path} is not PX4: it has no startup files in"),
         ("ardupilot", "program", "true ended with code 0"),
     ],
 )

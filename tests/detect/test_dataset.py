@@ -60,7 +60,7 @@ def test_what_is_no_data_set_is_refused(tmp_path):
     with pytest.raises(RecordError, match="no data set can be read"):
         Dataset.load(path)
     pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(ModelError, match="is no data set of mavfi"):
+    with pytest.raises(ModelError, match="is not a data set of mavfi"):
         Dataset.load(path)
     dataset(params=PreprocessParams(yaw_floor=-5)).save(path)
     with pytest.raises(ModelError, match="another version, table of states or preprocessing"):

@@ -55,12 +55,12 @@ def test_what_is_saved_is_loaded_exactly(path):
         ({"stack": None}, "corrupt model file: keys stack"),
         ({"extended": {}}, "extended must be collision, plan_trajectory_seq, plan_future"),
         ({"extended": {**RANGES, "collision": [0]}}, "corrupt model file: extended.collision: "),
-        ({"extended": {**RANGES, "collision": [1, 2]}}, "extended: collision is no range"),
+        ({"extended": {**RANGES, "collision": [1, 2]}}, "extended: collision is not a range"),
         (
             {"extended": {**RANGES, "collision": [0, 0.5]}},
             "collision.1.: expected a whole number",
         ),
-        ({"extended": {**RANGES, "collision": [0, 40000]}}, "extended: collision is no range"),
+        ({"extended": {**RANGES, "collision": [0, 40000]}}, "extended: collision is not a range"),
         ({"detector": "aad"}, "made for detector 'aad', this is 'gad'"),
         ({"states": "0" * 64}, "made for another table of states"),
         ({"preprocess_digest": "0" * 64}, "made with another preprocessing"),
@@ -87,9 +87,9 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(path, values, problem):
     ("value", "problem"),
     [
         ([1.0, 2.0], r"array 'n_sigma' has shape \(2,\), this version needs \(1,\)"),
-        (["a"], "array 'n_sigma' is no numbers"),
+        (["a"], "array 'n_sigma' does not contain numbers"),
         ([None], "not finite"),
-        ([[1.0], [2.0, 3.0]], "is no numbers"),
+        ([[1.0], [2.0, 3.0]], "does not contain numbers"),
         ([float("inf")], "not finite"),
     ],
 )

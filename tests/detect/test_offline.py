@@ -132,7 +132,7 @@ def test_steps_of_plans_are_what_the_gate_looks_at():
 def test_a_missing_column_is_named():
     columns = trace(1.0)
     del columns["waypoint_vx"]
-    with pytest.raises(ModelError, match="a trace without the column 'waypoint_vx'"):
+    with pytest.raises(ModelError, match="the trace has no column 'waypoint_vx'"):
         list(replay(columns, None))
 
 

@@ -62,6 +62,6 @@ def test_unknown_items_are_named():
     assert [each.name for each in items_named(["table4", "fig8"])] == ["fig8", "table4"]
     with pytest.raises(UnknownName, match="did you mean 'table4'"):
         items_named(["tabel4"])
-    with pytest.raises(ConfigError, match="fig1: is no experiment: it draws the pipeline"):
+    with pytest.raises(ConfigError, match="fig1: is not an experiment: it draws the pipeline"):
         items_named(["fig1"])
     assert not LEFT_OUT.keys() & BY_NAME.keys()

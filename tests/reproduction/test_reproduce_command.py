@@ -71,7 +71,7 @@ def test_unknown_items_are_usage_errors(mavfi, tmp_path):
     assert "did you mean 'table4'" in run.stderr
     run = mavfi("reproduce", "table1")
     assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
-    assert "is no experiment" in run.stderr
+    assert "is not an experiment" in run.stderr
     assert mavfi("reproduce", "fig9", "--scale", "0").returncode == 2
     run = mavfi("reproduce", "fig9", "--stack", "mavbnch", "--out", tmp_path)
     assert "did you mean 'mavbench'" in run.stderr
@@ -122,7 +122,7 @@ def test_full_status_is_still_there(folder, mavfi):
 def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
     for arguments, told in (
         (("--item", "fig99"), "unknown item 'fig99'"),
-        (("--item", "fig2"), "is no experiment"),
+        (("--item", "fig2"), "is not an experiment"),
         (("--item", "fig9", "--output", "x.jpg"), "name a file that ends in .svg, .pdf or .png"),
         (("--item", "fig9", "--output", tmp_path / "no/x.png"), "its folder does not exist"),
         (("--item", "fig6"), "no runs of kernels"),

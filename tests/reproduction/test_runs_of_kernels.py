@@ -104,5 +104,5 @@ def test_without_runs_the_command_that_makes_them_is_named(tmp_path):
         list(tables(plan(tmp_path)))
     (tmp_path / "kernels").mkdir()
     (tmp_path / "kernels" / KERNELS).write_text("{")
-    with pytest.raises(RecordError, match="no summary of `mavfi kernels`"):
+    with pytest.raises(RecordError, match="not a summary of `mavfi kernels`"):
         list(tables(plan(tmp_path)))

@@ -164,4 +164,4 @@ def test_bad_input_is_one_line_and_leaves_nothing(mavfi, tmp_path, arguments, to
 def test_two_formats_at_once_are_a_usage_error(mavfi, tmp_path):
     run = mavfi("compare", "--json", "--csv", cwd=tmp_path)
     assert run.returncode == 2
-    assert "--json or --csv, not both" in run.stderr
+    assert "--json and --csv exclude each other" in run.stderr

@@ -335,8 +335,8 @@ def injection_of(
     assert config.instruction is not None
     if config.link is not None:
         raise FaultError(
-            "an instruction-level fault is drawn from the golden flight, and a foreign autopilot "
-            "flies no two alike: leave out --link"
+            "an instruction-level fault needs flights that repeat, and those of a foreign "
+            "autopilot do not: leave out --link"
         )
     if repeat is not None:
         planned = _planned_of(repeat)

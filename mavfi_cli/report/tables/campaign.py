@@ -325,7 +325,7 @@ def write_flights(table: pa.Table, path: Path) -> int:
     """
     if path.suffix not in _FORMATS:
         raise ConfigError(
-            f"expected a name that ends in {' or '.join(_FORMATS)}, or - for CSV on stdout",
+            f"the name must end in {' or '.join(_FORMATS)}, or - for CSV on stdout",
             path=path,
         )
 

@@ -49,13 +49,13 @@ def test_a_file_that_must_not_be_executed(tmp_path: Path) -> None:
 
 def test_a_program_without_startup_files_is_no_px4(tmp_path: Path) -> None:
     program = _program(tmp_path / "bin" / "px4", "#!/bin/sh\n")
-    with pytest.raises(VehicleProcessError, match="is no PX4: it has no startup files"):
+    with pytest.raises(VehicleProcessError, match="is not PX4: it has no startup files"):
         _open("px4", program)
 
 
 def test_a_file_that_is_no_program(tmp_path: Path) -> None:
     program = _program(tmp_path / "arducopter", "no program")
-    with pytest.raises(VehicleProcessError, match="is no firmware: Exec format error"):
+    with pytest.raises(VehicleProcessError, match="is not a firmware: Exec format error"):
         _open("ardupilot", program)
 
 
