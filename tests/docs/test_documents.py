@@ -70,6 +70,37 @@ def test_every_relative_link_leads_to_a_file(document):
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_named_file_exists(document):
+    folders = "mavfi_cli|sitl|tests|benchmarks|examples|docs"
+    named = re.findall(rf"\b(?:{folders})/[\w./*-]*[\w/*]", document.read_text())
+    assert [path for path in named if not any(ROOT.glob(path.rstrip("/")))] == []
+
+
+def named_commands(document):
+    """The words of each command of mavfi that a page names, without `mavfi`."""
+    text = document.read_text().replace("\\\n", " ")
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.M)
+    lines = [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
+    for line in (*re.findall(r"(?<!`)`([^`]+)`(?!`)", text), *lines):
+        if line.startswith("mavfi "):
+            yield shlex.split(" ".join(line.split()), comments=True)[1:]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_named_option_exists(document, mavfi):
+    if document.name == "CHANGELOG.md":
+        pytest.skip("it also names options that are gone")
+    wrong = []
+    for words in named_commands(document):
+        options = {word.partition("=")[0] for word in words if re.match("--?[a-z]", word)}
+        if options and words[0].islower():
+            names = 2 if words[0] in ("campaign", "detect", "world") else 1
+            told = mavfi(*words[:names], "--help").stdout
+            wrong += [(words, each) for each in options if not re.search(rf"{each}\b", told)]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_placeholder_is_left(document):
     assert "@@" not in document.read_text()
 
