@@ -145,11 +145,11 @@ def store_plan(
     if stored and not append and (new or left.total()):
         found = [*differing] or _first_of(new, +left)
         found.append(f"{stored} missions there, {len(missions)} here, of which {len(new)} are new")
+        remedy = "choose another folder"
         if left.total():
             found[-1] += f", and {left.total()} are gone"
         elif can_append:
-            found.append(can_append)
-        remedy = "choose another folder"
+            remedy = f"{can_append}, or {remedy}"
         raise ConfigError(
             f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
         )

@@ -136,5 +136,5 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
         measured(guarded.path, "tx2")
     with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
         measured(tmp_path)
-    with pytest.raises(UsageError, match=r"no such file or folder; for per cent write aad=0\.0062"):
+    with pytest.raises(UsageError, match=r"folder; for a percentage write aad=0\.0062"):
         overheads((str(tmp_path / "nowhere"),))

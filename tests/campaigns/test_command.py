@@ -116,7 +116,7 @@ def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
     assert run.stdout == (tmp_path / "table.csv").read_text()
     assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
     refused = mavfi("campaign", "export", folder, tmp_path / "table.xls")
-    assert "ends in .parquet or .csv, or - for CSV on stdout" in refused.stderr
+    assert "must end in .parquet or .csv, or - for CSV on stdout" in refused.stderr
 
 
 @pytest.mark.parametrize(("chosen", "seed"), [((), 1), (("--pair", "3"), 2)])
@@ -164,8 +164,8 @@ def test_append_is_recommended_where_it_is_enough(flown, mavfi, tmp_path):
     more = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 3"))
     line = mavfi("campaign", "run", more, "--out", folder).stderr
     assert "another campaign: repetitions 2 there, 3 here; 4 missions there, 6 here" in line
-    assert line.endswith("of which 2 are new; --append adds what is new; another folder starts "
-                         "anew\n")  # fmt: skip
+    remedy = "--append adds what is new, or choose another folder\n"
+    assert line.endswith(f"of which 2 are new; {remedy}")
     fewer = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 1"))
     line = mavfi("campaign", "run", fewer, "--out", folder).stderr
     assert "4 missions there, 2 here, of which 0 are new, and 2 are gone" in line
@@ -270,7 +270,7 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     again = invoke(command.campaign, ["run", str(changed), "--quiet"])
     assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
     both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])
-    assert "goes without --scale, --set and --out" in str(both.exception)
+    assert "does not take --scale, --set or --out" in str(both.exception)
 
 
 def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):
