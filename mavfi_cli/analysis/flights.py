@@ -21,7 +21,6 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
-    PlannedMission,
     ResultState,
     canonical,
     changes_of,
@@ -46,7 +45,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 
-def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) -> pa.Table:
+def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     """The finished missions; those that could not begin have the state `error`.
 
     Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
@@ -55,21 +54,12 @@ def flights(ledger: Ledger, missions: Iterable[PlannedMission] | None = None) ->
     of the flight time that detection takes (`check_share`) and recovery (`recovery_share_STAGE`).
 
     Args:
-        missions: selects these of the ledger.
+        among: numbers of the missions to choose from; None means all.
     """
-    wanted = None if missions is None else {_asked(mission) for mission in missions}
     labels = sorted({name for cell in ledger.cells() for name in cell})
-    rows = [
-        _row(entry, labels)
-        for entry in ledger.results()
-        if wanted is None or _asked(entry.mission) in wanted
-    ]
+    rows = [_row(entry, labels) for entry in ledger.results(among)]
     names = _names(labels)
     return pa.table({name: _column([row[name] for row in rows]) for name in names})
-
-
-def _asked(mission: PlannedMission) -> tuple[str, str]:
-    return canonical(dict(mission.labels)), canonical(changes_of(mission.config))
 
 
 def _names(labels: Sequence[str]) -> list[str]:

@@ -9,9 +9,10 @@ from pathlib import Path
 import pyarrow as pa
 
 from mavfi_cli.analysis.flights import flights
-from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError, UnknownName
@@ -26,13 +27,20 @@ def fly(
 ) -> pa.Table:
     """Fly the missions that the folder lacks; return all of them, as `analysis.flights`.
 
+    Others that an interrupted larger plan has left in the folder's list are not flown.
+
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
-    with run_campaign(
-        missions, folder, replace(options, keep=keep), spectator, append=True
-    ) as ledger:
-        return flights(ledger, missions)
+    wanted = {
+        (canonical(dict(each.labels)), canonical(changes_of(each.config))) for each in missions
+    }
+    with Ledger(folder, writing=True) as ledger:
+        store_plan(ledger, missions, append=True)
+        mine = [number for number, labels, _, changes in ledger.rows()
+                if (labels, changes) in wanted]  # fmt: skip
+        fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
+        return flights(ledger, mine)
 
 
 def require_named(

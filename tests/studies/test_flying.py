@@ -1,0 +1,45 @@
+"""What all studies do: fly a list into a folder that may hold more."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.studies.flying import fly
+
+OPTIONS = Options(jobs=1, keep=Keep.NONE, task="fake_task")
+
+
+@pytest.fixture(autouse=True)
+def _fake_task_is_importable(monkeypatch):
+    paths = [str(Path(__file__).parents[1] / "campaigns"), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+
+
+def test_a_smaller_plan_flies_no_mission_that_a_larger_one_has_left(tmp_path):
+    missions = [
+        PlannedMission(config=MissionConfig(world=world, seed=seed), labels={"n": seed})
+        for seed, world in enumerate(["fly", "end:collision", "fly", "fly", "fly"])
+    ]
+    run_campaign(missions, tmp_path, replace(OPTIONS, only=frozenset({2}))).close()
+    told = []
+
+    class Told(Spectator):
+        def on_progress(self, progress):
+            told.append((progress.before, progress.over, progress.total))
+
+    table = fly(missions[:3], tmp_path, Keep.NONE, OPTIONS, Told())
+    assert table["number"].to_pylist() == [0, 1, 2]
+    assert table["outcome"].to_pylist() == ["success", "collision", "success"]
+    assert told[-1] == (1, 3, 3)
+    with Ledger(tmp_path) as ledger:
+        assert (ledger.planned(), ledger.over()) == (5, 3)
+    more = fly(missions, tmp_path, Keep.NONE, OPTIONS, Spectator())
+    assert more["number"].to_pylist() == [0, 1, 2, 3, 4]
