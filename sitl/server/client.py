@@ -29,7 +29,7 @@ class Client(Peer):
     heartbeat.
 
     Attributes:
-        overheard: frames of received STATUSTEXTs for the other clients, unchanged, as an
+        overheard: Frames of received STATUSTEXTs for the other clients, unchanged, as an
             autopilot forwards its companion's texts to the ground station.
     """
 
@@ -62,17 +62,17 @@ class Client(Peer):
         super().close()
 
     def receive(self, timeout_s: float) -> list[Any]:
-        """Handle the next bytes, waiting at most `timeout_s`; return the handled messages.
+        """Handle the next bytes, waiting at most `timeout_s`. Return the handled messages.
 
         Raises:
-            LinkLost: the peer is gone.
+            LinkLost: The peer is gone.
         """
         with self._simulation.wall.measure("wait"):
             data = self.transport.receive(timeout_s)
         return self.take(data) if data else []
 
     def take(self, data: bytes) -> list[Any]:
-        """Handle received bytes; return the handled messages."""
+        """Handle received bytes. Return the handled messages."""
         with self._simulation.wall.measure("link"):
             messages = self._codec.decode(data, datagram=self.transport.datagram)
             for message in messages:
@@ -87,7 +87,7 @@ class Client(Peer):
         """Send everything due at this tick at once, the autopilot's streams last.
 
         Returns:
-            Whether anything was due.
+            True if anything was due.
         """
         with self._simulation.wall.measure("link"):
             due = [

@@ -47,7 +47,7 @@ class _Pace:
     dropped.
 
     Args:
-        speed: simulated seconds for each second of the wall clock.
+        speed: Simulated seconds for each second of the wall clock.
     """
 
     def __init__(self, speed: float) -> None:
@@ -90,7 +90,7 @@ def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[
 def _await_answer(
     stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
 ) -> bool:
-    """Handle messages of the companion until it answers; False if stopped before."""
+    """Handle messages of the companion until it answers. Return False if stopped before."""
     deadline_s = 0.0
     while True:
         messages = client.receive(_LOOK_UP_S)
@@ -111,7 +111,7 @@ def _await_answer(
 
 
 def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
-    """Whether the setpoint for a stamp is among the companion's messages."""
+    """Return True if the setpoint for a stamp is among the companion's messages."""
     return any(
         message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms
         for message in messages
@@ -122,13 +122,13 @@ class _EmbeddedVehicle:
     """The vehicle in the process of its companion, which waits while the vehicle flies.
 
     Args:
-        simulation: the vehicle.
-        truth_folder: folder in which the truth is saved at the end.
+        simulation: The vehicle.
+        truth_folder: Folder in which the truth is saved at the end.
 
     Attributes:
-        link: the companion's end of the link. When the companion has answered a tick and waits for
+        link: The companion's end of the link. When the companion has answered a tick and waits for
             more, the vehicle flies the next one.
-        error: error that ended the vehicle before its companion.
+        error: Error that ended the vehicle before its companion.
     """
 
     def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
@@ -154,7 +154,7 @@ class _EmbeddedVehicle:
             self.end()
 
     def _fly_tick(self) -> bool:
-        """Fly a tick if the companion has answered; return whether it has."""
+        """Fly a tick if the companion has answered. Return True if it has."""
         messages, simulation = self._client.receive(0.0), self._simulation
         answered = not simulation.awaits_setpoints or _answers(
             messages, simulation.stamp_us // 1000
@@ -164,10 +164,10 @@ class _EmbeddedVehicle:
         return answered
 
     def end(self) -> None:
-        """Fly the companion's last answer and save the truth; may be called repeatedly.
+        """Fly the companion's last answer and save the truth. May be called repeatedly.
 
         Raises:
-            RecordError: the truth cannot be saved.
+            RecordError: The truth cannot be saved.
         """
         if self._ended:
             return
@@ -303,14 +303,14 @@ def _serve(options: ServerOptions) -> None:
 
 
 def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
-    """The vehicle of `python -m sitl --lockstep` in this process, ready to fly.
+    """Return the vehicle of `python -m sitl --lockstep` in this process, ready to fly.
 
     Args:
-        arguments: command line without the companion's descriptor.
-        truth_folder: folder for the briefing and, at the end, the truth.
+        arguments: Command line without the companion's descriptor.
+        truth_folder: Folder for the briefing and, at the end, the truth.
 
     Raises:
-        MavfiError: the world, the vehicle, the start or the goal cannot be used.
+        MavfiError: The world, the vehicle, the start or the goal cannot be used.
     """
     options = parse(arguments)
     simulation = _simulation(options, _world(options), load_profile(options.vehicle), logs=True)
@@ -372,7 +372,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
 
 
 def _needs_of_firmware(options: ServerOptions) -> list[str]:
-    """The link and the parameters that a firmware started by somebody else needs, a line each."""
+    """Return link and parameters that a firmware started by somebody else needs, a line each."""
     kind = options.firmware_kind
     if kind is None or options.firmware is not None:
         return []
@@ -385,7 +385,7 @@ def _needs_of_firmware(options: ServerOptions) -> list[str]:
 
 
 def _commanders(options: ServerOptions) -> str:
-    """The clients whose commands are obeyed."""
+    """Return the clients whose commands are obeyed."""
     if options.trusted:
         return f"system {', '.join(map(str, sorted(options.trusted)))} only"
     return "anyone" + ("" if options.key_file is None else " who signs")

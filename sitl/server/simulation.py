@@ -34,19 +34,19 @@ class Simulation:
     """One vehicle in one world; deterministic in its arguments and the messages handled.
 
     Args:
-        world: world of the flight, which begins at the world's start, facing the goal.
-        profile: profile of the vehicle.
-        camera: its depth camera; None for one with default settings.
+        world: World of the flight, which begins at the world's start, facing the goal.
+        profile: Profile of the vehicle.
+        camera: Its depth camera; None for one with default settings.
         system_id: MAVLink system id.
-        step_s: physics step.
-        autopilot: real firmware in the place of the autopilot; None for our own.
+        step_s: Physics step.
+        autopilot: Real firmware in the place of the autopilot; None for our own.
         trusted: MAVLink systems that may command; empty for all.
-        logs: keep the truth of every tick for `save_truth`.
+        logs: Keep the truth of every tick for `save_truth`.
 
     Attributes:
-        stamp_us: boot clock at the newest tick.
-        camera_due: messages of the camera at the newest tick.
-        wall: wall times of this machine by part.
+        stamp_us: Boot clock at the newest tick.
+        camera_due: Messages of the camera at the newest tick.
+        wall: Wall times of this machine by part.
     """
 
     awaits_setpoints = True  # in lockstep, every tick waits for the companion's setpoint
@@ -133,7 +133,7 @@ class Simulation:
         """Write the referee's log and verdict.
 
         Raises:
-            RecordError: a file cannot be written.
+            RecordError: A file cannot be written.
         """
         truth = self.vehicle.truth
         energies = {

@@ -28,6 +28,7 @@ Triple = tuple[float, float, float]
 # ordinary 4.2 V cell.
 _MIDDLE = 0.3
 
+_LARGEST = 1e12  # of all values, in their units
 _ANY_SIGN = ("camera_mount_flu_m", "rotor.height_m", "energy.")
 _MAY_BE_ZERO = (
     "extra_payload_kg",
@@ -195,7 +196,7 @@ class VehicleProfile:
 
     def __post_init__(self) -> None:
         for key, value in _numbers(self):
-            _check_sign(key, value)
+            _check_number(key, value)
         self._check_lift()
         self._check_ranges()
 
@@ -270,7 +271,9 @@ def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
             yield key, value
 
 
-def _check_sign(key: str, value: float) -> None:
+def _check_number(key: str, value: float) -> None:
+    if value and not 1.0 / _LARGEST <= abs(value) <= _LARGEST:  # else sums and quotients overflow
+        raise ConfigError(f"no quadrotor has {value:g}", key=key)
     if key.startswith(_ANY_SIGN):
         return
     if value < 0.0 and key in _MAY_BE_ZERO:
