@@ -40,6 +40,7 @@ from mavfi_cli.attack.target import (
     signal_name,
 )
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.files import writing
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.counted import callgrind, read_counts, run_counted
 from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
@@ -179,6 +180,7 @@ class _Workplace:
 
     Raises:
         TargetError: the program is of a kind that cannot be attacked.
+        RecordError: the scratch folder cannot be made.
     """
 
     kind = "program"
@@ -188,12 +190,12 @@ class _Workplace:
         self.target, self.limits = target, target.limits
         self._golden: Golden | None = None
         self._watched: Watched | None = None
-        scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
+        with writing(Path(tempfile.gettempdir())):
+            scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
         self._remove = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
         self._counts = scratch / "counts"
         self._folder = scratch / "run"
-        self._folder.mkdir()
         self._command = replace(target.command, directory=self._folder)
 
     @property
@@ -219,7 +221,8 @@ class _Workplace:
 
     def _renew_folder(self) -> None:
         try:
-            shutil.rmtree(self._folder)  # follows no link
+            if self._folder.exists():
+                shutil.rmtree(self._folder)  # follows no link
             if self.target.folder is None:
                 self._folder.mkdir()
             else:

@@ -99,6 +99,11 @@ def test_every_run_begins_in_an_empty_folder(place, treasure):
     assert golden_run(where).output == b"== stdout\nlink\nmore\nout\n== out\n1\n"
 
 
+def test_a_run_may_remove_its_own_folder(place):
+    where = place('here=$(pwd); cd /; rmdir "$here"; echo 1')
+    assert golden_run(where).output == b"1\n"
+
+
 def test_an_argument_that_names_a_compared_file_is_the_programs_own(command, tmp_path, monkeypatch):
     """Else the program would write over the user's file of that name."""
     monkeypatch.chdir(tmp_path)
@@ -138,6 +143,13 @@ def test_nothing_is_left_behind(command, tmp_path, monkeypatch, jobs):
     done = command("--compare", "file:o", "--jobs", jobs, args="o")
     assert done.exit_code == 0, done.output
     assert not list(scratch.glob("mavfi-*"))
+
+
+def test_a_scratch_folder_that_cannot_be_made_is_a_clear_error(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    done = command("--compare", "file:o", args="o")
+    assert done.exit_code == 1
+    assert str(done.exception) == f"{tmp_path / 'gone'}: No such file or directory"
 
 
 # -- outputs
