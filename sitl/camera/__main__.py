@@ -143,7 +143,7 @@ def _camera(
     signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
     witness = Witness(world, profile, logs=truth is not None)
     if truth is not None:
-        world.write_briefing(made.mount_offset_flu_m, truth)
+        world.write_briefing((forward, left, up), truth)
     stopped = stop_on_signals()
     with contextlib.closing(
         Router(links, signing=signing, allow_unsigned=allow_unsigned)

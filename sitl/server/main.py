@@ -273,10 +273,6 @@ def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[
         server.run(stopped)
 
 
-def _brief(simulation: Simulation, folder: Path) -> None:
-    simulation.referee.world.write_briefing(simulation.camera.mount_offset_flu_m, folder)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `python -m sitl`. Return its exit code."""
     given = sys.argv[1:] if arguments is None else arguments
@@ -290,9 +286,9 @@ def _serve(options: ServerOptions) -> None:
     if not options.lockstep and not in_cache(control_step):
         click.echo("the first start compiles the vehicle, about half a minute", err=True)
         warm_up()
-    simulation = _simulation(options, world, profile, logs=options.truth is not None)
     if options.truth is not None:
-        _brief(simulation, options.truth)
+        world.write_briefing(profile.camera_mount_flu_m, options.truth)
+    simulation = _simulation(options, world, profile, logs=options.truth is not None)
     run = _lockstep if options.lockstep else _realtime
     try:
         run(options, simulation, stopped)
@@ -313,9 +309,9 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
         MavfiError: The world, the vehicle, the start or the goal cannot be used.
     """
     options = parse(arguments)
-    simulation = _simulation(options, _world(options), load_profile(options.vehicle), logs=True)
-    _brief(simulation, truth_folder)
-    return _EmbeddedVehicle(simulation, truth_folder)
+    world, profile = _world(options), load_profile(options.vehicle)
+    world.write_briefing(profile.camera_mount_flu_m, truth_folder)
+    return _EmbeddedVehicle(_simulation(options, world, profile, logs=True), truth_folder)
 
 
 def warm_up() -> None:

@@ -9,6 +9,7 @@ and never moves the others.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ class World:
             "boxes": self.boxes_enu_m.tolist(),
         }
 
-    def write_briefing(self, camera_mount_flu_m: Vector, folder: Path) -> None:
+    def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
         """Write what a companion knows before the first message: start, goal, bounds and camera.
 
         Args:
@@ -92,7 +93,7 @@ class World:
             "start_enu_m": self.start_enu_m.tolist(),
             "goal_enu_m": self.goal_enu_m.tolist(),
             "bounds_enu_m": self.bounds_enu_m.tolist(),
-            "camera_offset_flu_m": camera_mount_flu_m.tolist(),
+            "camera_offset_flu_m": list(camera_mount_flu_m),
         }
         write_json(folder / "briefing.json", briefing)
 

@@ -53,6 +53,19 @@ def test_known_error_is_one_line(run, arguments, words):
     assert words in errors
 
 
+def test_a_truth_that_cannot_be_written_starts_no_firmware(run, tmp_path, monkeypatch):
+    program, folder = tmp_path / "arducopter", tmp_path / "folder"
+    program.write_text("#!/bin/sh\nsleep 600\n")
+    program.chmod(0o755)
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    code, _, errors = run(
+        "--json", "ardupilot", "--firmware", str(program), "--truth", "/dev/null/truth"
+    )
+    assert (code, errors) == (1, "error: /dev/null/truth: Not a directory\n")
+    assert list(folder.iterdir()) == []
+
+
 def test_a_descriptor_that_is_no_socket_is_named():
     """In a process of its own, whose descriptor 1 it may close."""
     done = subprocess.run(
