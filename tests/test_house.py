@@ -29,7 +29,7 @@ UNCALLED = {
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
     "occupied_voxels": "what a map holds, for tests of the map",
 }
-COMMANDS = ("mavfi_cli/cli/", "sitl/world/command.py")  # functions that click calls by decorator
+COMMANDS = ("mavfi_cli/cli/",)  # functions that click calls by decorator
 
 
 @functools.cache
