@@ -234,6 +234,7 @@ def attack_live(
     regions: Regions | None = None,
     window: int = 64,
     armed: Notice = lambda: None,
+    reached: Notice = lambda: None,
     leave_stopped: bool = False,
     **context: Any,
 ) -> LiveAttack:
@@ -246,6 +247,7 @@ def attack_live(
     Args:
         window: number of instructions for which a destination fault is followed.
         armed: called once the process runs towards the trigger.
+        reached: called when it has stopped there.
         leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
         context: further entries of the record: kernel, stage, sampling rule, seed, scope.
 
@@ -262,6 +264,7 @@ def attack_live(
         reason = reach(tracee, image, fault)
         injection, followed = None, NOTHING
         if not reason:
+            reached()
             injection, followed = strike(tracee, fault, window=window)
             reason = "" if injection is None else injection.reason
             if leave_stopped and tracee.ended is None:

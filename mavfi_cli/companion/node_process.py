@@ -69,6 +69,7 @@ class NodeProcess:
 
     Args:
         ending: Returns how the process ended if another waiter reaped it, else None.
+        answered: Called after each answer or loss, before the process gets another input.
         patient: Never treat the process as hung, because a debugger may hold it.
     """
 
@@ -78,11 +79,13 @@ class NodeProcess:
         pid: int,
         *,
         ending: Callable[[], str | None] = lambda: None,
+        answered: Callable[[], None] = lambda: None,
         patient: bool = False,
     ) -> None:
         self._socket = connection
         self.pid = pid
         self._ending = ending
+        self._answered = answered
         self._patient = patient
         if not patient:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in mid-message
@@ -136,6 +139,16 @@ class NodeProcess:
         Raises:
             NodeLost: The process ended, hung and was killed, or its kernel raised an error.
         """
+        try:
+            answer = self._await(number)
+        finally:
+            self._answered()
+        if answer.error is not None:
+            how, _, told = answer.error.partition("\n")
+            raise NodeLost(hung=False, how=how, traceback=told)
+        return answer.output, answer.host_s
+
+    def _await(self, number: int) -> _Answer:
         begun_s, used_s = time.monotonic(), self._cpu_s()
         try:
             while number not in self._answers:
@@ -153,11 +166,7 @@ class NodeProcess:
             raise
         except Exception:  # a corrupted pickle can raise any error
             raise NodeLost(hung=False, how="garbled its output") from None
-        answer = self._answers.pop(number)
-        if answer.error is not None:
-            how, _, told = answer.error.partition("\n")
-            raise NodeLost(hung=False, how=how, traceback=told)
-        return answer.output, answer.host_s
+        return self._answers.pop(number)
 
     def _cpu_s(self) -> float:
         """Return the CPU time of the process in seconds; 0 after its end."""

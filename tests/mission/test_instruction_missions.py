@@ -119,6 +119,31 @@ def test_a_wild_jump_kills_the_node_and_the_mission_goes_on(repeat):
 
 
 @traced
+def test_a_trigger_that_comes_in_another_invocation_than_planned_is_told_when_it_comes(
+    attacked, repeat
+):
+    """A detector may change the flight before the fault, and with it the invocations."""
+
+    def earlier(recorded):
+        return {**recorded, "node_invocation": 1}
+
+    assert flown(repeat(earlier), without=OF_THE_FAULT) == flown(attacked, without=OF_THE_FAULT)
+
+
+@traced
+def test_a_trigger_that_never_comes_is_no_fault_and_stops_no_mission(repeat, short_flight):
+    def later(recorded):
+        recorded["trigger"][0]["count"] += 1_000_000
+        return recorded
+
+    folder = repeat(later)
+    assert flown(folder, without=OF_THE_FAULT) == flown(short_flight, without=OF_THE_FAULT)
+    fault = load_run(folder.path).result["fault"]
+    assert (fault["state"], fault["injection"]["applied"]) == ("not_injected", False)
+    assert "ended before execution" in fault["reason"]
+
+
+@traced
 def test_a_record_of_another_build_is_refused(repeat):
     def other(recorded):
         recorded["build_ids"]["numba:track"] = "sha256:0"

@@ -11,6 +11,7 @@ import hashlib
 import json
 import pickle
 import signal
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -50,11 +51,6 @@ class _PlannedFault:
     fault: InstructionFault
     context: Mapping[str, Any]  # further entries of the record, by the names of _CONTEXT
     recorded: Mapping[str, Any] | None = None  # the repeated record; None for a drawn fault
-
-    @property
-    def order(self) -> int:
-        """Number of the node's order in which the fault strikes, from 1."""
-        return int(self.context["node_invocation"])
 
 
 def _plan_fault(
@@ -209,8 +205,9 @@ class _InstructionInjection(NoInjection):
         self._for_debugger = for_debugger
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
+        self._reached = threading.Event()  # the trigger, or the end of the attack without it
+        self._struck = False  # in an invocation whose answer is there
         self._told = False
-        self._finished: Callable[[], int] = lambda: 0
         self.node = str(planned.context["node"])
 
     def begin(self, path: Path) -> None:
@@ -224,7 +221,6 @@ class _InstructionInjection(NoInjection):
             TracingForbidden: the operating system refuses.
         """
         scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")
-        self._finished = lambda: executor.nodes[self.node].finished
         pid = self._spawned.pid
         if self._planned.recorded is not None:
             record.require_same_build(self._planned.recorded, Image(pid, scope.regions))
@@ -234,6 +230,7 @@ class _InstructionInjection(NoInjection):
             self._spawned.connection,
             pid,
             ending=self._ending,
+            answered=self._note_strike,
             patient=self._for_debugger is not None,
         )
         executor.isolate(self.node, process)
@@ -241,17 +238,21 @@ class _InstructionInjection(NoInjection):
     def _attack(self, pid: int, scope: KernelScope, armed: Callable[[], None]) -> LiveAttack:
         assert self._path is not None
         debugging = self._for_debugger is not None
-        done = attack_live(
-            pid,
-            self._planned.fault,
-            path=self._path,
-            regions=scope.regions,
-            window=0 if debugging else 64,
-            armed=armed,
-            leave_stopped=debugging,
-            scope=list(scope.objects),
-            **self._planned.context,
-        )
+        try:
+            done = attack_live(
+                pid,
+                self._planned.fault,
+                path=self._path,
+                regions=scope.regions,
+                window=0 if debugging else 64,
+                armed=armed,
+                reached=self._reached.set,
+                leave_stopped=debugging,
+                scope=list(scope.objects),
+                **self._planned.context,
+            )
+        finally:
+            self._reached.set()
         if self._for_debugger is not None and done.ended is None:
             self._for_debugger(pid)
         return done
@@ -267,9 +268,17 @@ class _InstructionInjection(NoInjection):
             return f"killed by {signal.Signals(ended.signal).name}"
         return f"ended with code {ended.exit_code}"
 
+    def _note_strike(self) -> None:
+        """Ask between two inputs of the node: the tick of the news must not depend on speed.
+
+        A detector may have changed the flight before the fault. Then the trigger comes in another
+        invocation than planned, or never.
+        """
+        self._struck = self._struck or self._reached.is_set()
+
     def news(self) -> list[str]:
         """The fault as text, once the struck invocation is over."""
-        if self._told or self._tracer is None or self._finished() < self._planned.order:
+        if self._told or self._tracer is None or not self._struck:
             return []
         self._told = True
         done = self._tracer.result()
