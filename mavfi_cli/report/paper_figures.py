@@ -7,6 +7,7 @@ lightness, so they stay apart without colour; markers and hatches differ as well
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -28,7 +29,8 @@ MARKERS = ("o", "s", "^", "D")
 _PAPER = {"marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
           "markeredgewidth": 0.9, "linestyle": "none"}  # fmt: skip
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
-_LINE_IN = 0.19  # height of a row
+_LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
+_NAME = 36  # characters in a line of a row's name
 
 
 def print_figure(columns: str, height_in: float) -> Figure:
@@ -50,7 +52,11 @@ def print_axes(axes: Axes, title: str = "") -> None:
 
 
 def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
-    """A panel for each column of a table: ours with its interval, the paper's as a diamond."""
+    """A panel for each column of a table: ours with its interval, the paper's as a diamond.
+
+    Args:
+        table: at least one row.
+    """
     shown = [
         place
         for place in range(len(table.columns))
@@ -58,14 +64,16 @@ def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
     ] or [0]
     across = min(len(shown), 4 if columns == "two" else 2)
     down = math.ceil(len(shown) / across)
-    height = down * (0.62 + _LINE_IN * max(2, len(table.rows)))
+    whole = (", ".join(label for label in row.labels if label) for row in table.rows)
+    names = [textwrap.fill(name, _NAME) for name in whole]
+    row_in = _LINE_IN + _NEXT_LINE_IN * max(name.count("\n") for name in names)
+    height = down * (0.62 + row_in * max(2, len(table.rows)))
     figure = print_figure(columns, height + 0.25)
     grid = figure.subplots(down, across, squeeze=False, sharey=True)
     for panel, place in zip(grid.flat, shown, strict=False):
         _dots(panel, table, place)
     for panel in grid.flat[len(shown) :]:
         panel.set_visible(False)
-    names = [", ".join(label for label in row.labels if label) for row in table.rows]
     grid[0, 0].set_yticks(range(len(table.rows)), names, fontsize=SMALLEST)
     grid[0, 0].set_ylim(len(table.rows) - 0.5, -0.5)
     _explain(figure, any(table.printed_in(place) for place in shown))

@@ -54,7 +54,7 @@ def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
     Raises:
         RecordError: nothing was flown that it could show, or these folders are not there.
     """
-    if flights is not None and not flights.num_rows:
+    if not table.rows or (flights is not None and not flights.num_rows):
         raise RecordError(_NOTHING)
     if flights is None or table.name not in DRAWN:
         return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)

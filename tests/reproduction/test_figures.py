@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import matplotlib.colors
 import pytest
@@ -77,6 +78,22 @@ def test_tables_are_drawn_in_the_same_sizes(draw):
     figure = draw(small_table(), "one")
     assert figure.get_figwidth() == WIDTHS_IN["one"]
     assert min(text.get_fontsize() for text in shown_texts(figure)) >= SMALLEST
+
+
+def test_long_names_of_settings_leave_room_for_the_dots():
+    told = small_table()
+    name = "FI, sparse, queue.waypoint_position, mavbench:owns_sequence_numbers=false"
+    figure = draw_dots(replace(told, rows=[replace(told.rows[0], labels=(name,))] * 9), "one")
+    figure.draw_without_rendering()  # warns if an axes has no room
+    assert min(axes.get_window_extent().width for axes in figure.axes) > 0.5 * figure.dpi
+    labels = figure.axes[0].get_yticklabels()
+    boxes = [label.get_window_extent() for label in labels]
+    assert all(a.y0 > b.y1 for a, b in itertools.pairwise(boxes))  # from top to bottom
+
+
+def test_a_table_without_rows_is_not_drawn():
+    with pytest.raises(RecordError, match="nothing to draw"):
+        draw(replace(small_table(), rows=()), None, "one")
 
 
 def test_dots_show_ours_and_the_papers():
