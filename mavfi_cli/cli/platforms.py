@@ -33,7 +33,8 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
             "`mavfi fly --realtime` only"
         )
         click.echo(
-            "\n`mavfi platforms NAME` shows every kernel; docs/how-to/platform.md says how to add one."
+            "\n`mavfi platforms NAME` shows every kernel; "
+            "docs/how-to/platform.md says how to add one."
         )
 
 

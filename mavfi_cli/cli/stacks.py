@@ -51,7 +51,8 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
         click.echo("\n".join([
             *(f"{stack.name:<19}{stack.description}" for stack in found),
             "",
-            "`mavfi stacks NAME` explains every key, `mavfi stacks NAME NAME` shows where stacks differ.",
+            "`mavfi stacks NAME` explains every key, "
+            "`mavfi stacks NAME NAME` shows where stacks differ.",
             "NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true.",
         ]))  # fmt: skip
     else:
