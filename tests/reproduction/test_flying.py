@@ -136,7 +136,7 @@ def test_each_stack_has_its_own_folder(tmp_path):
 def test_another_campaign_is_refused(tmp_path):
     missions = [PlannedMission(config=MissionConfig(world="flat"), labels={})]
     run_campaign(missions, tmp_path / "mavbench", TASK).close()
-    with pytest.raises(ConfigError, match="holds a campaign that is no reproduction"):
+    with pytest.raises(ConfigError, match="holds a campaign that is not a reproduction"):
         flown(plan(tmp_path, "fig9"))
 
 
