@@ -218,7 +218,7 @@ def _effect(found: Any, unit: str) -> str:
     if unit == "number":
         return f"{found.value:.2f} ({_ends(found, 1.0, 2)})"
     largest = max(abs(found.low), abs(found.high))
-    digits = 0 if largest >= 0.1 else 1 if largest >= 0.01 else 4
+    digits = 0 if largest >= 0.1 else 1 if largest >= 0.001 else 4
     value = f"{100 * found.value:{'+' if unit == 'points' else ''}z.{digits}f}"
     return f"{value} {'points' if unit == 'points' else '%'} ({_ends(found, digits=digits)})"
 

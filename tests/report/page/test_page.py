@@ -97,3 +97,5 @@ def test_numbers_as_words():
     assert effect(Interval(value=0.9, low=0.85, high=0.93, count=9), "percent") == "90 % (85 to 93)"
     small = Interval(value=0.0002, low=0.0001, high=0.0003, count=9)
     assert effect(small, "percent") == "0.0200 % (0.0100 to 0.0300)"
+    below_a_point = Interval(value=0.0, low=-0.0092, high=0.0092, count=300)
+    assert effect(below_a_point, "points") == "+0.0 points (-0.9 to 0.9)"
