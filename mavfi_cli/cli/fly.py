@@ -122,7 +122,7 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_fault("--at", default="random", show_default=True,
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
-@_fault("--fault-seed", default=1, show_default=True,
+@_fault("--fault-seed", default=1, show_default=True, type=click.IntRange(min=0),
         help="Seed of all random draws of the fault.")  # fmt: skip
 @_fault("--bits", default=1, show_default=True, help="Number of bits to flip.")
 @_fault("--field", default="any", show_default=True,

@@ -44,6 +44,8 @@ def replay(
     from mavfi_cli.report.summary import difference_lines, outcome_line
 
     recorded = load_run(run)
+    if gdb and (without_fault or not recorded.record.config.get("instruction")):
+        raise click.UsageError("--gdb needs an instruction-level fault to stop at")
     for text in version_differences(recorded.record.versions, installed_versions()):
         click.echo(f"warning: another build: {text}", err=True)
     config = config_of(recorded, with_fault=not without_fault)

@@ -23,6 +23,8 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     from mavfi_cli.mission.repetition import kept_golden, paired_golden
     from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
 
+    if as_json and (pair or events):
+        raise click.UsageError("--json prints the record alone: leave out --pair and --events")
     record = load_run(run)
     if picture is not None:
         from mavfi_cli.report.drawing import write_figure

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, NoReturn
 
+from mavfi_cli.core.errors import described
 from mavfi_cli.core.processes import fork, receive, send
 
 Run = Callable[[Any, float], Any]
@@ -219,7 +220,7 @@ def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:
             try:
                 output = runs[order.node](order.input, order.start_s)
             except Exception as failure:  # the node's boundary: a crash is a result
-                error = f"{type(failure).__name__}: {failure}\n{traceback.format_exc()}"
+                error = f"{described(failure)}\n{traceback.format_exc()}"
             host_s = perf_counter() - begun
             send(
                 connection,

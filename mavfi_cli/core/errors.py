@@ -17,6 +17,11 @@ class MavfiError(Exception):
     exit_code = 1
 
 
+def described(error: BaseException) -> str:
+    """Return type and message of an error. A lone surrogate, which no file can hold, is escaped."""
+    return f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
+
+
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name most similar to `name`, ignoring case and folder, or None."""
     for each in known:

@@ -77,8 +77,8 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically."""
-    write_atomically(path, lambda file: file.write(text.encode()))
+    """Write a UTF-8 text file atomically. A lone surrogate, which UTF-8 lacks, is escaped."""
+    write_atomically(path, lambda file: file.write(text.encode(errors="backslashreplace")))
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -128,16 +128,17 @@ def plain(value: Any) -> Any:
 def folder_digest(folder: Path, *, deep: bool = False) -> str:
     """Return the SHA-256 of names and contents of all Python sources in a folder.
 
-    `deep` includes its subfolders.
+    `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
     """
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py") if deep else folder.glob("*.py")):
+    found = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
+    for path in sorted(found):
         digest.update(str(path.relative_to(folder)).encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 def own_digest() -> str:
-    """Return the SHA-256 of all sources of mavfi, including the simulated vehicle."""
+    """Return the SHA-256 of all sources and settings of mavfi and of the simulated vehicle."""
     parts = [folder_digest(each, deep=True) for each in (PACKAGE, PACKAGE.parent / "sitl")]
     return hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -12,7 +12,7 @@ from functools import cache
 from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
-from mavfi_cli.core.errors import MavfiError, UnknownName
+from mavfi_cli.core.errors import MavfiError, UnknownName, described
 
 try:
     __version__ = importlib.metadata.version("mavfi")
@@ -56,8 +56,7 @@ def load_plug_in(group: str, kind: str, name: str, known: list[str]) -> Any:
             try:
                 return entry.load()
             except Exception as error:  # another package's code may raise anything
-                found = f"{type(error).__name__}: {error}"
                 raise MavfiError(
-                    f"the plug-in {name!r} ({entry.value}) does not load: {found}"
+                    f"the plug-in {name!r} ({entry.value}) does not load: {described(error)}"
                 ) from None
     raise UnknownName(kind, name, known)

@@ -34,7 +34,6 @@ from mavfi_cli.detect.preprocess import (
     PREVIOUS,
     REFERENCE,
     SPANS,
-    UNKNOWN,
     Codes,
     PreprocessParams,
     plan_deltas,
@@ -300,13 +299,6 @@ class Gate:
                 self._confirm(stage)
         if Stage.PLANNING in self.fresh:
             self._trajectory, self._index = self._judged
-
-    def forget(self, stage: Stage) -> None:
-        """Forget the last sample of a stage. The next one is accepted without judgement."""
-        first, end = SPANS[stage]
-        self._work[REFERENCE, first:end] = UNKNOWN
-        if stage is Stage.PLANNING:
-            self._trajectory, self._index = None, -1
 
     def _reject(self, stage: Stage) -> None:
         first, end = SPANS[stage]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError, ModelError
+from mavfi_cli.core.errors import ConfigError, MavfiError, ModelError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import FloatArray, StackMark
 from mavfi_cli.detect.base import detector_names, find_detector
@@ -205,7 +205,7 @@ def _row(name: str, path: Path | None) -> dict[str, Any]:
         if path is None:
             return {**row, "told": "needs no training"}
         model = Model.read(path)
-    except ModelError as error:
+    except MavfiError as error:  # of the model, or of a plug-in that does not load
         return {**row, "told": f"cannot be used: {error}"}
     row["provenance"] = {"mavfi": model.mavfi, "detector": model.detector, **model.provenance}
     row["stack"] = model.stack.name

@@ -49,7 +49,7 @@ _WHEELS = {
     "numpy": "numpy", "numba": "numba", "jsbsim": "jsbsim", "pymavlink": "pymavlink",
     "pyoctomap": "pyoctomap", "ompl": "ompl", "python-fcl": "fcl", "pyarrow": "pyarrow",
     "matplotlib": "matplotlib", "click": "click", "rich": "rich", "cattrs": "cattrs",
-    "pyserial": "serial",
+    "pyserial": "serial", "capstone": "capstone", "pyelftools": "elftools",
 }  # fmt: skip
 _LOAD_VEHICLE = """
 from sitl.vehicle.profile import load_profile

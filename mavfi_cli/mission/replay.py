@@ -67,14 +67,14 @@ def first_difference(
 
     Within a tick the columns are compared in the order of the pipeline: perception, planning,
     control, then the vehicle. The referee's truth is ignored by default. Columns in `leave_out` are
-    ignored, too.
+    ignored, too, and those that one run lacks.
 
     Raises:
         RecordError: A run has no trace.
     """
     if this.trace is None or other.trace is None:
         raise RecordError(f"{(this if this.trace is None else other).folder.path}: no trace")
-    names = this.trace.column_names
+    names = [name for name in this.trace.column_names if name in other.trace.column_names]
     columns = [name for name in BY_NAME if name in names]
     columns += [name for name in names if name not in BY_NAME and name != "stamp_s"]
     if not truth:

@@ -22,8 +22,8 @@ from mavfi_cli.autonomy import planners, warm
 from mavfi_cli.companion import protection
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
-from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError
-from mavfi_cli.core.files import file_digest, write_json, write_parquet
+from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
+from mavfi_cli.core.files import file_digest, write_json, write_parquet, write_text
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome, Reaction
@@ -227,7 +227,7 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
     except MavfiError:
         raise
     except Exception as error:  # the mission-process boundary: a crash is a result
-        flight.end(Outcome.CRASH, f"{type(error).__name__}: {error}")
+        flight.end(Outcome.CRASH, described(error))
         return traceback.format_exc()
     return None
 
@@ -300,7 +300,7 @@ def _write(
         told = [*(loss.traceback for loss in companion.executor.losses), crash]
     write_timetable(folder.kernels, timetable)
     if errors := [text for text in told if text]:
-        folder.crash.write_text("\n".join(errors))
+        write_text(folder.crash, "\n".join(errors))
     write_json(folder.result, result)
 
 

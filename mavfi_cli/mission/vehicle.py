@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError
+from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.link.codec import Signing, key_from_file
@@ -59,7 +59,7 @@ class VehicleInProcess:
             return None
         known = isinstance(error, MavfiError)
         return VehicleProcessError(
-            str(error) if known else f"the vehicle ended with {type(error).__name__}: {error}"
+            str(error) if known else f"the vehicle ended with {described(error)}"
         )
 
 

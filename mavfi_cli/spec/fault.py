@@ -58,6 +58,9 @@ class FaultConfig:
     duration_s: float | None = None  # None: until the end of the mission
     period_s: float = 1.0  # time between two strikes of an intermittent fault
 
+    def __post_init__(self) -> None:
+        _check_seed(self.seed)
+
     @property
     def attacks_detector(self) -> bool:
         """True if the injection site is the detector's memory."""
@@ -100,7 +103,7 @@ class FaultConfig:
         if self.exact_bits:
             numbers = " and ".join(map(str, self.exact_bits))
             return f"bit{'s'[len(self.exact_bits) == 1 :]} {numbers}"
-        return bits_in_words(self.bits, self.field)
+        return _bits_in_words(self.bits, self.field)
 
     def _place(self, target: str) -> str:
         where = target.partition(".")[2] if self.strikes_queue else target
@@ -180,7 +183,12 @@ class FaultConfig:
         )
 
 
-def bits_in_words(count: int, field: str) -> str:
+def _check_seed(seed: int) -> None:
+    if seed < 0:
+        raise FaultSpecError(f"the seed of a fault must be 0 or above, got {seed}")
+
+
+def _bits_in_words(count: int, field: str) -> str:
     """A number of bits of a field in words, such as "a bit", "an exponent bit", "3 bits"."""
     kind = "bit" if field == Field.ANY.value else f"{field} bit"
     if count > 1:
@@ -244,13 +252,16 @@ class InstructionConfig:
     bits: int = 1
     null: bool = False
 
+    def __post_init__(self) -> None:
+        _check_seed(self.seed)
+
     def words(self, struck: str | None = None) -> str:
         """The fault as a title says it, such as "a bit in an instruction of octomap".
 
         Args:
             struck: the node that was drawn from the target; None if none was.
         """
-        bits = "no bit" if self.null else bits_in_words(self.bits, self.field)
+        bits = "no bit" if self.null else _bits_in_words(self.bits, self.field)
         where = f" ({', '.join((*self.sites, *self.roles))})" if self.sites or self.roles else ""
         return f"{bits} in an instruction of {struck or self.target}{where}".replace("_", " ")
 

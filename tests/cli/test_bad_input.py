@@ -76,6 +76,7 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--inject", "control", "--at", "tick=15001"), "at tick=15001: 300.02 s into the flight"),
         (("--time-limit", "inf"), "--time-limit: must be within"),
         (("--seed", "-1"), "--seed: must be within 0 and 2^31 - 1, got -1"),
+        (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
         (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
         (("--start", "1,inf,2"), "--start: must be three finite numbers"),
     ],

@@ -1,5 +1,6 @@
 """Help, `show`, `world`, `doctor`."""
 
+import importlib.metadata
 import json
 import re
 import shutil
@@ -95,6 +96,19 @@ def test_show_events_and_json(command_line, troubled_flight):
     assert json.loads(out) == result
 
 
+def test_show_json_is_the_record_alone(command_line, short_flight):
+    code, out, err = command_line("show", short_flight.path, "--json", "--pair")
+    assert (code, out) == (2, "")
+    assert "leave out --pair and --events" in err
+
+
+@pytest.mark.parametrize("options", [(), ("--without-fault",)])
+def test_a_replay_waits_for_a_debugger_at_an_instruction_only(command_line, short_flight, options):
+    code, out, err = command_line("replay", short_flight.path, "--gdb", *options)
+    assert (code, out) == (2, "")
+    assert "--gdb needs an instruction-level fault" in err
+
+
 @pytest.fixture
 def copied(short_flight, tmp_path):
     folder = tmp_path / "copy"
@@ -180,6 +194,9 @@ def test_doctor(command_line):
     failed = [check for check in checks.values() if check["verdict"] == "failed"]
     assert code == (1 if failed else 0)
     assert checks["Vehicle"]["verdict"] == "ok"
+    needed = [each for each in importlib.metadata.requires("mavfi") if "extra ==" not in each]
+    for each in needed:
+        assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["found"]
     for check in checks.values():
         assert check["verdict"] == "ok" or check["remedy"]
 

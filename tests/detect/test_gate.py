@@ -180,15 +180,6 @@ def test_a_plan_of_an_unwatched_stage_or_without_a_step_is_not_looked_through():
         assert Gate(Notes(per_stage)).judge_ahead(corrupted(plan(1), 0, 0, HUGE), 0) is None
 
 
-def test_forgetting_takes_the_next_sample_unjudged():
-    gate, _, trajectory = primed()
-    gate.forget(Stage.CONTROL)
-    assert gate.judge_tick(trajectory, 0, command(vx=HUGE)) is None
-    assert gate.judge_tick(trajectory, 0, command()) is not None
-    gate.forget(Stage.PLANNING)
-    assert gate.judge_tick(corrupted(trajectory, 0, 0, HUGE), 0, command(vx=HUGE)) is None
-
-
 def test_a_nan_threshold_or_score_is_an_alarm():
     gate, detector, trajectory = primed()
     detector.threshold = float("nan")

@@ -1,9 +1,11 @@
 import json
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 import numpy as np
 import pytest
 from detect_builders import RANGES, STACK
 
+from mavfi_cli.core import installed
 from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.detect import base, model
 from mavfi_cli.detect.gaussian import GaussianDetector
@@ -167,3 +169,17 @@ def test_the_shipped_models_tell_where_they_come_from(name, stack):
     parts = [set(told["split"][part]) for part in ("train", "validation", "threshold")]
     assert sum(len(part) for part in parts) == len(set.union(*parts)) == told["flights"] >= 100
     assert told["threshold"] == detector.threshold
+
+
+def test_a_plug_in_that_does_not_load_has_a_row_of_its_own(monkeypatch):
+    gone = EntryPoint("gone", "nowhere_at_all:Gone", base.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(
+        installed, "entry_points", lambda group: EntryPoints([*entry_points(group=group), gone])
+    )
+    installed.installed.cache_clear()
+    try:
+        rows = {row["name"]: row for row in model.listing()}
+    finally:
+        installed.installed.cache_clear()
+    assert rows["gone"]["told"].startswith("cannot be used: the plug-in 'gone'")
+    assert {"gad", "aad", "range", "l2"} < set(rows)

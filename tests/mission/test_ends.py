@@ -12,6 +12,7 @@ from missions import RECORD
 
 from mavfi_cli.autonomy import collision
 from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.replay import first_difference
 from mavfi_cli.mission.vehicle import VehicleProcess
 
 MAVLOGDUMP = Path(sys.executable).parent / "mavlogdump.py"
@@ -80,7 +81,7 @@ def test_a_killed_mission_leaves_its_tlog(flying, mavfi):
     assert shown.stderr == f"error: {folder}: no result.json (cut off before its end)\n"
 
 
-def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehicle):
+def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehicle, short_flight):
     folder = fly_short(at_event("flies a plan", kill_vehicle), launch=VehicleProcess)
     run = load_run(folder.path)
     assert run.result["outcome"] == "link_lost"
@@ -89,6 +90,8 @@ def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehic
     assert run.trace.num_rows > 0
     assert "truth_x_m" not in run.trace.column_names
     assert "BAD_DATA" not in dumped(folder.tlog)
+    parting = first_difference(load_run(short_flight.path), run, truth=True)
+    assert (parting.column, parting.other) == ("outcome", "link_lost")
 
 
 def test_an_error_in_a_kernel_is_a_crash_with_its_traceback(fly_short, monkeypatch):
@@ -97,12 +100,12 @@ def test_an_error_in_a_kernel_is_a_crash_with_its_traceback(fly_short, monkeypat
     def breaks_later(*arguments):
         calls.append(1)
         if len(calls) > 5:
-            raise IndexError("no such voxel")
+            raise IndexError("no such voxel \udc80")
         return real(*arguments)
 
     monkeypatch.setattr(collision, "step", breaks_later)
     folder = fly_short()
     result = load_run(folder.path).result
     assert result["outcome"] == "crash"
-    assert result["reason"] == "IndexError: no such voxel"
-    assert "Traceback" in (folder.path / "crash.txt").read_text()
+    assert result["reason"] == r"IndexError: no such voxel \udc80"
+    assert "Traceback" in (folder.path / "crash.txt").read_text(encoding="utf-8")

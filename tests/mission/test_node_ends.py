@@ -92,7 +92,7 @@ def test_a_planner_that_dies_over_the_first_plan_is_asked_again(fly_short, at_in
 
 
 def broken():
-    raise IndexError("no such voxel")
+    raise IndexError("no such voxel \udc80")
 
 
 def test_an_error_in_an_isolated_kernel_ends_its_node_only(fly_short, at_invocation):
@@ -104,7 +104,7 @@ def test_an_error_in_an_isolated_kernel_ends_its_node_only(fly_short, at_invocat
     assert records[0] == records[1]
     result = records[0][1]
     ends = result["nodes"]["octomap"]
-    assert [crash["how"] for crash in ends["crashes"]] == ["IndexError: no such voxel"]
+    assert [crash["how"] for crash in ends["crashes"]] == [r"IndexError: no such voxel \udc80"]
     assert (ends["restarts"], result["outcome"]) == (1, "success")
     assert "Traceback" in (folder.path / "crash.txt").read_text()
 

@@ -2,6 +2,8 @@
 
 import pytest
 
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, FaultSpecError
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 
@@ -35,3 +37,11 @@ def test_a_fault_in_an_instruction_in_words():
     assert fault.words() == "2 bits in an instruction of perception (flags)"
     assert fault.words("point_cloud") == "2 bits in an instruction of point cloud (flags)"
     assert InstructionConfig(target="control", null=True).words().startswith("no bit in an")
+
+
+@pytest.mark.parametrize("kind", [FaultConfig, InstructionConfig])
+def test_a_negative_seed_is_refused(kind):
+    with pytest.raises(FaultSpecError, match="seed of a fault must be 0 or above, got -1"):
+        kind(target="planning", seed=-1)
+    with pytest.raises(ConfigError, match="seed of a fault must be"):
+        structure({"target": "planning", "seed": -1}, kind)
