@@ -64,7 +64,7 @@ def test_the_source_archive_has_the_documents(source, tmp_path):
 def test_the_page_of_the_installation_names_every_extra():
     page = (ROOT / "docs" / "how-to" / "install.md").read_text()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert [name for name in project["optional-dependencies"] if f"mavfi[{name}]" not in page] == []
+    assert [name for name in project["optional-dependencies"] if f"| `{name}` |" not in page] == []
 
 
 def test_the_citation_is_of_this_version():

@@ -228,6 +228,7 @@ def draw_histograms(
             axes.hist(values, bins=61, range=(-max(spans), max(spans)), color=PALETTE[0])
             if len(values):
                 axes.set_yscale("log")
+                axes.set_ylim(bottom=0.8)
             axes.yaxis.set_minor_formatter(NullFormatter())
     figure.supylabel("control ticks", fontsize=SMALLEST + 0.5)
     return figure

@@ -39,7 +39,7 @@ def test_a_slip_of_the_name():
 def test_it_is_refused_where_it_would_have_to_repeat():
     with pytest.raises(ConfigError, match="measured:2 needs --realtime"):
         MissionConfig(platform="measured:2")
-    with pytest.raises(ConfigError, match="without isolate"):
+    with pytest.raises(ConfigError, match="leave out isolate"):
         MissionConfig(platform="measured:2", realtime=True, isolate=("planner",))
     assert MissionConfig(platform="measured:2", realtime=True).platform == "measured:2"
 

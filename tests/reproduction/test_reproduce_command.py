@@ -4,7 +4,7 @@ import csv
 import io
 
 import pytest
-from test_flying import TASK, flown, no_vehicle, plan  # noqa: F401
+from test_reproductions import TASK, flown, no_vehicle, plan  # noqa: F401
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.run import run_campaign
