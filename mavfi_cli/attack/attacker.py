@@ -85,8 +85,9 @@ class Attacker:
         try:
             hits = sum(stage.count for stage in fault.trigger)
             wall_s = self._wall_limit_s + hits * _HIT_LIMIT_S
+            image = self.place.image(tracee)
             with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
-                reason = reach(tracee, self.place.image(tracee), fault)
+                reason = reach(tracee, image, fault)
             if alarm.fired:
                 late = f"the {self.place.kind} did not reach the instruction in time"
                 return self._result(start, None, fault, None, NOTHING, late)
