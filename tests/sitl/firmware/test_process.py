@@ -59,21 +59,18 @@ def test_a_file_that_is_no_program(tmp_path: Path) -> None:
         _open("ardupilot", program)
 
 
-def test_a_program_that_ends_is_no_firmware(tmp_path: Path) -> None:
-    program = _program(tmp_path / "arducopter", "#!/bin/sh\necho no such model\nexit 3\n")
-    firmware = _open("ardupilot", program)
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("echo no such model\nexit 3", "ended with code 3: no such model"),
+        ('echo "$@"\nexit 3', "--sysid 7 "),
+    ],
+    ids=["its words are told", "ardupilot gets its system id"],
+)
+def test_a_program_that_ends_is_no_firmware(tmp_path: Path, script: str, told: str) -> None:
+    firmware = _open("ardupilot", _program(tmp_path / "arducopter", f"#!/bin/sh\n{script}\n"))
     try:
-        with pytest.raises(VehicleProcessError, match="ended with code 3: no such model"):
-            firmware.begin()
-    finally:
-        firmware.close()
-
-
-def test_ardupilot_is_told_its_system_id(tmp_path: Path) -> None:
-    program = _program(tmp_path / "arducopter", '#!/bin/sh\necho "$@"\nexit 3\n')
-    firmware = _open("ardupilot", program)
-    try:
-        with pytest.raises(VehicleProcessError, match="--sysid 7 "):
+        with pytest.raises(VehicleProcessError, match=told):
             firmware.begin()
     finally:
         firmware.close()
