@@ -17,8 +17,8 @@ from pathlib import Path
 
 from exported import arguments
 
-from mavfi_cli.claims.beyond import PLAIN, Arm, arms
-from mavfi_cli.claims.sources import gather
+from mavfi_cli.paper.beyond import PLAIN, Arm, arms
+from mavfi_cli.paper.sources import gather
 from mavfi_cli.stats.shares import Share
 
 

@@ -19,7 +19,7 @@ from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.fi.tracer.fault import FaultModel
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
-from mavfi_cli.report.tables.attacks import summarise
+from mavfi_cli.report.attacks import summarise
 from mavfi_cli.spec.mission import MissionConfig
 
 KERNEL = """

@@ -11,18 +11,19 @@ import click
 
 from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 
-# name -> (module, what it does); the help page must not import the modules
+# name -> (module, what it does); the help page must not import the modules. One of the vehicle's
+# side takes the place of this process.
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
-    "sitl": ("mavfi_cli.cli.delegate", "Run the simulated vehicle alone, for any MAVLink client."),
-    "world": ("mavfi_cli.cli.delegate", "List, make, check and draw worlds."),
+    "sitl": ("sitl", "Run the simulated vehicle alone, for any MAVLink client."),
+    "world": ("sitl.world", "List, make, check and draw worlds."),
     "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
     "kernels": ("mavfi_cli.cli.kernels", "Flip bits in isolated kernels, one fault per run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
     "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan, run and summarise thousands of missions."),
-    "reproduce": ("mavfi_cli.cli.reproduce", "Fly every experiment of the paper."),
-    "report": ("mavfi_cli.cli.report", "Write one page: the paper's claims beside flown missions."),
+    "reproduce": ("mavfi_cli.cli.paper", "Fly every experiment of the paper."),
+    "report": ("mavfi_cli.cli.paper", "Write one page: the paper's claims beside flown missions."),
     "compare": ("mavfi_cli.cli.compare", "Fly the same missions on several platforms."),
     "vpm": ("mavfi_cli.cli.vpm", "Model the cost of DMR and TMR in speed, time and energy."),
     "platforms": ("mavfi_cli.cli.platforms", "List the compute platforms and their latencies."),
@@ -45,8 +46,10 @@ class _LazyGroup(click.Group):
         """Import the command's module; None if there is no such command."""
         if cmd_name not in _COMMANDS:
             return None
-        module = importlib.import_module(_COMMANDS[cmd_name][0])
-        command: click.Command = getattr(module, cmd_name)
+        module = _COMMANDS[cmd_name][0]
+        if module.startswith("sitl"):
+            return _vehicle_side(cmd_name, module)
+        command: click.Command = getattr(importlib.import_module(module), cmd_name)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -61,6 +64,21 @@ class _LazyGroup(click.Group):
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
             ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
+
+
+def _vehicle_side(name: str, module: str) -> click.Command:
+    """A command that becomes `python -m module`, with its streams, signals and exit code."""
+
+    def become(arguments: tuple[str, ...]) -> None:
+        from mavfi_cli.core.processes import PYTHON
+
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.execv(sys.executable, [*PYTHON, "-m", module, *arguments])
+
+    arguments = click.Argument(["arguments"], nargs=-1, type=click.UNPROCESSED)
+    settings = {"ignore_unknown_options": True, "help_option_names": []}
+    return click.Command(name, settings, become, [arguments], add_help_option=False)
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

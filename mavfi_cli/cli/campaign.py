@@ -157,10 +157,10 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     from mavfi_cli.campaigns.begin import folder_of
     from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import require_output
+    from mavfi_cli.paper.figures import draw
+    from mavfi_cli.paper.status import shown
     from mavfi_cli.report.drawing import PICTURES, write_figure
-    from mavfi_cli.report.tables.paper_table import FORMATS
-    from mavfi_cli.reproduction.figures import draw
-    from mavfi_cli.reproduction.status import shown
+    from mavfi_cli.report.paper import FORMATS
 
     if output is not None:
         require_output(output, PICTURES)
@@ -178,7 +178,7 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 def export(what: str, path: Path) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
-    from mavfi_cli.report.tables.campaign import flights_csv, write_flights
+    from mavfi_cli.report.campaign import flights_csv, write_flights
 
     table = library.campaign(what).table
     if path == Path("-"):
@@ -323,9 +323,9 @@ def _show(
 ) -> None:
     from mavfi_cli.campaigns.begin import stopped, stored_spec
     from mavfi_cli.core.files import plain
-    from mavfi_cli.report.tables.campaign import campaign_lines
-    from mavfi_cli.report.tables.paper_table import as_text
-    from mavfi_cli.reproduction.status import progress_lines, short, shown
+    from mavfi_cli.paper.status import progress_lines, short, shown
+    from mavfi_cli.report.campaign import campaign_lines
+    from mavfi_cli.report.paper import as_text
 
     if as_json:
         told = _summary(ledger, by, confidence, more or {})

@@ -54,10 +54,9 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
-    from mavfi_cli.report.compare_plot import draw_compare_plot
+    from mavfi_cli.report.compare_plot import draw_compare_plot, draw_timeline
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.tables.platforms import platform_csv, platform_lines
-    from mavfi_cli.report.timeline import draw_timeline
+    from mavfi_cli.report.platforms import platform_csv, platform_lines
     from mavfi_cli.studies.compare import compare as run
 
     if as_json and as_csv:

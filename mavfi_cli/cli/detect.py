@@ -90,9 +90,13 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
-    from mavfi_cli.report.detector_plots import draw_recovery_plot, draw_roc_plot
+    from mavfi_cli.report.detectors import (
+        detector_csv,
+        detector_lines,
+        draw_recovery_plot,
+        draw_roc_plot,
+    )
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
     from mavfi_cli.studies.evaluate import evaluate as run
 
     if as_json and as_csv:

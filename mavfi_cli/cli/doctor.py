@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import click
 
-from mavfi_cli.report.tables.columns import WIDTH
+from mavfi_cli.report.columns import WIDTH
 
 _INDENT = 29  # column of a check's finding
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}

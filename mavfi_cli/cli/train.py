@@ -68,7 +68,7 @@ def train(
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.detect.fit import KINDS
-    from mavfi_cli.report.detector_plots import draw_loss_curve
+    from mavfi_cli.report.detectors import draw_loss_curve
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
     from mavfi_cli.studies.train import train as run

@@ -25,7 +25,7 @@ def view(run: Path, save: Path | None) -> None:
     """
     from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.report import view as viewers
-    from mavfi_cli.report.view.entries import ViewedFlight
+    from mavfi_cli.report.view import ViewedFlight
 
     viewers.require_viewer(save)
     recorded = load_run(run)

@@ -96,7 +96,7 @@ def vpm(
     """
     from mavfi_cli.core.config import require_distinct
     from mavfi_cli.core.files import plain
-    from mavfi_cli.report.tables.model import model_csv, model_lines, redundancy_csv
+    from mavfi_cli.report.model import model_csv, model_lines, redundancy_csv
     from mavfi_cli.vpm.model import schemes_with
     from mavfi_cli.vpm.report import report
     from mavfi_cli.vpm.vehicle import ModelVehicle
@@ -211,12 +211,13 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
     """Write all files; return their names."""
     from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.model_plots import (
+    from mavfi_cli.report.model import (
         draw_flight_plot,
         draw_redundancy_plot,
         draw_roofline_plot,
+        model_csv,
+        redundancy_csv,
     )
-    from mavfi_cli.report.tables.model import model_csv, redundancy_csv
 
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)

@@ -1,1 +1,1 @@
-"""Summaries and pictures of runs."""
+"""Summaries, tables, CSV and pictures."""

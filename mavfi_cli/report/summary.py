@@ -13,7 +13,7 @@ from mavfi_cli.mission.record.detection_cost import DetectionCost, detection_cos
 from mavfi_cli.mission.record.measures import FlightRecord, record_of
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.mission.replay import first_difference, largest_deviation_m
-from mavfi_cli.report.tables.columns import WIDTH
+from mavfi_cli.report.columns import WIDTH
 
 Section = Mapping[str, Any]
 _INDENT = 12 * " "

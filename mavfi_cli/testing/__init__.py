@@ -8,11 +8,14 @@ class TestMine(PlannerContract):
 
 import pytest
 
-for _suite in ("detectors", "planners", "transports"):  # before the imports: else no explanations
-    pytest.register_assert_rewrite(f"mavfi_cli.testing.{_suite}")
+# Before the import: else a failed assertion is not explained.
+pytest.register_assert_rewrite("mavfi_cli.testing.suites")
 
-from mavfi_cli.testing.detectors import DetectorContract  # noqa: E402
-from mavfi_cli.testing.planners import PlannerContract  # noqa: E402
-from mavfi_cli.testing.transports import StreamTransportContract, TransportContract  # noqa: E402
+from mavfi_cli.testing.suites import (  # noqa: E402
+    DetectorContract,
+    PlannerContract,
+    StreamTransportContract,
+    TransportContract,
+)
 
 __all__ = ["DetectorContract", "PlannerContract", "StreamTransportContract", "TransportContract"]

@@ -12,8 +12,7 @@ from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.record.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.model_plots import draw_flight_plot
-from mavfi_cli.report.tables.model import model_lines, redundancy_csv
+from mavfi_cli.report.model import draw_flight_plot, model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.flight_plan import flight_plan
 from mavfi_cli.vpm.model import SCHEMES

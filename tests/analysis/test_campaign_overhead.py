@@ -12,7 +12,7 @@ from mavfi_cli.analysis.groups import groups
 from mavfi_cli.analysis.overhead import flight_overheads
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
-from mavfi_cli.report.tables.campaign import campaign_lines
+from mavfi_cli.report.campaign import campaign_lines
 
 KERNELS = {
     "point_cloud": {"invocations": 10, "busy_s": 0.1},

@@ -15,7 +15,7 @@ from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
-from mavfi_cli.report.tables.campaign import campaign_lines
+from mavfi_cli.report.campaign import campaign_lines
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -10,7 +10,7 @@ import pytest
 from flown_twice import PLAN, SEEDS, figures_of, flight
 
 from mavfi_cli.analysis.platforms import QUANTITIES
-from mavfi_cli.report.tables.platforms import platform_csv, platform_lines
+from mavfi_cli.report.platforms import platform_csv, platform_lines
 from mavfi_cli.stats.shares import rate
 from mavfi_cli.studies.compare import ComparePlan
 

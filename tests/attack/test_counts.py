@@ -16,7 +16,7 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import counted as counting
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program
-from mavfi_cli.report.tables.attacks import program_table, summarise_program
+from mavfi_cli.report.attacks import program_table, summarise_program
 
 pytestmark = pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is missing")
 

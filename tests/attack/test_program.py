@@ -35,7 +35,7 @@ from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
-from mavfi_cli.report.tables.attacks import PROGRAM_COLUMNS, summarise_program
+from mavfi_cli.report.attacks import PROGRAM_COLUMNS, summarise_program
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 

@@ -10,7 +10,9 @@ from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core import installed
 from mavfi_cli.core.errors import MavfiError, UnknownName
 from mavfi_cli.testing import PlannerContract
-from mavfi_cli.testing.planners import PARAMS, posed, wall_with_gap
+from mavfi_cli.testing.suites import PARAMS
+
+posed, wall_with_gap = PlannerContract.posed, PlannerContract.wall_with_gap
 
 
 class TestPlanners(PlannerContract):

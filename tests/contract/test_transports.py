@@ -17,7 +17,10 @@ from mavfi_cli.core.errors import EndpointError, LinkLost
 from mavfi_cli.link.codec import Codec, Signing, begins_with_frame, dialect, key_from_passphrase
 from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
 from mavfi_cli.testing import StreamTransportContract, TransportContract
-from mavfi_cli.testing.transports import WAIT_S, Pair, introduce, message, receive, send
+from mavfi_cli.testing.suites import WAIT_S, Pair
+
+introduce, message = TransportContract.introduce, TransportContract.message
+receive, send = TransportContract.receive, TransportContract.send
 
 HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3)
 

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from mavfi_cli.attack.campaign import Plan
-from mavfi_cli.report.tables.attacks import summarise_program
+from mavfi_cli.report.attacks import summarise_program
 
 
 def outcomes(told, *, windows=None):

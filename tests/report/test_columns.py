@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.report.tables.columns import blocks, columns, wrapped
+from mavfi_cli.report.columns import blocks, columns, wrapped
 
 ROWS = [["name", "count", "share"], ["a", "1", "0.5 %"], ["long name", "100"]]
 

@@ -8,9 +8,8 @@ import pytest
 from flown_twice import PLAN, figures_of
 from matplotlib.patches import Rectangle
 
-from mavfi_cli.report.compare_plot import draw_compare_plot
+from mavfi_cli.report.compare_plot import draw_compare_plot, draw_timeline
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.timeline import draw_timeline
 from mavfi_cli.studies.compare import ComparePlan
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -8,7 +8,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.report.detector_plots import draw_recovery_plot
+from mavfi_cli.report.detectors import draw_recovery_plot
 from mavfi_cli.report.drawing import (
     DETECTORS,
     NONE,
@@ -17,7 +17,7 @@ from mavfi_cli.report.drawing import (
     detector_colours,
     write_figure,
 )
-from mavfi_cli.report.model_plots import draw_redundancy_plot
+from mavfi_cli.report.model import draw_redundancy_plot
 from mavfi_cli.vpm.model import SCHEMES
 from mavfi_cli.vpm.report import Choices, report
 from mavfi_cli.vpm.vehicle import ModelVehicle

@@ -1,6 +1,6 @@
 """The picture of the autoencoder's training."""
 
-from mavfi_cli.report.detector_plots import draw_loss_curve
+from mavfi_cli.report.detectors import draw_loss_curve
 from mavfi_cli.report.drawing import write_figure
 
 CURVE = [[0, 0.2, 0.4], [20, 0.1, 0.3], [40, 0.05, 0.25]]

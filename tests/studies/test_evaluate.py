@@ -9,9 +9,13 @@ from evaluation_flights import error_free, flown, pair, struck, table
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.files import write_json
-from mavfi_cli.report.detector_plots import draw_recovery_plot, draw_roc_plot
+from mavfi_cli.report.detectors import (
+    detector_csv,
+    detector_lines,
+    draw_recovery_plot,
+    draw_roc_plot,
+)
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.tables.detectors import detector_csv, detector_lines
 from mavfi_cli.studies.evaluate import told
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan
 

@@ -1,19 +1,311 @@
-"""Looking at flights: one stream of entries, and the formats of two viewers that show it."""
+"""A flight as a stream of typed, timed entries. Two formats of viewers show them.
+
+Lengths are in m and angles in rad; positions are in the world frame (ENU). The path of an entry is
+the place of a thing in the tree that the viewers show, such as `faulty/map`. A newer entry replaces
+an older one with the same path.
+"""
 
 from __future__ import annotations
 
+import heapq
+import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
+from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from mavfi_cli.autonomy.occupancy import MapSnapshot
+from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.core.files import require_output
+from mavfi_cli.core.types import DepthFrame, FloatArray
+from mavfi_cli.mission.progress import Recorder
+from mavfi_cli.mission.record.measures import FlightRecord
+from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.report.drawing import ALARM, FAULT, FLIGHTS, GOAL, OBSTACLE, PLAN
 
 if TYPE_CHECKING:
-    from mavfi_cli.report.view.entries import ViewedFlight
+    import pyarrow as pa
+
+
+Orders = Mapping[str, Sequence[tuple[Any, float]]]  # input and start stamp of each invocation
+
+MARKED = {"fault": FAULT, "alarm": ALARM}  # events with a mark at their position
+_MAP = "#8b93a1"
+_FARTHEST_M = 1e5  # a corrupted position can be anywhere; viewers compute in single precision
+_MAP_EVERY_S = 1.0
+_PATH_EVERY_TICKS, _PATH_STEP_TICKS = 50, 10  # a path every second, with a point every 0.2 s
+_SETPOINT_S = 1.0  # a setpoint is drawn as the way that it commands in this time
+_MARK_M = 0.35
+_TALLEST_M = 15.0  # towers of generated worlds are 1000 m high, flights at most 10 m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """The state of one thing from a moment on."""
+
+    path: str
+    stamp_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Boxes(Entry):
+    """Solid boxes along the axes: obstacles, or the occupied voxels of a map."""
+
+    centres_enu_m: FloatArray  # (n, 3)
+    sizes_m: FloatArray  # (n, 3)
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Marks(Entry):
+    """Spheres: the goal, or where something happened."""
+
+    centres_enu_m: FloatArray  # (n, 3)
+    radius_m: float
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Points(Entry):
+    """A point cloud."""
+
+    points_enu_m: FloatArray  # (n, 3)
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line(Entry):
+    """A line through points: a path, a plan or a setpoint."""
+
+    points_enu_m: FloatArray  # (n, 3)
+    colour: str
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Depth(Entry):
+    """A depth frame with the pose of its camera."""
+
+    frame: DepthFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pose(Entry):
+    """The vehicle, level."""
+
+    position_enu_m: FloatArray  # (3,)
+    yaw_rad: float
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Note(Entry):
+    """One event of the flight in words."""
+
+    kind: str
+    text: str
+
+    @property
+    def urgent(self) -> bool:
+        """True for faults, alarms and the deaths of nodes."""
+        return self.kind in ("fault", "alarm", "node")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Values(Entry):
+    """All numbers of one control tick by the trace's column names; None where there is none yet."""
+
+    values: Mapping[str, float | int | bool | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewedFlight:
+    """A flight to look at.
+
+    Attributes:
+        name: First part of its paths, such as "golden".
+        recorder: What its nodes received; None leaves out depth frames, clouds and maps.
+    """
+
+    name: str
+    run: Run
+    recorder: Recorder | None
+
+    @property
+    def colour(self) -> str:
+        """Colour of vehicle, path and setpoints, as in all pictures."""
+        return FLIGHTS[1 if self.run.record.fault else 0]
+
+
+def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
+    """Yield the world and the entries of at least one flight in the order of their stamps."""
+    streams: list[Iterable[Entry]] = [_world(flights[0].run.record)]
+    for flight in flights:
+        streams += [_plans(flight), _notes(flight), *(_marks(flight, kind) for kind in MARKED)]
+        if flight.run.trace is not None:
+            streams += [_ticks(flight, flight.run.trace), _path(flight, flight.run.trace)]
+        if flight.recorder is not None:
+            orders = flight.recorder.orders
+            streams += [_frames(flight, orders), _clouds(flight, orders), _maps(flight, orders)]
+    return heapq.merge(*streams, key=attrgetter("stamp_s"))
+
+
+def _world(record: FlightRecord) -> Iterator[Entry]:
+    stamp_s = record.events[0]["stamp_s"] if record.events else 0.0
+    boxes = np.array(record.world.get("boxes", ()), dtype=np.float64).reshape(-1, 6)
+    boxes = boxes.clip(max=[math.inf] * 5 + [_TALLEST_M])
+    yield Boxes(
+        path="world/obstacles",
+        stamp_s=stamp_s,
+        centres_enu_m=(boxes[:, :3] + boxes[:, 3:]) / 2.0,
+        sizes_m=boxes[:, 3:] - boxes[:, :3],
+        colour=OBSTACLE,
+    )
+    if record.goal_enu_m is not None:
+        yield Marks(
+            path="world/goal",
+            stamp_s=stamp_s,
+            centres_enu_m=np.array([record.goal_enu_m]),
+            radius_m=_MARK_M,
+            colour=GOAL,
+        )
+
+
+# From the record -------------------------------------------------------------------------------
+
+
+def _plans(flight: ViewedFlight) -> Iterator[Entry]:
+    for plan in flight.run.record.plans:
+        yield _line(flight, "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), PLAN, 0.08)
+
+
+def _notes(flight: ViewedFlight) -> Iterator[Entry]:
+    for event in flight.run.record.events:
+        yield Note(
+            path=f"{flight.name}/events",
+            stamp_s=event["stamp_s"],
+            kind=event["kind"],
+            text=event["text"],
+        )
+
+
+def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
+    """Yield the positions of all events of a kind so far, at each of them."""
+    places: list[Sequence[float]] = []
+    for event in flight.run.record.events:
+        if event["kind"] == kind and event["position_enu_m"]:
+            places.append(event["position_enu_m"])
+            yield Marks(
+                path=f"{flight.name}/{kind}s",
+                stamp_s=event["stamp_s"],
+                centres_enu_m=np.array(places),
+                radius_m=_MARK_M,
+                colour=MARKED[kind],
+            )
+
+
+def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
+    """Yield pose, setpoint and all states of each control tick."""
+    for row in trace.drop_columns(["phase"]).to_pylist():
+        stamp_s = row.pop("stamp_s")
+        position = np.array([row["x_m"], row["y_m"], row["z_m"]])
+        yield Pose(
+            path=f"{flight.name}/vehicle",
+            stamp_s=stamp_s,
+            position_enu_m=position,
+            yaw_rad=row["yaw_rad"],
+            colour=flight.colour,
+        )
+        if row["command_vx"] is not None:
+            velocity = np.array([row[f"command_v{axis}"] for axis in "xyz"])
+            way = np.stack([position, position + _SETPOINT_S * velocity])
+            yield _line(flight, "setpoint", stamp_s, way, flight.colour, 0.1)
+        yield Values(path=f"{flight.name}/states", stamp_s=stamp_s, values=row)
+
+
+def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
+    """Yield the path flown so far, again and again."""
+    stamps = trace["stamp_s"].to_numpy()
+    places = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
+    last = len(stamps) - 1
+    for row in sorted({*range(0, last, _PATH_EVERY_TICKS), last} - {-1}):
+        points = np.concatenate([places[:row:_PATH_STEP_TICKS], places[row : row + 1]])
+        yield _line(flight, "path", float(stamps[row]), points, flight.colour, 0.15)
+
+
+def _line(
+    flight: ViewedFlight,
+    name: str,
+    stamp_s: float,
+    points_enu_m: FloatArray,
+    colour: str,
+    width_m: float,
+) -> Line:
+    """Return a line through those points (n, 3) that are numbers."""
+    return Line(
+        path=f"{flight.name}/{name}",
+        stamp_s=stamp_s,
+        points_enu_m=_drawable(points_enu_m),
+        colour=colour,
+        width_m=width_m,
+    )
+
+
+def _drawable(points: FloatArray) -> FloatArray:
+    """Leave out the points (n, 3) that are not finite, and bring very far ones nearer."""
+    points = points.reshape(-1, 3)
+    return points[np.isfinite(points).all(axis=1)].clip(-_FARTHEST_M, _FARTHEST_M)
+
+
+# From what the nodes received --------------------------------------------------------------------
+
+
+def _frames(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
+    for frame, start_s in orders.get("point_cloud", ()):
+        yield Depth(path=f"{flight.name}/camera", stamp_s=start_s, frame=frame)
+
+
+def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
+    for cloud, start_s in orders.get("octomap", ()):
+        points = _drawable(cloud.points_enu_m)
+        yield Points(
+            path=f"{flight.name}/cloud", stamp_s=start_s, points_enu_m=points, colour=flight.colour
+        )
+
+
+def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
+    """Yield every map that a plan was made on, and in between one a second of those checked."""
+    planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
+    checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
+    told_s = -math.inf
+    for start_s, snapshot, wanted in sorted(planned + checked, key=itemgetter(0)):
+        if wanted or start_s >= told_s + _MAP_EVERY_S:
+            told_s = start_s
+            centres, sizes = _voxels(snapshot)
+            yield Boxes(
+                path=f"{flight.name}/map",
+                stamp_s=start_s,
+                centres_enu_m=centres,
+                sizes_m=sizes,
+                colour=_MAP,
+            )
+
+
+def _voxels(snapshot: MapSnapshot) -> tuple[FloatArray, FloatArray]:
+    """Return centres and sizes (n, 3) of the occupied cubes of a map."""
+    leaves = occupied_leaves(snapshot.payload) * snapshot.resolution_m
+    sizes = np.repeat(leaves[:, 3:], 3, axis=1)
+    return leaves[:, :3] + sizes / 2.0, sizes
+
+
+# Writing ------------------------------------------------------------------------------------------
 
 # Suffix of a file, or None for rerun's window -> what it needs, and the extra that installs it.
 _NEEDED = {

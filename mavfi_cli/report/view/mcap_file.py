@@ -39,7 +39,7 @@ from mavfi_cli.core.files import plain, write_atomically
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
 from mavfi_cli.report.drawing import rgb
-from mavfi_cli.report.view.entries import (
+from mavfi_cli.report.view import (
     Boxes,
     Depth,
     Entry,

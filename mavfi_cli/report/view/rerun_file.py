@@ -13,7 +13,7 @@ from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.states import of_stage
 from mavfi_cli.core.types import Stage
 from mavfi_cli.report.drawing import rgb
-from mavfi_cli.report.view.entries import (
+from mavfi_cli.report.view import (
     Boxes,
     Depth,
     Entry,

@@ -15,9 +15,9 @@ from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
+from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
-from mavfi_cli.report.tables.attacks import KERNEL_COLUMNS, save_runs, summarise, table
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 

@@ -10,7 +10,7 @@ from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.repetition import watch_again
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.report.view.entries import (
+from mavfi_cli.report.view import (
     Boxes,
     Depth,
     Line,

@@ -1,0 +1,415 @@
+"""Every claim of the paper: its words, the number that decides it, and what the paper's n can tell.
+
+claims.toml has the claims. A claim is decided by one number, its effect, and by the range that the
+claim gives for it; `stats.effects.judge` does the rest. A measure finds the effect: it takes a
+stack's flights, as `paper.flights.pooled`, and the values of columns that choose some of
+them. Of faults without a detector it counts those that flipped a bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import COSTS, chosen, flags, numbers
+from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.analysis.kernel_runs import outcome_share
+from mavfi_cli.core.config import read_toml
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.paper.flights import (
+    EVERY_STAGE,
+    STAGES,
+    by_value,
+    faults_of,
+    golden,
+    ratios,
+    share,
+    struck,
+)
+from mavfi_cli.report.paper import count_of
+from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.effects import (
+    Count,
+    as_interval,
+    correlation,
+    effect_difference,
+    fisher,
+    longest_reaches,
+    paired_difference,
+    rate_difference,
+    recovered_share,
+)
+from mavfi_cli.stats.paired import mcnemar
+from mavfi_cli.stats.shares import Share, wilson
+
+Where = Mapping[str, Any]  # values of columns; a tuple allows several
+Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
+_FEWEST = 4  # flights for a correlation with an interval
+_FILE = Path(__file__).parent / "claims.toml"
+_AS_PRINTED = "paper"  # an end of the range that the paper's own interval has
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What our missions say about a claim.
+
+    Attributes:
+        effect: None if no mission tells.
+        told: the counts behind it.
+    """
+
+    effect: Interval | None = None
+    told: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claim:
+    """A claim of the paper.
+
+    Attributes:
+        name: unique, such as `table4-dense`.
+        item: table or figure, by its name in `mavfi reproduce`.
+        words: the claim as a sentence.
+        paper: its numbers; empty if the paper prints none.
+        effect: the number that decides, in words.
+        find: the effect of a stack's flights, or of the isolated kernels.
+        low, high: the claimed range of the effect.
+        unit: `points` of a rate, `percent` of a whole, or `number`.
+        paper_tells: what the paper's own number of missions can tell.
+        isolated: whether it is about isolated kernels.
+    """
+
+    name: str
+    item: str
+    words: str
+    effect: str
+    find: Callable[[Any], Finding]
+    paper: str = "no number printed"
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = "points"
+    paper_tells: str = "drawn only, without counts"
+    isolated: bool = False
+
+
+def _of_share(found: Share, what: str) -> Finding:
+    if not found.total:
+        return Finding()
+    return Finding(effect=as_interval(found), told=f"{count_of(found)} {what}")
+
+
+def _difference(shares: Sequence[Share], told: str) -> Finding:
+    """The first minus the second of two shares; nothing unless both have flights."""
+    first, second = shares
+    if not (first.total and second.total):
+        return Finding()
+    return Finding(effect=rate_difference(first, second), told=told)
+
+
+# Faults without a detector ------------------------------------------------------------------------
+
+
+def _success_lost(flights: pa.Table, **where: Any) -> Finding:
+    """Success of the golden flights minus that of the same missions with a fault."""
+    hit = struck(flights, **where)
+    both = hit.filter(pc.is_valid(hit["own_lost"]))
+    if not both.num_rows:
+        return Finding()
+    found = paired_difference(mcnemar(~flags(both, "lost"), ~flags(both, "own_lost")))
+    told = f"{count_of(share(both))} lost; golden {count_of(share(both, 'own_lost'))}"
+    return Finding(effect=found, told=told)
+
+
+def _most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
+    """Success lost by faults in the kernel that loses most."""
+    hit = by_value(struck(flights, **where), "struck_kernel")
+    kernels = {name: share(those).share for (name,), those in hit.items() if name}
+    if not kernels:
+        return Finding()
+    most = max(kernels, key=lambda name: kernels[name])
+    found = _success_lost(flights, **where, struck_kernel=most)
+    return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
+
+
+def _harm_difference(flights: pa.Table, groups: Mapping[str, Where]) -> Finding:
+    """Share of harmful faults in the first of two groups minus that in the second."""
+    shares = [share(struck(flights, **where), "harmed") for where in groups.values()]
+    told = (f"{name} {count_of(each)}" for name, each in zip(groups, shares, strict=True))
+    return _difference(shares, f"harmful: {'; '.join(told)}")
+
+
+def _harmful(flights: pa.Table, **where: Any) -> Finding:
+    """The share of harmful faults."""
+    return _of_share(share(struck(flights, **where), "harmed"), "harmful")
+
+
+def _loss_difference(
+    flights: pa.Table, first: Where, second: Where, told: str, **where: Any
+) -> Finding:
+    """Share of lost missions in one group of faults minus that in another.
+
+    Args:
+        told: the counts, as a format of two texts.
+    """
+    shares = [share(struck(flights, **where, **each)) for each in (first, second)]
+    return _difference(shares, f"lost: {told.format(*map(count_of, shares))}")
+
+
+def _as_long(flights: pa.Table, ratio: float, **where: Any) -> Finding:
+    """The share of flights that take at least so many times as long as their golden flights."""
+    return _of_share(_at_least(ratio, ratios(struck(flights, **where))), "as long")
+
+
+def _at_least(ratio: float, found: FloatArray) -> Share:
+    return wilson(int((found >= ratio).sum()), len(found))
+
+
+def _worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) -> Finding:
+    """The probability that the longest of so many flights reaches a ratio to its golden flight."""
+    found = ratios(struck(flights, **where))
+    if not len(found):
+        return Finding()
+    beyond = _at_least(ratio, found)
+    longest = 100.0 * (found.max() - 1.0)
+    return Finding(
+        effect=longest_reaches(beyond, missions),
+        told=f"{count_of(beyond)} as long; longest {longest:+.1f} %",
+    )
+
+
+def _energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
+    """Correlation of energy with flight time over successful golden flights."""
+    won = chosen(golden(flights), lost=False, **where)
+    pairs = np.stack([numbers(won, name) for name in ("flight_time_s", "energy_regression_j")], 1)
+    pairs = pairs[(pairs > 0.0).all(axis=1)]
+    if len(pairs) < _FEWEST:
+        return Finding()
+    return Finding(effect=correlation(pairs.tolist()), told=f"{len(pairs):,} golden flights")
+
+
+# The same faults without and with a detector ------------------------------------------------------
+
+
+def protected(
+    flights: pa.Table, detector: str, protect: str = EVERY_STAGE, **where: Any
+) -> pa.Table:
+    """The flights with a detector of these stages, whose fault struck without it as well."""
+    seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
+    return chosen(flights, **seen, **where)
+
+
+def _recovered(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The share of lost missions that a detector saves."""
+    seen = protected(flights, detector, **where)
+    lost = chosen(seen, bare_lost=True)
+    return _of_some(lost, "lost", "lost missions saved") or _none_of(seen, "lost")
+
+
+def _shortened(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The share of longer flights that a detector brings back within 5 %."""
+    seen = protected(flights, detector, **where)
+    longer = chosen(seen, bare_lost=False, bare_harmed=True)
+    told = "longer flights brought back"
+    return _of_some(longer, "harmed", told) or _none_of(seen, "over 5 % longer")
+
+
+def _of_some(flights: pa.Table, column: str, told: str) -> Finding | None:
+    return _of_share(share(flights, column, value=False), told) if flights.num_rows else None
+
+
+def _none_of(seen: pa.Table, what: str) -> Finding:
+    """What is told if none of the faults, flown without the detector, had an effect."""
+    return Finding(told=f"without it 0 of {seen.num_rows:,} {what}") if seen.num_rows else Finding()
+
+
+def _undone(flights: pa.Table, detector: str, protect: str, where: Where) -> Share:
+    """The share of harmful faults that do no harm with a detector of these stages."""
+    seen = protected(flights, detector, protect, **where)
+    return share(chosen(seen, bare_harmed=True), "harmed", value=False)
+
+
+def _control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """Harm undone by watching control minus that by the better single other stage."""
+    shares = {stage: _undone(flights, detector, stage, where) for stage in STAGES}
+    if not all(each.total for each in shares.values()):
+        return Finding()
+    *others, control = shares.values()
+    told = ", ".join(f"{name} {count_of(each)}" for name, each in shares.items())
+    best = max(others, key=lambda each: each.share)
+    return _difference((control, best), f"harm undone: {told}")
+
+
+def _all_stages_best(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """Harm undone by watching all stages minus that by watching control."""
+    shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
+    told = "harm undone: all stages {}, control {}".format(*map(count_of, shares))
+    return _difference(shares, told)
+
+
+def _autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
+    """Success with the autoencoder minus success with the Gaussian detector."""
+    seen = [protected(flights, name, **where) for name in ("gad", "aad")]
+    gad, aad = (dict(zip(faults_of(x), ~flags(x, "lost"), strict=True)) for x in seen)
+    both = sorted(gad.keys() & aad.keys())
+    if not both:
+        return Finding()
+    test = mcnemar([gad[key] for key in both], [aad[key] for key in both])
+    told = f"{test.only_second} missions by AAD only, {test.only_first} by GAD only"
+    return Finding(effect=paired_difference(test), told=f"{told}, of {test.pairs:,}")
+
+
+# Costs of detectors -------------------------------------------------------------------------------
+
+_NO_COSTS = Finding(told="flown, but this export does not hold these times; a new one does")
+
+
+def _overhead_of(flights: pa.Table, detector: str, **where: Any) -> Finding:
+    """The mean share of the flight time that detection and recovery take."""
+    seen, shares = _overheads(flights, detector, where)
+    told = "time of the computer that flew, and simulated recovery"
+    return _mean_cost(seen, shares, told)
+
+
+def _gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
+    """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
+    gad, aad = (
+        dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
+    )
+    both = sorted(gad.keys() & aad.keys())
+    more = [gad[key] - aad[key] for key in both]
+    return _mean_cost(both, more, "the same faults with either detector")
+
+
+def _overheads(
+    flights: pa.Table, detector: str, where: Where
+) -> tuple[list[tuple[str, str]], list[float]]:
+    """The faults with a detector, and its share of each flight time; NaN if unknown."""
+    seen = struck(flights, detector=detector, protect=EVERY_STAGE, **where)
+    return faults_of(seen), np.sum([numbers(seen, name) for name in COSTS], axis=0).tolist()
+
+
+def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Finding:
+    known = [each for each in costs if not math.isnan(each)]
+    if not known:
+        return _NO_COSTS if seen else Finding()
+    return Finding(effect=interval(known, resamples=RESAMPLES), told=told)
+
+
+def _calibrated(_: pa.Table) -> Finding:
+    """No finding: the model takes this number from the paper."""
+    return Finding(told="our model is calibrated with this number, so it tells nothing")
+
+
+# Isolated kernels ---------------------------------------------------------------------------------
+
+
+def _outcome_beside(
+    kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
+) -> Finding:
+    """The share of an outcome in one kernel minus that in the most extreme of others.
+
+    Args:
+        extreme: `most` or `least`.
+        others: none mean all.
+    """
+    there = [each for each in others or kernels if each in kernels and each != kernel]
+    if kernel not in kernels or not there:
+        return Finding()
+    choose = max if extreme == "most" else min
+    other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
+    shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
+    told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
+    return Finding(effect=rate_difference(*shares.values()), told=", ".join(told))
+
+
+def _least_benign(kernels: Kernels, but: str) -> Finding:
+    """The least share of benign runs of all kernels but one."""
+    shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
+    if not shares:
+        return Finding()
+    least = min(shares, key=lambda each: shares[each].share)
+    told = f"least: {kernels[least]['title']}, {count_of(shares[least])}"
+    return Finding(effect=as_interval(shares[least]), told=told)
+
+
+MEASURES: Mapping[str, Callable[..., Finding]] = {
+    "success_lost": _success_lost,
+    "most_lost_kernel": _most_lost_kernel,
+    "harm_difference": _harm_difference,
+    "harmful": _harmful,
+    "loss_difference": _loss_difference,
+    "as_long": _as_long,
+    "worst_as_long": _worst_as_long,
+    "energy_follows_time": _energy_follows_time,
+    "recovered": _recovered,
+    "shortened": _shortened,
+    "control_recovers_most": _control_recovers_most,
+    "all_stages_best": _all_stages_best,
+    "autoencoder_better": _autoencoder_better,
+    "overhead_of": _overhead_of,
+    "gaussian_dearer": _gaussian_dearer,
+    "calibrated": _calibrated,
+    "outcome_beside": _outcome_beside,
+    "least_benign": _least_benign,
+}
+"""By the names that claims.toml uses. Each takes flights or kernels, and what a claim gives it."""
+
+# The claims of claims.toml ------------------------------------------------------------------------
+
+
+def _read(path: Path) -> Iterator[Claim]:
+    data, _ = read_toml(path)
+    for told in data["claim"]:
+        measure, given = told.pop("measure"), told.pop("given", {})
+        counts = [(wins, missions) for wins, missions in told.pop("paper_counts", ())]
+        if counts:
+            told |= _in_the_paper(told, counts)
+        yield Claim(
+            item=told["name"].partition("-")[0],
+            find=partial(MEASURES[measure], **_arguments(given, data["flights"])),
+            **told,
+        )
+
+
+def _in_the_paper(told: Mapping[str, Any], counts: Sequence[Count]) -> dict[str, Any]:
+    """The parts of a claim that follow from the paper's counts."""
+    spread = _spread(counts)
+    ends = {end: getattr(spread, end) for end in ("low", "high")}
+    chance = fisher(counts[0], counts[1])
+    texts = {name: f"{100 * end:z.0f}" for name, end in ends.items()}
+    texts["p"] = "p < 0.001" if chance < 0.001 else f"p = {chance:.2g}"
+    found = {name: ends[name] for name in ends if told.get(name) == _AS_PRINTED}
+    return found | {"paper_tells": told["paper_tells"].format_map(texts)}
+
+
+def _spread(counts: Sequence[Count]) -> Interval:
+    """Difference of two rates, recovered share of three, difference of two losses of four."""
+    if len(counts) == 3:
+        return recovered_share(*counts)
+    first, second, *others = (wilson(*each) for each in counts)
+    loss = rate_difference(first, second)
+    return effect_difference(loss, rate_difference(*others)) if others else loss
+
+
+def _arguments(given: Mapping[str, Any], sets: Mapping[str, Any]) -> dict[str, Any]:
+    """What a measure is given: named flights become the columns that choose them."""
+    found: dict[str, Any] = {}
+    for name, value in given.items():
+        if name == "flights":
+            found |= _arguments(sets[value], sets)
+        elif isinstance(value, Mapping):
+            found[name] = _arguments(value, sets)
+        else:
+            found[name] = tuple(value) if isinstance(value, list) else value
+    return found
+
+
+CLAIMS = tuple(_read(_FILE))

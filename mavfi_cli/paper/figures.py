@@ -1,0 +1,185 @@
+"""The figure of each item, from the same flights as its table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from mavfi_cli.analysis.flights import chosen
+from mavfi_cli.analysis.trajectories import pair
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.paper.flights import STAGES, by_value, comparable, faulty, golden
+from mavfi_cli.paper.items import printed
+from mavfi_cli.paper.layouts import (
+    KERNELS_FLOWN,
+    PERCENT,
+    PROTECTED,
+    increases,
+    values_and_deltas,
+    worlds_of,
+)
+from mavfi_cli.report.paper import (
+    DETECTOR_TITLES,
+    SMALLEST,
+    WIDTHS_IN,
+    PaperTable,
+    Strip,
+    draw_dots,
+    draw_histograms,
+    draw_stack,
+    draw_strips,
+)
+from mavfi_cli.report.top_view import draw_trajectories, panels_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
+_Row = tuple[str, str | None, pa.Table]  # of a panel: label, detector, flights
+_STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
+_NOTHING = "nothing to draw: no mission of the figure has flown yet"
+
+
+def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
+    """Draw the figure of an item from its flights, or the dots of its table.
+
+    Args:
+        flights: as `paper.flights.beside_golden`; None of what was not flown. `fig13` needs
+            their kept run folders, of one campaign.
+        columns: width, `one` or `two`.
+
+    Raises:
+        RecordError: nothing was flown that it could show, or these folders are not there.
+    """
+    if not table.rows or (flights is not None and not flights.num_rows):
+        raise RecordError(_NOTHING)
+    if flights is None or table.name not in DRAWN:
+        return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
+    return DRAWN[table.name](flights, columns)
+
+
+def panel(rows: Iterable[_Row], paper: float | None = None) -> list[Strip]:
+    """Distributions of flights over their golden ones.
+
+    Args:
+        paper: the largest increase without a detector.
+    """
+    return [
+        Strip(
+            label=label,
+            values=increases(flights),
+            style=_STYLES[detector],
+            paper=None if detector else paper,
+        )
+        for label, detector, flights in rows
+    ]
+
+
+def _number(name: str, *keys: object) -> float | None:
+    found = printed(name, *keys)
+    return found if isinstance(found, float) else None
+
+
+def _fig7(flights: pa.Table, columns: str) -> Figure:
+    rows = (
+        (title, None, faulty(flights, fault_target=node, planner=planner, level="instruction"))
+        for title, (node, planner) in KERNELS_FLOWN.items()
+    )
+    return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
+
+
+def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
+    def draw_values(flights: pa.Table, columns: str) -> Figure:
+        groups = by_value(faulty(flights), column)
+        if not groups:
+            raise RecordError(_NOTHING)
+        rows = ((str(value), None, those) for (value,), those in groups.items())
+        return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
+
+    return draw_values
+
+
+def _beside_detectors(flights: pa.Table, paper: float | None) -> list[Strip]:
+    """A row for the flights with faults, and one for those with each detector."""
+    rows: list[_Row] = [("fault", None, faulty(flights))]
+    rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTOR_TITLES]
+    return panel(rows, paper)
+
+
+def _fig12(flights: pa.Table, columns: str) -> Figure:
+    flights = comparable(flights)
+    panels = {
+        world: _beside_detectors(
+            chosen(flights, world=world), _number("fig12", "worst_increase_percent", world)
+        )
+        for world in worlds_of(flights)
+    }
+    return draw_strips(panels, OVER_GOLDEN, columns)
+
+
+def _fig14(flights: pa.Table, columns: str) -> Figure:
+    panels = {}
+    for world in worlds_of(flights):
+        here = chosen(flights, world=world)
+        rows: list[_Row] = [("no protection", None, faulty(here))]
+        rows += [
+            (f"{name.upper()} {_short(stages)}", name, faulty(here, name, protect=stages))
+            for name in DETECTOR_TITLES
+            for stages in PROTECTED
+        ]
+        panels[world] = panel(rows)
+    return draw_strips(panels, OVER_GOLDEN, columns)
+
+
+def _short(stages: str) -> str:
+    """Protected stages as the paper abbreviates them."""
+    if stages in STAGES:
+        return stages
+    return "".join(stage[0].upper() for stage in stages.split("+"))
+
+
+def _fig16(flights: pa.Table, columns: str) -> Figure:
+    panels = {}
+    for (platform,), here in by_value(flights, "platform").items():
+        ratio = _number("fig16", "worst_ratio", platform)
+        worst = None if ratio is None else PERCENT * (ratio - 1.0)
+        panels[platform] = _beside_detectors(here, worst)
+    return draw_strips(panels, OVER_GOLDEN, columns)
+
+
+def _fig11(table: pa.Table, columns: str) -> Figure:
+    found = values_and_deltas(golden(table))
+    return draw_histograms([(name, *both) for name, both in found.items()], columns)
+
+
+def _fig13(table: pa.Table, columns: str) -> Figure:
+    """The pair of missions that a fault prolongs most, from above."""
+    kept = [Path(path) for path in table["path"].to_pylist() if path]
+    if not kept:
+        raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
+    with Ledger(kept[0].parents[1]) as ledger:
+        panels = panels_of(pair(ledger, among=frozenset(table["number"].to_pylist())))
+    figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
+    for axes in figure.axes:  # room for the legend below the smaller panel
+        axes.tick_params(labelsize=SMALLEST, pad=1)
+        axes.set_xlabel(axes.get_xlabel(), fontsize=SMALLEST, labelpad=0)
+        axes.set_ylabel(axes.get_ylabel(), fontsize=SMALLEST, labelpad=0)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(WIDTHS_IN[columns], height * WIDTHS_IN[columns] / width + 0.6)
+    return figure
+
+
+DRAWN: Mapping[str, Callable[[pa.Table, str], Figure]] = {
+    "fig7": _fig7,
+    "fig8": _by_value("fault_target"),
+    "fig9": _by_value("fault_field"),
+    "fig11": _fig11,
+    "fig12": _fig12,
+    "fig13": _fig13,
+    "fig14": _fig14,
+    "fig16": _fig16,
+}

@@ -1,0 +1,308 @@
+"""Flies the missions that items need and runs the kernels of Fig. 6, and tells the cost before."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
+from mavfi_cli.attack.campaign import Plan, run_campaign
+from mavfi_cli.attack.kernels.catalogue import select
+from mavfi_cli.campaigns.begin import check_kinds
+from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
+from mavfi_cli.campaigns.progress import Progress, Spectator, duration
+from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
+from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise
+from mavfi_cli.report.drawing import write_figure
+from mavfi_cli.report.kernel_plot import draw_kernel_plot
+
+_MEASURED = 12  # missions that are flown before the forecast
+_FOLDER_BYTES = 2_000_000  # of a kept run folder, until one is there
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forecast:
+    """What is left to fly, and what it takes on this machine.
+
+    Attributes:
+        missions, over: missions of the items; those of them that are over.
+        seconds: wall time of the rest.
+        disk_bytes: space for the rest.
+        measured: number of missions that the forecast is from.
+        jobs: missions or runs at the same time.
+        runs: runs of isolated kernels that are missing.
+    """
+
+    missions: int = 0
+    over: int = 0
+    seconds: float = 0.0
+    disk_bytes: float = 0.0
+    measured: int = 0
+    jobs: int = 1
+    runs: int = 0
+
+    @property
+    def told(self) -> str:
+        """The forecast in one line."""
+        left = self.missions - self.over
+        parts = [f"{self.missions} missions, {self.over} of them flown"]
+        parts += [f"{self.runs} runs of kernels"] if self.runs else []
+        done = "; ".join(parts)
+        if not (left or self.runs):
+            return done
+        measured = f", from {self.measured} missions" if left else ""
+        return (
+            f"{done}; what is left takes about {duration(self.seconds)} on this machine "
+            f"({self.jobs} at a time{measured}) and {self.disk_bytes / 1e6:.0f} MB"
+        )
+
+
+def reproduce(
+    plan: FlightsPlan,
+    options: Options,
+    spectator: Spectator,
+    on_forecast: Callable[[Forecast], None],
+) -> None:
+    """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
+
+    Args:
+        on_forecast: hears what is left before it begins, after a little of it is measured.
+
+    Raises:
+        ConfigError: the folder holds another stack, more missions, or another campaign.
+        RecordError: the disk has not enough room.
+        MavfiError: a mission or a kernel cannot be run.
+    """
+    jobs = options.jobs or len(os.sched_getaffinity(0))
+    kernels = _KernelRuns(out=plan.out, runs=max(1, round(_PAPER_RUNS * plan.scale)), jobs=jobs)
+    left = Forecast(jobs=jobs)
+    if any(item.source is Source.KERNELS for item in plan.items) and (runs := kernels.missing()):
+        spectator.on_note("measuring a few runs of a kernel")
+        seconds = kernels.forecast_s()
+        left = replace(left, runs=runs, seconds=seconds, disk_bytes=kernels.disk_bytes)
+    if any(item.preset for item in plan.items):
+        with _opened(plan) as ledger:
+            wanted = frozenset(plan.numbers(ledger))
+            options = replace(options, only=wanted, kept=frozenset(plan.kept(ledger)))
+            _measure(ledger, wanted, options, spectator)
+            whole = _with_flights(left, ledger, wanted, options)
+            on_forecast(whole)
+            _require_room(plan.out, whole)
+            fly_missing(ledger, options, _Ahead(spectator, left.seconds))
+    else:
+        on_forecast(left)
+        _require_room(plan.out, left)
+    if left.runs:
+        kernels.run(spectator, left.seconds)
+
+
+class _Ahead(Spectator):
+    """Passes everything on; the time left includes what follows the missions."""
+
+    def __init__(self, spectator: Spectator, beyond_s: float) -> None:
+        self._spectator, self._beyond_s = spectator, beyond_s
+
+    def on_progress(self, progress: Progress) -> None:
+        self._spectator.on_progress(replace(progress, beyond_s=self._beyond_s))
+
+    def on_end(self, progress: Progress) -> None:
+        self._spectator.on_end(progress)
+
+    def on_note(self, text: str) -> None:
+        self._spectator.on_note(text)
+
+
+def _opened(plan: FlightsPlan) -> Ledger:
+    """The ledger of the plan's stack with the list of all items at the plan's scale."""
+    if (plan.folder / LEDGER).is_file():
+        with Ledger(plan.folder) as ledger:
+            _require_same(plan, FlightsPlan.stored(ledger))
+    else:
+        check_kinds(plan.kinds(*ITEMS))
+    ledger = Ledger(plan.folder, writing=True)
+    try:
+        require_unchanged(ledger)
+        ledger.set_meta(plan.meta)
+        store_plan(ledger, plan.missions(*ITEMS), append=True)
+    except BaseException:
+        ledger.close()
+        raise
+    return ledger
+
+
+def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
+    """Refuse a folder that cannot grow to the plan."""
+    if stored is None:
+        raise ConfigError(
+            "holds a campaign that is not a reproduction; choose another --out", path=plan.folder
+        )
+    if stored.stack != plan.stack:
+        raise ConfigError(
+            f"flies the stack {stored.stack}, not {plan.stack}; choose another --out",
+            path=plan.folder,
+        )
+    if plan.scale < stored.scale:
+        raise ConfigError(
+            f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}; "
+            "choose another --out",
+            path=plan.folder,
+        )
+
+
+def _missing(ledger: Ledger, wanted: frozenset[int]) -> list[int]:
+    return [number for number, _, _ in ledger.missing() if number in wanted]
+
+
+def _measure(
+    ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
+) -> None:
+    """Fly a few missions for the forecast, unless enough are over or few are missing."""
+    missing = _missing(ledger, wanted)
+    if len(wanted) - len(missing) < _MEASURED and len(missing) > _MEASURED:
+        spectator.on_note(f"measuring {_MEASURED} missions")
+        fly_missing(ledger, replace(options, only=_spread(missing, ledger)), Spectator())
+
+
+def _spread(missing: Sequence[int], ledger: Ledger) -> frozenset[int]:
+    """Missions of as many settings as possible: of the first repetition, evenly."""
+    first = missing[: len(ledger.cells())]
+    step = max(1, len(first) // _MEASURED)
+    return frozenset(first[::step][:_MEASURED])
+
+
+def _with_flights(
+    forecast: Forecast, ledger: Ledger, wanted: frozenset[int], options: Options
+) -> Forecast:
+    """A forecast with what the missing missions take beside it."""
+    missing = _missing(ledger, wanted)
+    over = sorted(wanted - set(missing))
+    flown = list(ledger.results(over[-2000:]))
+    each_s = sum(each.wall_s for each in flown) / len(flown) if flown else 0.0
+    losses = sum(each.outcome != "success" for each in flown) / len(flown) if flown else 0.0
+    kept = sum(number in options.kept for number in missing)
+    rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
+    runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()]
+    run_bytes = _size(runs[-20:]) / len(runs[-20:]) if runs else _FOLDER_BYTES
+    return replace(
+        forecast,
+        missions=len(wanted),
+        over=len(over),
+        seconds=forecast.seconds + len(missing) * each_s / forecast.jobs,
+        disk_bytes=forecast.disk_bytes
+        + len(missing) * rows / max(1, ledger.over())
+        + (kept + losses * len(missing)) * run_bytes,
+        measured=len(flown),
+    )
+
+
+def _size(folders: Sequence[Path]) -> int:
+    return sum(
+        path.stat().st_size for each in folders for path in each.rglob("*") if path.is_file()
+    )
+
+
+def _require_room(out: Path, forecast: Forecast) -> None:
+    place = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    free = shutil.disk_usage(place).free
+    if forecast.disk_bytes > free:
+        raise RecordError(
+            f"{out}: needs about {forecast.disk_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
+            "are free"
+        )
+
+
+# Isolated kernels, which depend on no stack -------------------------------------------------------
+
+_PAPER_RUNS = 5000  # of each kernel
+_SEED = 1
+# The forecast measures the quickest kernel and takes the others from docs/results/kernels.json.
+_QUICKEST, _QUICK_RUNS = "control", 100
+_QUICKEST_RUN_S = 35.0 / 5000  # there
+_PREPARE_S, _RUN_OF_EACH_S = 738.0, 1965.0 / 5000  # of all kernels, there
+_RECORD_BYTES = 2000  # of the record of a run
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _KernelRuns:
+    """The runs of all kernels in the folder of a reproduction.
+
+    Attributes:
+        out: folder of all stacks; the runs are in KERNELS_FOLDER beside those.
+        runs: of each kernel.
+        jobs: runs at the same time.
+    """
+
+    out: Path
+    runs: int
+    jobs: int
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the runs, as of `mavfi kernels --out`."""
+        return self.out / KERNELS_FOLDER
+
+    def missing(self) -> int:
+        """Number of runs that the summary lacks."""
+        path = self.folder / KERNELS
+        if not path.is_file():
+            return self.runs * len(select(()))
+        done = {each["kernel"]: each["runs"] for each in kernel_summary(path)["kernels"]}
+        return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
+
+    @property
+    def disk_bytes(self) -> int:
+        """Space for the missing runs."""
+        return self.missing() * _RECORD_BYTES
+
+    def forecast_s(self) -> float:
+        """Wall time of the missing runs, from a few runs of the quickest kernel."""
+        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+
+        with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
+            targets = kernel_targets(select([_QUICKEST]), kernel_flight(), Path(scratch))
+            (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
+        run_s = (measured.wall_s - measured.prepare_s) / _QUICK_RUNS
+        of_each = self.missing() / len(select(()))
+        there_s = _PREPARE_S + _RUN_OF_EACH_S * of_each / self.jobs
+        return there_s * run_s / _QUICKEST_RUN_S
+
+    def run(self, spectator: Spectator, forecast_s: float) -> None:
+        """Make the missing runs, and write their summary.
+
+        Raises:
+            MavfiError: as `attack.campaign.run_campaign`.
+        """
+        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+
+        plan = Plan(runs=self.runs, seed=_SEED)
+        targets = kernel_targets(select(()), kernel_flight(), self.folder)
+        names, begun = [target.name for target in targets], time.monotonic()
+        whole, missing = self.runs * len(names), self.missing()
+
+        def show(name: str, done: int) -> None:
+            """Tell the runs of the kernel, and the time left from the forecast."""
+            place = names.index(name)
+            left = min(1.0, (whole - place * self.runs - done) / missing)
+            text = f"kernel {place + 1} of {len(names)}, {name}: {done}/{self.runs} runs"
+            spectator.on_step(
+                f"{text}, {duration(forecast_s * left)} to go", time.monotonic() - begun
+            )
+
+        campaign = run_campaign(
+            plan,
+            targets,
+            jobs=self.jobs,
+            folder=self.folder,
+            progress=show,
+            notice=lambda text: spectator.on_note(f"warning: {text}"),
+        )
+        summary = summarise(plan, campaign)
+        save_runs(self.folder, summary, campaign, KERNEL_COLUMNS)
+        write_figure(draw_kernel_plot(summary), self.folder / "kernels.svg")

@@ -1,0 +1,227 @@
+"""The items of the paper: figures and tables that are experiments, their numbers, their missions.
+
+paper.toml has the items and all numbers that the paper prints. The missions of several items are
+one list, each mission once.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaigns.specification import Keep, Spec
+from mavfi_cli.campaigns.specification_file import folder_name, load_spec
+from mavfi_cli.core.config import read_toml
+from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
+
+_PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
+_META = "reproduction"  # key of the ledger's `meta`
+OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
+Key = str  # the configuration of a mission as text; equal missions have equal keys
+_ROMAN = ("", "I", "II", "III", "IV", "V")
+
+
+class Source(Enum):
+    """What an item is computed from."""
+
+    FLIGHTS = "flights"
+    KERNELS = "kernels"  # runs of isolated kernels
+    MODEL = "model"  # the performance model, which flies nothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Item:
+    """A figure or a table of the paper.
+
+    Attributes:
+        name: as on the command line, such as `fig6`.
+        title: what it shows.
+        labels: headings of its table's labels.
+        columns: of its table; a column without a title stands for one of each world.
+        notes: below its table.
+        origin: where the paper prints its numbers, and what it only draws.
+        preset: the campaign that flies it; empty if its source is not flights.
+    """
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    columns: tuple[PaperColumn, ...]
+    notes: tuple[str, ...]
+    origin: str
+    preset: str
+    source: Source
+
+    @property
+    def paper(self) -> str:
+        """The paper's name of it."""
+        return printed_name(self.name)
+
+    def table(
+        self, rows: Sequence[PaperRow], worlds: Sequence[str] = (), notes: Sequence[str] = ()
+    ) -> PaperTable:
+        """The item's table with these rows, and with more notes."""
+        return PaperTable(
+            name=self.name,
+            title=f"{self.paper}: {self.title}",
+            labels=self.labels,
+            columns=tuple(
+                column if column.title else replace(column, title=world)
+                for column in self.columns
+                for world in ([column.title] if column.title else worlds)
+            ),
+            rows=tuple(rows),
+            notes=(*self.notes, *notes, self.origin),
+        )
+
+
+def printed_name(name: str) -> str:
+    """The paper's name of a figure or table, such as `Fig. 6` of `fig6`."""
+    table = name.removeprefix("table")
+    return f"Fig. {name.removeprefix('fig')}" if table == name else f"Table {_ROMAN[int(table)]}"
+
+
+def printed(item: str, *keys: object) -> Printed:
+    """A number that the paper prints, or its words; None if it prints nothing there."""
+    found: Any = _PAPER.get(item, {})
+    for key in keys:
+        found = found.get(str(key)) if isinstance(found, Mapping) else None
+    if found is None or isinstance(found, str):
+        return found
+    return float(found)
+
+
+def _item(name: str, told: Mapping[str, Any]) -> Item:
+    drawn = f"; {told['unprinted']}: drawn only" if "unprinted" in told else ""
+    return Item(
+        name=name,
+        title=told["title"],
+        labels=tuple(told["labels"]),
+        columns=tuple(PaperColumn(**each) for each in told["columns"]),
+        notes=tuple(_PAPER["notes"].get(each, each) for each in told["notes"]),
+        origin=f"paper: {told['source']}{drawn}",
+        preset=told.get("preset", ""),
+        source=Source(told.get("computed_from", "flights")),
+    )
+
+
+ITEMS = tuple(_item(name, told) for name, told in _PAPER.items() if "title" in told)
+BY_NAME = {item.name: item for item in ITEMS}
+LEFT_OUT: Mapping[str, str] = _PAPER["left_out"]
+"""Figures and tables of the paper that are no experiment, and why."""
+
+
+def items_named(names: Sequence[str]) -> tuple[Item, ...]:
+    """The items of these names, in the order of ITEMS; no names mean all.
+
+    Raises:
+        UnknownName: there is no such item. Suggests the nearest.
+        ConfigError: the paper has it, but it is no experiment; says what it is.
+    """
+    for name in names:
+        if name in LEFT_OUT:
+            raise ConfigError(f"is not an experiment: it {LEFT_OUT[name]}", key=name)
+        if name not in BY_NAME:
+            raise UnknownName("item", name, BY_NAME)
+    return tuple(item for item in ITEMS if not names or item.name in names)
+
+
+# Missions -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightsPlan:
+    """The flights of items on one stack. Its methods take items of it; none mean all.
+
+    Attributes:
+        scale: fraction of the paper's number of missions.
+        out: folder of all reproductions; each stack has its own folder in it.
+    """
+
+    items: Sequence[Item]
+    stack: str
+    scale: float = 1.0
+    out: Path = OUT
+
+    @classmethod
+    def stored(cls, ledger: Ledger) -> FlightsPlan | None:
+        """The plan with which a reproduction was begun, of all items; None of another campaign."""
+        text = ledger.meta(_META)
+        if text is None:
+            return None
+        return cls(items=ITEMS, out=ledger.folder.parent, **json.loads(text))
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the flights."""
+        return self.out / folder_name(self.stack)
+
+    @property
+    def meta(self) -> dict[str, str]:
+        """What the ledger of the flights stores of the plan."""
+        asked = {"stack": self.stack, "scale": self.scale}
+        return {"name": self.folder.name, _META: json.dumps(asked)}
+
+    @property
+    def command(self) -> str:
+        """The command that flies the plan's stack for all items."""
+        asked = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
+        return shlex.join(["mavfi", "reproduce", *asked])
+
+    def missions(self, *items: Item) -> list[PlannedMission]:
+        """The missions, repetition by repetition, so that all items grow together.
+
+        Raises:
+            ConfigError: the scale leaves nothing, or the stack cannot be used.
+        """
+        planned = [
+            (mission.config.seed - spec.first_seed, mission)
+            for spec in self._specs(items, self.scale)
+            for mission in spec.missions()
+        ]
+        once: dict[Key, PlannedMission] = {}
+        for _, mission in sorted(planned, key=itemgetter(0)):
+            once.setdefault(_key_of(mission), mission)
+        return list(once.values())
+
+    def kinds(self, *items: Item) -> list[PlannedMission]:
+        """The first mission of each kind; the others differ in seeds."""
+        return [mission for spec in self._specs(items, 1.0) for mission in spec.kinds()]
+
+    def keys(self, *items: Item) -> list[Key]:
+        """The configurations of the missions, as the ledger stores them."""
+        return [_key_of(each) for each in self.missions(*items)]
+
+    def numbers(self, ledger: Ledger, *items: Item) -> list[int]:
+        """The numbers of the missions in a ledger, in the order of its list."""
+        return _numbers_of(ledger, self.keys(*items))
+
+    def kept(self, ledger: Ledger) -> list[int]:
+        """The numbers of the missions whose run folders any item needs."""
+        specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
+        return _numbers_of(ledger, (_key_of(each) for spec in specs for each in spec.missions()))
+
+    def _specs(self, items: Iterable[Item], scale: float) -> list[Spec]:
+        """The campaigns of items, each once, in the order of ITEMS."""
+        asked = set(items) or set(self.items)
+        presets = dict.fromkeys(item.preset for item in ITEMS if item in asked and item.preset)
+        specs = (load_spec(preset).scaled(scale) for preset in presets)
+        return [replace(spec, fixed={**spec.fixed, "stack": self.stack}) for spec in specs]
+
+
+def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:
+    wanted = frozenset(keys)
+    return [number for number, _, _, changes in ledger.rows() if changes in wanted]
+
+
+def _key_of(mission: PlannedMission) -> Key:
+    return canonical(changes_of(mission.config))

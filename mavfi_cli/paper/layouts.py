@@ -1,0 +1,479 @@
+"""The layout of each item that is flown: from missions to the paper's table.
+
+A layout takes the item's missions as `paper.flights.beside_golden`. It reads
+configuration and record only, never labels, so that it serves any campaign with such missions. It
+gives the cells of each row; paper.toml has headings, columns and notes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from mavfi_cli.analysis.flights import chosen, known, numbers
+from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.core.files import read_parquet
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.mission.record.run_folder import TRACE
+from mavfi_cli.paper.flights import (
+    EVERY_STAGE,
+    STAGES,
+    by_value,
+    comparable,
+    faulty,
+    golden,
+    ratios,
+    share,
+)
+from mavfi_cli.paper.items import BY_NAME, printed
+from mavfi_cli.report.paper import (
+    DETECTOR_TITLES,
+    PaperCell,
+    PaperRow,
+    PaperTable,
+    Printed,
+)
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.paired import OWN, worst_case
+from mavfi_cli.stats.shares import Share
+
+PERCENT = 100.0
+WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
+PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
+_GOLDEN = "golden"  # begins the labels of rows of golden flights
+_JOULES = 1e-3  # kJ
+_NOTHING = "nothing flown yet"
+
+
+def of_flights(name: str, flights: pa.Table) -> PaperTable:
+    """The table of an item that is flown.
+
+    Args:
+        flights: the item's missions, as `paper.flights.beside_golden`.
+    """
+    if name in _ONLY_COMPARABLE:
+        flights = comparable(flights)
+    rows = [*OF_FLIGHTS[name](flights)]
+    notes = _unknown_costs(flights) if name == "table5" else []
+    table = BY_NAME[name].table(rows, worlds_of(flights), notes)
+    return replace(table, result=_RESULTS[name](table))
+
+
+_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part of the stages
+
+
+def _row(*labels: object, cells: Iterable[PaperCell]) -> PaperRow:
+    return PaperRow(labels=tuple(map(str, labels)), cells=tuple(cells))
+
+
+def worlds_of(flights: pa.Table) -> list[str]:
+    """The worlds that were flown, the paper's first."""
+    found = set(flights["world"].to_pylist())
+    return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
+
+
+# Faults by place: Figs. 7, 8, 9, Table III ------------------------------------------------------
+
+KERNELS_FLOWN = {  # node and planner
+    "point cloud": ("point_cloud", "rrtstar"),
+    "OctoMap": ("octomap", "rrtstar"),
+    "collision check": ("collision_check", "rrtstar"),
+    "RRT": ("planner", "rrt"),
+    "RRTConnect": ("planner", "rrtconnect"),
+    "RRT*": ("planner", "rrtstar"),
+    "PID": ("control", "rrtstar"),
+}
+_PLANNERS = {"rrtstar": "RRT*", "rrt": "RRT", "rrtconnect": "RRTConnect"}
+
+
+def _effects(flights: pa.Table) -> list[PaperCell]:
+    """Success, mean time, and the longest flight of those with a fault."""
+    longest = _maximum(increases(faulty(flights)))
+    return [_success(flights), _mean(flights, "flight_time_s"), longest]
+
+
+def _fig7(flights: pa.Table) -> Iterator[PaperRow]:
+    """Faults in each kernel beside the golden flights with the same planner."""
+    groups = {
+        f"{_GOLDEN}, {title}": chosen(golden(flights), planner=name)
+        for name, title in _PLANNERS.items()
+    } | {
+        title: faulty(flights, level="instruction", fault_target=node, planner=planner)
+        for title, (node, planner) in KERNELS_FLOWN.items()
+    }
+    for title, those in groups.items():
+        if those.num_rows:
+            energy = _mean(those, "energy_regression_j", scale=_JOULES)
+            yield _row(title, cells=[*_effects(those), energy])
+
+
+def _fig7_told(table: PaperTable) -> str:
+    worst = printed("fig7", "worst_increase_percent")
+    lost = printed("fig7", "success_lost_points")
+    return f"{_worst_told(table)}; paper: up to +{worst} % and -{lost} points"
+
+
+def _by_value(name: str, column: str) -> Callable[[pa.Table], Iterator[PaperRow]]:
+    """Faults by the values of a column, and what the paper says of each."""
+
+    def rows(flights: pa.Table) -> Iterator[PaperRow]:
+        yield _row(_GOLDEN, "", cells=_effects(golden(flights)))
+        for (value,), those in by_value(faulty(flights), column).items():
+            critical = printed(name, "critical", value) or "-"
+            yield _row(value, critical, cells=_effects(those))
+
+    return rows
+
+
+def _worst_told(table: PaperTable) -> str:
+    """The row with the longest flight, and the one with the lowest success."""
+    struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
+    longest = table.ranked(2)
+    if not longest:
+        return _NOTHING
+    lowest = min(struck, key=lambda row: row.cells[0].value)
+    return (
+        f"longest flight {table.told(longest[0], 2)} over its own golden one "
+        f"({longest[0].labels[0]}); lowest success {table.told(lowest, 0)} ({lowest.labels[0]})"
+    )
+
+
+_QUALITY = {  # the paper's name of a measure, its column, and its scale
+    "flight_time_s": ("flight_time_s", 1.0),
+    "distance_m": ("distance_m", 1.0),
+    "energy_kj": ("energy_regression_j", _JOULES),
+    "replans": ("replans", 1.0),
+}
+
+
+def _table3(flights: pa.Table) -> Iterator[PaperRow]:
+    """Quality of flight by the number of flipped bits."""
+    groups = {0: golden(flights)}
+    faults = by_value(faulty(flights), "fault_bits")
+    groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
+    for bits, those in groups.items():
+        means = [
+            _mean(those, column, printed("table3", paper, bits), scale)
+            for paper, (column, scale) in _QUALITY.items()
+        ]
+        won = _success(those, printed("table3", "success_percent", bits))
+        yield _row(bits or f"0 ({_GOLDEN})", cells=[*means, won])
+
+
+def _table3_told(table: PaperTable) -> str:
+    most = table.rows[-1]
+    time_s, won = table.told(most, 0, " s"), table.told(most, -1)
+    return f"{most.labels[0]} bits: flight time {time_s}, success {won}"
+
+
+# Detection and recovery in four worlds: Table IV, Figs. 12 and 14, Table V -----------------------
+
+
+def _table4(flights: pa.Table) -> Iterator[PaperRow]:
+    """Success in each world: golden, with faults, with each detector."""
+    settings = [(_GOLDEN, "golden", golden(flights)), ("injection", "none", faulty(flights))]
+    settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTOR_TITLES.items()]
+    for title, key, those in settings:
+        cells = (
+            _success(chosen(those, world=world), printed("table4", "success_percent", key, world))
+            for world in worlds_of(flights)
+        )
+        yield _row(title, cells=cells)
+
+
+def _table4_told(table: PaperTable) -> str:
+    world = table.columns[-1].title if table.columns else "no world"
+    told = (f"{row.labels[0]} {table.told(row, -1)}" for row in table.rows if row.cells)
+    return f"{world}: {', '.join(told)}"
+
+
+def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
+    """Worst flight time with faults, and what each detector recovers of it, in points."""
+    for world in worlds_of(flights):
+        here = chosen(flights, world=world)
+        bare, struck = golden(here), faulty(here)
+        increase = printed("fig12", "worst_increase_percent", world)
+        yield _row(world, cells=[
+            _mean(bare, "flight_time_s"),
+            _maximum(increases(struck), increase),
+            _worst_mean(bare, struck, increase),
+            *_recovered(here, "fig12", "recovered_points", world),
+        ])  # fmt: skip
+
+
+def _recovered(flights: pa.Table, item: str, unit: str, place: str) -> Iterator[PaperCell]:
+    """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
+    measure = "recovered" if unit == "recovered_points" else "recovered_share"
+    for name in DETECTOR_TITLES:
+        yield _recovery(faulty(flights, name), measure, printed(item, unit, name, place))
+
+
+def _fig12_told(table: PaperTable) -> str:
+    if not (worst := table.ranked(1)):
+        return _NOTHING
+    longest, gad, aad = (table.told(worst[0], *each) for each in ((1,), (3, ""), (4, "")))
+    world = worst[0].labels[0]
+    return f"worst flight {longest} in {world}, GAD recovers {gad} and AAD {aad} points"
+
+
+def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
+    """Share of the worst increase that each detector recovers, by protected stages."""
+    for detector, told in DETECTOR_TITLES.items():
+        for stages in PROTECTED:
+            paper = ("fig14", "recovered_percent", detector)
+            cells = (
+                _recovery(
+                    faulty(flights, detector, protect=stages, world=world),
+                    "recovered_share",
+                    printed(*paper, world, stages),
+                )
+                for world in worlds_of(flights)
+            )
+            yield _row(told, stages, cells=cells)
+
+
+def _fig14_told(table: PaperTable) -> str:
+    protected = [row for row in table.rows if row.labels[1] == EVERY_STAGE and row.cells]
+    return "all stages, " + "; ".join(
+        f"{row.labels[0]} recovers {table.told(row, 0)} in {table.columns[0].title}"
+        for row in protected
+    )
+
+
+def _table5(flights: pa.Table) -> Iterator[PaperRow]:
+    """Shares of the flight time that detection and recovery take."""
+    for detector in DETECTOR_TITLES:
+        for title, (columns, keys) in _parts(detector).items():
+            cells = (
+                mean_cell(
+                    PERCENT * _summed(faulty(flights, detector, world=world), columns),
+                    printed("table5", *keys, world),
+                )
+                for world in worlds_of(flights)
+            )
+            yield _row(detector.upper(), title, cells=cells)
+
+
+def _table5_told(table: PaperTable) -> str:
+    sums = [row for row in table.rows if row.labels[1] == "sum" and row.cells]
+    return "detection and recovery, " + "; ".join(
+        f"{row.labels[0]} {table.told(row, -1)} in {table.columns[-1].title}" for row in sums
+    )
+
+
+def _unknown_costs(flights: pa.Table) -> list[str]:
+    """Why watched flights have no costs."""
+    watched = flights.num_rows > flights["detector"].null_count
+    if not watched or len(known(numbers(flights, "check_share"))):
+        return []
+    return ["no numbers: this export does not hold these times; a new one does"]
+
+
+def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
+    """Rows of a detector: columns that add up, and the keys of the paper's number."""
+    recovery = [f"recovery_share_{stage}" for stage in STAGES]
+    apart = {
+        stage: ([column], ["recovery", detector, stage])
+        for stage, column in zip(STAGES, recovery, strict=True)
+    }
+    if detector == "aad":  # recomputes control only
+        apart = {"recovery": (recovery, ["recovery", detector, "control"])}
+    return {
+        **apart,
+        "detection": (["check_share"], ["detection", detector]),
+        "sum": (["check_share", *recovery], ["sum", detector]),
+    }
+
+
+def _summed(table: pa.Table, columns: Sequence[str]) -> FloatArray:
+    """The sum of columns in each flight that has them."""
+    return known(np.sum([numbers(table, column) for column in columns], axis=0))
+
+
+# Paths and states: Figs. 11 and 13 ---------------------------------------------------------------
+
+SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
+
+
+def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Values of SHOWN_STATES at all control ticks, and their changes from tick to tick.
+
+    Reads the traces of the successful flights whose run folders are there.
+    """
+    runs = [Path(each) for each in chosen(flights, lost=False)["path"].to_pylist() if each]
+    traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
+    found = {}
+    for state in SHOWN_STATES:
+        columns = [known(numbers(trace, state)) for trace in traces]
+        found[state] = (
+            np.concatenate([np.zeros(0), *columns]),
+            np.concatenate([np.zeros(0), *(np.diff(each) for each in columns)]),
+        )
+    return found
+
+
+def _fig11(flights: pa.Table) -> Iterator[PaperRow]:
+    """Ranges of the values of three states, and of their changes."""
+    for state, (values, deltas) in values_and_deltas(golden(flights)).items():
+        spans = [_span(values, 1.0), _span(deltas, 1.0)]
+        middle = [_span(values, 0.99), _span(deltas, 0.99)]
+        reduced = [_reduction(*spans), _reduction(*middle)]
+        cells = [PaperCell(value=each, count=len(values)) for each in (*spans, *reduced)]
+        cells[2] = replace(cells[2], paper=printed("fig11", "reduction_percent", state))
+        yield _row(state, cells=cells)
+
+
+def _fig11_told(table: PaperTable) -> str:
+    told = (f"{table.told(row, 2)} ({row.labels[0]})" for row in table.rows)
+    return f"range reduced by {', '.join(told)}"
+
+
+def _span(values: FloatArray, share: float) -> float:
+    """The range of the middle share of the values; NaN without any."""
+    if not len(values):
+        return math.nan
+    low, high = np.quantile(values, (0.5 - share / 2.0, 0.5 + share / 2.0))
+    return float(high - low)
+
+
+def _reduction(values: float, deltas: float) -> float:
+    return PERCENT * (1.0 - deltas / values) if values else math.nan
+
+
+def _fig13(flights: pa.Table) -> Iterator[PaperRow]:
+    """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
+    for (stage,), struck in by_value(faulty(flights), "fault_target").items():
+        yield _row(stage, cells=[
+            _maximum(increases(struck), printed("fig13", "increase_percent", stage)),
+            _maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
+            mean_cell(increases(struck)),
+        ])  # fmt: skip
+
+
+def _fig13_told(table: PaperTable) -> str:
+    return "; ".join(
+        f"{row.labels[0]}: {table.told(row, 0)}, with AAD {table.told(row, 1)}"
+        for row in table.rows
+    ) or _NOTHING  # fmt: skip
+
+
+def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
+    """Increase of the flight with the fault that prolongs most, protected, (1,) or (0,)."""
+    if not len(ratios(struck)):
+        return np.zeros(0)
+    worst = struck.slice(int(np.nanargmax(numbers(struck, "over_own"))), 1)
+    return increases(chosen(protected, pair=worst["pair"][0], fault=worst["fault"][0]))
+
+
+# Platforms: Fig. 16 ------------------------------------------------------------------------------
+
+
+def _fig16(flights: pa.Table) -> Iterator[PaperRow]:
+    """Worst flight time on each platform, and what each detector recovers of it."""
+    for (platform,), here in by_value(flights, "platform").items():
+        struck = faulty(here)
+        yield _row(platform, cells=[
+            _mean(golden(here), "flight_time_s"),
+            _success(struck),
+            _maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
+            *_recovered(here, "fig16", "recovered_percent", platform),
+        ])  # fmt: skip
+
+
+def _fig16_told(table: PaperTable) -> str:
+    return "; ".join(
+        f"{row.labels[0]}: worst x {table.told(row, 2, '')}, GAD recovers "
+        f"{table.told(row, 3)}, AAD {table.told(row, 4)}"
+        for row in table.rows
+    ) or _NOTHING  # fmt: skip
+
+
+OF_FLIGHTS: Mapping[str, Callable[[pa.Table], Iterator[PaperRow]]] = {
+    "fig7": _fig7, "fig8": _by_value("fig8", "fault_target"),
+    "fig9": _by_value("fig9", "fault_field"), "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
+    "fig14": _fig14, "fig16": _fig16, "table3": _table3, "table4": _table4, "table5": _table5,
+}  # fmt: skip
+_RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
+    "fig7": _fig7_told, "fig8": _worst_told, "fig9": _worst_told, "fig11": _fig11_told,
+    "fig12": _fig12_told, "fig13": _fig13_told, "fig14": _fig14_told, "fig16": _fig16_told,
+    "table3": _table3_told, "table4": _table4_told, "table5": _table5_told,
+}  # fmt: skip
+
+
+# Cells --------------------------------------------------------------------------------------------
+
+
+def share_cell(share: Share, paper: Printed = None) -> PaperCell:
+    """A share as per cent."""
+    if not share.total:
+        return PaperCell(paper=paper)
+    return PaperCell(
+        value=PERCENT * share.share,
+        low=PERCENT * share.low,
+        high=PERCENT * share.high,
+        count=share.total,
+        paper=paper,
+    )
+
+
+def _success(flights: pa.Table, paper: Printed = None) -> PaperCell:
+    """Success rate of all flown missions, in per cent, as the paper counts."""
+    return share_cell(share(flights, value=False), paper)
+
+
+def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
+    """A mean with its bootstrap interval."""
+    found = interval(values, resamples=RESAMPLES)
+    return PaperCell(
+        value=found.value, low=found.low, high=found.high, count=found.count, paper=paper
+    )
+
+
+def _mean(flights: pa.Table, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
+    """Mean of a measure over the successful missions."""
+    return mean_cell(scale * _of_successes(flights, name), paper)
+
+
+def _of_successes(flights: pa.Table, name: str) -> FloatArray:
+    """A measure of the successful missions that have it."""
+    return known(numbers(chosen(flights, lost=False), name))
+
+
+def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
+    """The largest value; it has no interval."""
+    if not len(values):
+        return PaperCell(paper=paper)
+    return PaperCell(value=float(np.max(values)), count=len(values), paper=paper)
+
+
+def increases(flights: pa.Table) -> FloatArray:
+    """Flight times beyond those of the own golden flights, in per cent, where both succeed."""
+    return PERCENT * (ratios(flights) - 1.0)
+
+
+def _worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> PaperCell:
+    """The longest flight over the mean golden one, as increase in per cent."""
+    golden_s, times_s = (_of_successes(each, "flight_time_s") for each in (bare, flights))
+    if not (len(golden_s) and len(times_s)):
+        return PaperCell(paper=paper)
+    increase = float(times_s.max() / golden_s.mean()) - 1.0
+    return PaperCell(value=PERCENT * increase, count=len(times_s), paper=paper)
+
+
+def _recovery(protected: pa.Table, measure: str, paper: Printed) -> PaperCell:
+    """What a protection recovers of the worst case, in per cent or in points.
+
+    The worst case is that of the faults that were flown with the protection, too: of more flights
+    the longest is longer.
+
+    Args:
+        measure: field of `WorstCase`.
+    """
+    bare, own = known(numbers(protected, "bare_over_own")), ratios(protected)
+    value = PERCENT * getattr(worst_case(OWN, bare.tolist(), own.tolist()), measure)
+    return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

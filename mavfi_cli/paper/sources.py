@@ -1,0 +1,263 @@
+"""Finds campaigns, exported campaigns and attacked kernels in files and folders."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import flights, provenance
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
+from mavfi_cli.campaigns.begin import stored_spec
+from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.missions import ResultState
+from mavfi_cli.campaigns.specification import Spec
+from mavfi_cli.campaigns.specification_file import load_spec, presets
+from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.files import file_digest, read_parquet
+from mavfi_cli.core.installed import installed_versions, version_differences
+from mavfi_cli.paper.flights import flown_missions, pooled
+from mavfi_cli.paper.items import FlightsPlan
+from mavfi_cli.paper.status import of_kernels
+
+STACKS = ("mavbench", "hardened")  # the paper's, and ours
+_NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
+_EXPORT, _SPEC = ".parquet", ".toml"
+_OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignSource:
+    """A campaign, from its folder or from an export.
+
+    Attributes:
+        path: the campaign's folder, or the exported file.
+        spec: None if a program made the list, or if no specification lies beside an export.
+        planned: missions on its list; None of an export that does not say.
+        flights: the missions that flew, as `paper.flights.flown_missions`.
+        errors: missions that could not begin.
+        versions: of the programs that flew it; empty of an export that does not say.
+        host: of the first record; empty of an export that does not say.
+        digest: SHA-256 of an exported file; empty of a folder.
+        again: command that flies the rest of its list; empty if it is not known.
+    """
+
+    path: Path
+    name: str
+    spec: Spec | None
+    planned: int | None
+    flights: pa.Table
+    errors: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    host: Mapping[str, Any] = field(default_factory=dict)
+    digest: str = ""
+    again: str = ""
+
+    @property
+    def stacks(self) -> list[str]:
+        """The stacks that flew, sorted."""
+        return sorted(pc.unique(self.flights["stack"]).to_pylist())
+
+    @property
+    def seeds(self) -> tuple[int, int] | None:
+        """The smallest and the largest seed of its flights; None without any."""
+        found = pc.min_max(self.flights["seed"]).as_py()
+        return None if found["min"] is None else (found["min"], found["max"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _KernelSource:
+    """Attacked kernels: the summary that `mavfi kernels --out` writes."""
+
+    path: Path
+    summary: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """All that was found.
+
+    Attributes:
+        problems: what could not be read, is incomplete, or does not fit, a sentence each.
+    """
+
+    campaigns: Sequence[CampaignSource]
+    kernels: Sequence[_KernelSource]
+    problems: Sequence[str]
+
+    @property
+    def isolated(self) -> Mapping[str, Mapping[str, Any]]:
+        """The summary of each attacked kernel; of several, that of the last source."""
+        return {part["kernel"]: part for each in self.kernels for part in each.summary["kernels"]}
+
+    def flights(self, stack: str | None = None) -> pa.Table:
+        """The flights of a stack, each mission once and beside its golden flight; None means all.
+
+        They are those of `paper.flights.pooled`.
+        """
+        return pooled([each.flights for each in self.campaigns], stack)
+
+
+def gather(places: Sequence[Path]) -> Evidence:
+    """Read what the places hold.
+
+    Args:
+        places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
+
+    Raises:
+        RecordError: a place does not exist, or nothing in them can be read.
+    """
+    campaigns: list[CampaignSource] = []
+    kernels: list[_KernelSource] = []
+    problems: list[str] = []
+    for place in places:
+        before = len(campaigns) + len(kernels) + len(problems)
+        for path in _found(place):
+            try:
+                each = _read(path)
+            except (MavfiError, OSError) as error:
+                problems.append(f"Not read: {error}.")
+                continue
+            if isinstance(each, _KernelSource):
+                kernels.append(each)
+            else:
+                campaigns.append(each)
+        if len(campaigns) + len(kernels) + len(problems) == before:
+            problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
+    if not any(each.flights.num_rows for each in campaigns) and not kernels:
+        raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
+    problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
+    return Evidence(campaigns=campaigns, kernels=kernels, problems=problems)
+
+
+def _found(place: Path) -> Iterator[Path]:
+    """Ledgers, summaries of kernels and exports at a place, in the order of their names."""
+    if not place.exists():
+        raise RecordError(f"{place}: does not exist")
+    if place.is_file():
+        yield place
+        return
+    yield from sorted(
+        path
+        for path in place.rglob("*")
+        if (path.name in (KERNELS, LEDGER) or path.suffix == _EXPORT)
+        and path.name not in _OTHERS
+        and not _inside_campaign(path, place)
+    )
+
+
+def _inside_campaign(path: Path, place: Path) -> bool:
+    """Whether it belongs to a campaign's own folders: kept runs, the search for a world."""
+    above = [each for each in path.parent.parents if each.is_relative_to(place)]
+    return any((each / LEDGER).is_file() for each in above)
+
+
+def _read(path: Path) -> CampaignSource | _KernelSource:
+    if path.name == LEDGER:
+        return _from_ledger(path.parent)
+    if path.suffix == _EXPORT:
+        return _from_export(path)
+    return _from_summary(path)
+
+
+def _from_ledger(folder: Path) -> CampaignSource:
+    with Ledger(folder) as ledger:
+        table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
+        plan = FlightsPlan.stored(ledger)
+    found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
+    again = "" if spec is None else shlex.join(["mavfi", "campaign", "run", str(folder)])
+    return replace(found, again=again if plan is None else plan.command)
+
+
+def _from_summary(path: Path) -> _KernelSource:
+    summary = kernel_summary(path)
+    try:  # all that the page shows of it
+        of_kernels(summary), [part["runs"] + 0 for part in summary["kernels"]]
+        summary["plan"]["seed"], summary["plan"]["flight"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordError(f"{path}: not a whole summary of `mavfi kernels` ({error!r})") from None
+    return _KernelSource(path=path, summary=summary)
+
+
+def _from_export(path: Path) -> CampaignSource:
+    table = read_parquet(path, "export of a campaign")
+    lacking = [name for name in _NEEDED if name not in table.column_names]
+    if lacking:
+        raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
+    spec = _spec_beside(path)
+    try:
+        found = _campaign(path, path.stem, spec, table, provenance(table))
+    except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
+        raise RecordError(f"{path}: not an export of a campaign ({error})") from None
+    return replace(found, digest=file_digest(path))
+
+
+def _campaign(
+    path: Path, name: str, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any]
+) -> CampaignSource:
+    return CampaignSource(
+        path=path,
+        name=name,
+        spec=spec,
+        planned=origin.get("planned"),
+        flights=flown_missions(table),
+        errors=table["state"].to_pylist().count(ResultState.ERROR.value),
+        versions=origin.get("versions", {}),
+        host=origin.get("host", {}),
+    )
+
+
+def _spec_beside(path: Path) -> Spec | None:
+    """The specification of an export: NAME.toml, also for NAME-part1.parquet, or the preset."""
+    for stem in (path.stem, path.stem.rpartition("-part")[0]):
+        if stem and (beside := path.with_name(stem + _SPEC)).is_file():
+            return load_spec(str(beside))
+        if stem in presets():
+            return load_spec(stem)
+    return None
+
+
+# What is missing ----------------------------------------------------------------------------------
+
+
+def _nothing(campaigns: Sequence[CampaignSource]) -> str:
+    return "; ".join(f"{each.path}: no mission has flown yet" for each in campaigns)
+
+
+def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
+    for each in campaigns:
+        over = each.flights.num_rows + each.errors
+        if each.planned is not None and over < each.planned:
+            rest = f"{each.again or 'The command that began it'} flies the rest."
+            rest = "An export holds no list." if each.digest else rest
+            yield f"{each.path}: {over:,} of {each.planned:,} missions have flown. {rest}"
+        if each.errors:
+            yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
+
+
+def _repeated(kernels: Sequence[_KernelSource]) -> Iterator[str]:
+    first: dict[str, Path] = {}
+    for each in kernels:
+        for part in each.summary["kernels"]:
+            name = part["kernel"]
+            if name in first:
+                yield f"{first[name]} and {each.path} both have {name}; the latter counts."
+            first[name] = each.path
+
+
+def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
+    told = [each for each in campaigns if each.versions]
+    for each in told[1:]:
+        if found := version_differences(told[0].versions, each.versions):
+            yield f"{each.path} and {told[0].path} were flown by other builds: {', '.join(found)}."
+    here = installed_versions()
+    if told and (found := version_differences(told[0].versions, here)):
+        yield (
+            f"{told[0].path} was flown by another build than this one, so its missions may not "
+            f"repeat here: {', '.join(found)}."
+        )

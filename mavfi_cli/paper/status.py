@@ -1,0 +1,261 @@
+"""What a campaign shows of the paper: the tables of its items, and its state on one screen."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.groups import METRICS, Group, groups
+from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, outcome_share
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.progress import duration
+from mavfi_cli.campaigns.specification_file import presets
+from mavfi_cli.core.errors import RecordError, UnknownName
+from mavfi_cli.paper.flights import beside_golden, flown_missions
+from mavfi_cli.paper.items import (
+    BY_NAME,
+    ITEMS,
+    KERNELS_FOLDER,
+    FlightsPlan,
+    Item,
+    Source,
+    items_named,
+    printed,
+)
+from mavfi_cli.paper.layouts import mean_cell, of_flights, share_cell
+from mavfi_cli.report.campaign import SettingColumns
+from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.stats.shares import rate
+from mavfi_cli.vpm.model import schemes_with
+from mavfi_cli.vpm.report import Choices, report
+from mavfi_cli.vpm.vehicle import ModelVehicle
+
+_ROWS = 14  # of a table on one screen
+_WIDE = 2  # columns of settings on one screen
+_SETTINGS = "settings"  # name of the table of a user's own campaign
+
+
+def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, pa.Table | None]:
+    """The one table of a campaign, and the flights that its figure needs; None if it needs none.
+
+    It is the table of the named item, or of the preset's item. Without one, a reproduction has the
+    table of its items, and another campaign that of its settings.
+
+    Raises:
+        UnknownName: the campaign flies no item of this name.
+        ConfigError: the paper has it, but it is no experiment.
+        RecordError: the kernels were not run.
+    """
+    item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
+    if item is None:
+        return _settings_table(ledger) if plan is None else _progress_table(ledger, plan), None
+    if item.source is not Source.FLIGHTS:
+        return _unflown(item, ledger.folder.parent), None
+    table = beside_golden(flown_missions(flights(ledger)))
+    mine = table if plan is None else _flights_of(item, plan, table)
+    return of_flights(item.name, mine), mine
+
+
+def _item_of(ledger: Ledger, name: str | None) -> Item | None:
+    """The named item of a campaign, or the one of its preset; None if the paper has none."""
+    preset = (ledger.meta("name") or "").partition("-")[0]  # with or without changes
+    own = [item for item in ITEMS if item.preset == preset] if preset in presets() else []
+    if name is None:
+        return min(own, key=lambda item: item.name != preset, default=None)
+    (found,) = items_named([name])
+    known = own if FlightsPlan.stored(ledger) is None else ITEMS
+    if found not in known:
+        raise UnknownName("item of this campaign", name, [each.name for each in known] or ["none"])
+    return found
+
+
+def _flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
+    """The flights of an item among those of a reproduction."""
+    keys = pa.array(plan.keys(item), pa.string())
+    return table.filter(pc.is_in(table["changes"], value_set=keys))
+
+
+def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
+    """The table of each item of a plan, from what is there.
+
+    Raises:
+        RecordError: nothing was flown, or the kernels were not run.
+    """
+    table = None
+    for item in plan.items:
+        if item.source is not Source.FLIGHTS:
+            yield _unflown(item, plan.out)
+            continue
+        if table is None:
+            with Ledger(plan.folder) as ledger:
+                table = beside_golden(flown_missions(flights(ledger)))
+        yield of_flights(item.name, _flights_of(item, plan, table))
+
+
+# Items that are not flown: Figs. 6 and 15 --------------------------------------------------------
+
+_OUTCOMES = ("benign", "sdc", "crash", "hang")
+_PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
+
+
+def _unflown(item: Item, out: Path) -> PaperTable:
+    if item.source is Source.MODEL:
+        return of_model()
+    path = out / KERNELS_FOLDER / KERNELS
+    if not path.is_file():
+        raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)")
+    return of_kernels(kernel_summary(path))
+
+
+def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
+    """The table of Fig. 6.
+
+    Args:
+        summary: `kernels.json` of `mavfi kernels`.
+    """
+    rows = []
+    for kernel in summary["kernels"]:
+        name = kernel["kernel"]
+        paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
+        shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
+        cells = (share_cell(shares[0], paper), *map(share_cell, shares[1:]))
+        rows.append(PaperRow(labels=(kernel["title"],), cells=cells))
+    table = BY_NAME["fig6"].table(rows)
+    most = table.ranked(1)
+    told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
+    return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
+
+
+def of_model() -> PaperTable:
+    """The table of Fig. 15, of the performance model with the paper's overheads."""
+    item = BY_NAME["fig15"]
+    vehicles = [ModelVehicle.load(column.title) for column in item.columns]
+    told = report(vehicles, Choices(), schemes_with({}))["vehicles"]
+    ratio_of = {
+        (row["scheme"], one["vehicle"]): row["flight_time_ratio"]
+        for one in told
+        for row in one["schemes"]
+    }
+    rows = {
+        scheme: PaperRow(labels=(scheme,), cells=tuple(
+            PaperCell(
+                value=math.nan if (ratio := ratio_of[scheme, name]) is None else float(ratio),
+                paper=printed("fig15", "time_ratio", scheme, name),
+            )
+            for name in (column.title for column in item.columns)
+        ))
+        for scheme, _ in ratio_of
+    }  # fmt: skip
+    table = item.table([*rows.values()])
+    times = (
+        f"{x.title} {table.told(rows['tmr'], place, '')}" for place, x in enumerate(table.columns)
+    )
+    return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
+
+
+# Campaigns that are no item's --------------------------------------------------------------------
+
+
+def _settings_table(ledger: Ledger) -> PaperTable:
+    """Success and quality of flight of each setting."""
+    scales = {"flight_time_s": ("time, s", 1.0), "distance_m": ("distance, m", 1.0),
+              "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip
+    assert tuple(scales) == METRICS
+    found = groups(ledger)
+    settings = SettingColumns.of([group.labels for group in found])
+    return PaperTable(
+        name=_SETTINGS,
+        title=f"{ledger.meta('name') or ledger.folder.name}: settings",
+        labels=settings.heads,
+        columns=(
+            PaperColumn(title="success, %", ends=0),
+            *(PaperColumn(title=title) for title, _ in scales.values()),
+        ),
+        rows=tuple(
+            PaperRow(
+                labels=tuple(settings.cells(group.labels, group.name)),
+                cells=(
+                    _success(group),
+                    *(mean_cell(scale * group.successes(name))
+                      for name, (_, scale) in scales.items()),
+                ),
+            )
+            for group in found
+        ),
+        notes=(
+            *settings.told(),
+            "success: golden missions and faults that struck; means: the successful of them",
+        ),
+    )  # fmt: skip
+
+
+def _success(group: Group) -> PaperCell:
+    won = group.succeeded[group.counted]
+    return share_cell(rate(int(won.sum()), len(won)))
+
+
+def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
+    """How much of each item of a reproduction is flown."""
+    over = {number for number, _ in ledger.fates()}
+    rows = []
+    for item in plan.items:
+        if item.preset:
+            numbers = plan.numbers(ledger, item)
+            done = sum(number in over for number in numbers)
+            counts = (float(done), 100.0 * done / len(numbers))
+            cells = tuple(PaperCell(value=value, count=len(numbers)) for value in counts)
+            rows.append(PaperRow(labels=(item.name, item.title), cells=cells))
+    return PaperTable(
+        name="items",
+        title=f"Reproduction on {plan.stack} at scale {plan.scale:g}; n: missions of the item",
+        labels=("item", "what it shows"),
+        columns=(PaperColumn(title="flown", digits=0), PaperColumn(title="%", digits=0)),
+        rows=tuple(rows),
+        notes=("mavfi campaign report FOLDER --item ITEM prints its table",),
+    )
+
+
+def short(table: PaperTable) -> PaperTable:
+    """The table cut to one screen: its first rows, and of settings the first columns."""
+    wide = len(table.columns) if table.name != _SETTINGS else _WIDE
+    left = [column.title.partition(",")[0] for column in table.columns[wide:]]
+    left += [f"{len(table.rows) - _ROWS} more rows"] if len(table.rows) > _ROWS else []
+    if not left:
+        return table
+    return replace(
+        table,
+        columns=table.columns[:wide],
+        rows=tuple(replace(row, cells=row.cells[:wide]) for row in table.rows[:_ROWS]),
+        notes=(f"mavfi campaign report has {', '.join(left)}", *table.notes),
+    )
+
+
+def progress_lines(ledger: Ledger) -> list[str]:
+    """What is done, and the time left at the pace so far."""
+    planned, over = ledger.planned(), ledger.over()
+    errors = sum(ledger.errors_by_cell().values())
+    lines = [f"{ledger.meta('name') or ledger.folder.name}: {over} of {planned} missions"]
+    if errors:
+        lines.append(f"{errors} could not begin; run --retry-errors repeats them")
+    if over < planned:
+        lines.append(_time_left(ledger, planned - over))
+    return lines
+
+
+def _time_left(ledger: Ledger, missing: int) -> str:
+    walls = [wall for portion in ledger.columns(["wall_s"]) for wall in portion[0]]
+    if not walls:
+        return f"{missing} missing; time left: not known before a mission is over"
+    jobs, each_s = len(os.sched_getaffinity(0)), sum(walls) / len(walls)
+    return (
+        f"{missing} missing: about {duration(missing * each_s / jobs)} with {jobs} at a time "
+        f"({each_s:.1f} s each so far)"
+    )

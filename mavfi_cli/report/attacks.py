@@ -1,0 +1,325 @@
+"""Counts, shares and intervals of a campaign, with everything that the numbers depend on."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.analysis.kernel_runs import KERNELS
+from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
+from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.target import KernelTarget
+from mavfi_cli.attack.target import RunOutcome, signal_name
+from mavfi_cli.core.files import write_json, write_text
+from mavfi_cli.report.columns import blocks, csv_text
+from mavfi_cli.stats.clusters import Cluster, clustered_share
+
+SCHEMA = 2
+_OF_EVERY_RUN = (
+    "object offset symbol instruction k site role operand bits before after activation "
+    "not_injected_reason stop_s run_s output_sha256"
+)
+KERNEL_COLUMNS = (
+    "kernel run input outcome signal error relative absolute unit text noticeable "
+    "within_tolerance " + _OF_EVERY_RUN
+).split()
+PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".split()
+_SHOWN = tuple(RunOutcome)
+
+
+def _counts(runs: TargetRuns) -> dict[str, Any]:
+    """The counts of one target; shares are those of the *injected* runs."""
+    records = runs.records
+    return {
+        "outcomes": {
+            outcome.value: _share(
+                runs,
+                [entry["outcome"] == outcome.value for entry in records],
+                of_all=outcome is RunOutcome.NOT_INJECTED,
+            )
+            for outcome in RunOutcome
+        },
+        "crashes": _counted(_crash(entry) for entry in _with(records, RunOutcome.CRASH)),
+        "not_injected": _counted(
+            entry["not_injected_reason"] for entry in records if entry["not_injected_reason"]
+        ),
+        "activation": _counted(entry["activation"]["activation"] for entry in records),
+    }
+
+
+def _share(runs: TargetRuns, hits: Sequence[bool], *, of_all: bool = False) -> dict[str, Any]:
+    """The share of hits in the injected runs, or in all, with its 95 % interval.
+
+    Where windows are sampled, the spread between them widens the interval. A share of nothing is
+    null.
+    """
+    chosen: list[bool] = []
+    windows: list[Cluster | None] = []
+    for run, (hit, entry) in enumerate(zip(hits, runs.records, strict=True)):
+        if of_all or entry["outcome"] != RunOutcome.NOT_INJECTED.value:
+            number = runs.input_of(run)
+            profile = runs.inputs[number].profile
+            window = None if profile is None else profile.window_of(entry)
+            windows.append(window and ((number, window[0]), window[1]))
+            chosen.append(hit)
+    sampled = {
+        (number, stratum): count
+        for number, each in enumerate(runs.inputs)
+        if each.profile is not None
+        for stratum, count in each.profile.sampled.items()
+    }
+    share = clustered_share(chosen, windows, sampled)
+    return {
+        "count": share.count,
+        "of": share.total,
+        "share": None if math.isnan(share.share) else share.share,
+        "wilson95": [share.low, share.high],
+    }
+
+
+def _counted(names: Iterable[str]) -> dict[str, int]:
+    """Count each name, the most frequent first."""
+    counts = Counter(names)
+    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
+
+
+def _with(records: Iterable[Record], outcome: RunOutcome) -> Iterator[Record]:
+    return (entry for entry in records if entry["outcome"] == outcome.value)
+
+
+def _crash(entry: Mapping[str, Any]) -> str:
+    if entry["signal"]:
+        return signal_name(entry["signal"])
+    if "exit_code" in entry:
+        return f"exit {entry['exit_code']}"
+    return str(entry["error"]).partition(":")[0] or "exit"
+
+
+def _count_lines(counts: Mapping[str, Any], indent: str) -> Iterator[str]:
+    for title in ("crashes", "not_injected", "activation"):
+        if counts[title]:
+            parts = ", ".join(f"{name} {count}" for name, count in counts[title].items())
+            yield f"{indent}{title.replace('_', ' ')}: {parts}"
+
+
+# -- kernels
+
+
+def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
+    """Summarise a campaign on kernels as plain values."""
+    return {
+        "schema": SCHEMA,
+        "plan": plan.to_json(campaign[0].target),
+        "sampling": plan.strategy().name,
+        "kernels": [_kernel(runs) for runs in campaign],
+    }
+
+
+def _kernel(runs: TargetRuns) -> dict[str, Any]:
+    target, records = runs.target, runs.records
+    assert isinstance(target, KernelTarget)
+    kernel = catalogue.find(target.kernel)
+    sizes = [entry["magnitude"]["relative"] for entry in _with(records, RunOutcome.SDC)]
+    finite = sorted(size for size in sizes if size is not None)
+    run_s = sum(entry["run_s"] for entry in records)
+    return {
+        "kernel": target.name,
+        "title": kernel.title,
+        "runs": len(records),
+        "scope": runs.context["scope"],
+        "inputs": [_input(runs, number) for number in range(len(runs.inputs))],
+        **_counts(runs),
+        "sdc_relative": {
+            "median": finite[len(finite) // 2] if finite else None,
+            "largest": finite[-1] if finite else None,
+            "incomparable": len(sizes) - len(finite),
+        },
+        "sdc_noticeable": {"tolerance": kernel.tolerance, **_noticeable(runs)},
+        "sdc_parts": _parts(records),
+        "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
+        "prepare_s": runs.prepare_s,
+        "wall_s": runs.wall_s,
+        "injections_per_core_hour": 3600.0 * len(records) / run_s if run_s else None,
+    }
+
+
+def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
+    """One input of a kernel: how much of its run was profiled, and what became of its runs."""
+    records, profile = runs.records_of(number), runs.inputs[number].profile
+    golden = runs.inputs[number].golden
+    length = None if profile is None else profile.instructions
+    return {
+        "population": "moments of one call" if profile is None else profile.in_words(),
+        "complete": None if profile is None else profile.complete,
+        "instructions": None if length is None else length.total,
+        "instructions95": None if length is None else [length.low, _finite(length.high)],
+        "golden": {"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
+        "outcomes": _counted(entry["outcome"] for entry in records),
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _noticeable(runs: TargetRuns) -> dict[str, Any]:
+    """The share of runs with a silent corruption beyond the kernel's own tolerance."""
+    sdc = RunOutcome.SDC.value
+    return _share(
+        runs, [e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in runs.records]
+    )
+
+
+def _parts(records: Sequence[Record]) -> dict[str, Any]:
+    """The parts of silent corruptions: the number of runs that have one, and its size."""
+    found: dict[str, list[float]] = {}
+    for entry in _with(records, RunOutcome.SDC):
+        for name, size in entry["magnitude"]["parts"].items():
+            found.setdefault(name, [])
+            found[name] += [abs(size)] if size else []
+    return {
+        name: {
+            "runs": len(sizes),
+            "median": sorted(sizes)[len(sizes) // 2] if sizes else None,
+            "largest": max(sizes, default=None),
+        }
+        for name, sizes in found.items()
+    }
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """Format the summary: one row a kernel, shares of injected runs with 95 % intervals."""
+    head = ["kernel", "runs", *(outcome.title for outcome in _SHOWN)]
+    rows = [
+        [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
+        for each in summary["kernels"]
+    ]
+    lines = blocks([head, *rows], labels=1)
+    lines.append("")
+    lines.append(
+        f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
+        "95 % Wilson interval,"
+    )
+    lines.append("widened by the spread between windows where windows are sampled")
+    lines.append(f"inputs: {summary['plan']['flight']}; tolerance {summary['plan']['tolerance']:g}")
+    for kernel in summary["kernels"]:
+        lines += _notes(kernel)
+    return "\n".join(lines)
+
+
+def _cell(row: Mapping[str, Any]) -> str:
+    if row["share"] is None:
+        return "-"
+    low, high = (100.0 * edge for edge in row["wilson95"])
+    return f"{100.0 * row['share']:.1f} % ({low:.1f} to {high:.1f})"
+
+
+def _notes(kernel: Mapping[str, Any]) -> list[str]:
+    lines = [f"{kernel['title']}: scope {', '.join(kernel['scope'])}"]
+    lines += [f"  input {n}: {each['population']}" for n, each in enumerate(kernel["inputs"])]
+    lines += _count_lines(kernel, "  ")
+    sdc, noticeable = kernel["sdc_relative"], kernel["sdc_noticeable"]
+    if sdc["median"] is not None:
+        lines.append(
+            f"  SDC, relative size: median {sdc['median']:.2g}, largest {sdc['largest']:.2g}; "
+            f"{sdc['incomparable']} of another shape or not a number"
+        )
+    if kernel["outcomes"][RunOutcome.SDC.value]["count"]:
+        lines.append(f"  SDC beyond {noticeable['tolerance']}: {_cell(noticeable)}")
+    if kernel["sdc_parts"]:
+        parts = ", ".join(
+            f"{name} in {part['runs']}"
+            + (f" (median {part['median']:.2g})" if part["runs"] else "")
+            for name, part in kernel["sdc_parts"].items()
+        )
+        lines.append(f"  SDC by part: {parts}")
+    return lines
+
+
+# -- a program
+
+
+def summarise_program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
+    """Summarise a campaign on one program as plain values, with golden run and all records."""
+    return {
+        "summary": _program(plan, runs),
+        "golden": {
+            "exit_code": runs.golden.exit_code,
+            "cpu_s": runs.golden.cpu_s,
+            "wall_s": runs.golden.wall_s,
+        },
+        "runs": list(runs.records),
+    }
+
+
+def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
+    profile = runs.profile
+    return {
+        **runs.context,
+        "sampling": plan.strategy().name,
+        "seed": plan.seed,
+        "runs": len(runs.records),
+        "executed_in_scope": None if profile is None else profile.executed,
+        "profile_complete": None if profile is None else profile.complete,
+        "windows": None if profile is None else profile.windows,
+        "counted": profile is not None and profile.counted is not None,
+        "not_reached": None if profile is None else profile.not_reached,
+        "profile_s": None if profile is None else profile.cost_s,
+        "golden_wall_s": runs.golden.wall_s,
+        "wall_s": runs.wall_s,
+        **_counts(runs),
+    }
+
+
+def program_table(summary: Mapping[str, Any]) -> str:
+    """Format the summary of a program: one row an outcome."""
+    lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
+    for name, row in summary["outcomes"].items():
+        share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
+        low, high = (100 * edge for edge in row["wilson95"])
+        lines.append(
+            f"{RunOutcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
+        )
+    lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
+    if summary["executed_in_scope"] is not None:
+        lines.append(
+            f"{summary['executed_in_scope']} executed instructions in scope, {_how(summary)}"
+        )
+    return "\n".join([*lines, *_count_lines(summary, "")])
+
+
+def _how(summary: Mapping[str, Any]) -> str:
+    if not summary["counted"]:
+        return f"windows stepped: {summary['windows']}"
+    missed = 100 * summary["not_reached"]
+    return f"counted by callgrind; {missed:.2g} % of the executions are not reached"
+
+
+# -- both
+
+
+def save_runs(
+    folder: Path, told: Mapping[str, Any], campaign: Iterable[TargetRuns], columns: Sequence[str]
+) -> None:
+    """Write kernels.csv, a line a run, and kernels.json, the summary.
+
+    Entries without a value are empty.
+
+    Raises:
+        RecordError: a file cannot be written.
+    """
+    rows = (_cells(entry, columns) for runs in campaign for entry in runs.records)
+    write_text(folder / "kernels.csv", csv_text(rows, columns))
+    write_json(folder / KERNELS, told)
+
+
+def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:
+    flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}
+    if isinstance(entry["magnitude"], Mapping):
+        flat.update(entry["magnitude"])
+    flat["activation"] = entry["activation"]["activation"]
+    flat["bits"] = " ".join(str(bit) for bit in flat.get("bits", ()))
+    return {name: "" if flat.get(name) is None else str(flat[name]) for name in columns}

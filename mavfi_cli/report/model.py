@@ -1,0 +1,555 @@
+"""The performance model and its flights as text, CSV and pictures; every number with its unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
+from mavfi_cli.report.columns import columns, csv_text, wrapped
+from mavfi_cli.report.drawing import INK, NOTE, SCHEMES, new_figure, open_frame
+from mavfi_cli.vpm.report import RATIOS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def model_lines(told: Mapping[str, Any]) -> list[str]:
+    """The lines that are printed: the model's, and below them those of its flights, if any."""
+    lines = [
+        f"Model {told['model']}; knee: where velocity is "
+        f"{100 * told['knee_velocity_over_roof_ratio']:g} % of the roof",
+        f"Flights of {told['distance_m']:g} m at the safe velocity and hovering power; ratios "
+        f"are over {told['ratios_over']}",
+    ]
+    lines += [f"Note: {note}" for note in told["notes"]]
+    for one in told["vehicles"]:
+        lines += ["", *_vehicle(one, told["ratios_over"])]
+    return [*lines, *(_flight_lines(told["flights"]) if "flights" in told else [])]
+
+
+def model_csv(told: Mapping[str, Any]) -> str:
+    """CSV text, one row per vehicle and scheme; the header names the units."""
+    return csv_text(
+        {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
+        for one in told["vehicles"]
+        for row in one["schemes"]
+    )
+
+
+def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
+    title = f": {one['description']}" if one["description"] else ""
+    yield f"== {one['vehicle']}{title}; board {one['board']} =="
+    yield from (f"Note: {note}" for note in one["notes"])
+    flying = [row for row in one["schemes"] if row["problem"] is None]
+    yield from columns([
+        ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
+        *([row["scheme"], f"{row['boards']}", f"{row['compute_kg']:.3f} kg",
+           f"{row['mass_kg']:.3f} kg", f"{row['thrust_to_weight']:.2f} N/N",
+           f"{row['acceleration_mps2']:.2f} m/s²", f"{row['roof_mps']:.2f} m/s",
+           f"{row['knee_hz']:.1f} Hz"]
+          for row in flying),
+    ])  # fmt: skip
+    yield ""
+    yield from columns([
+        ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
+         "compute ceiling"],
+        *([row["scheme"], f"{row['overhead_percent']:.4g} %", f"{row['throughput_hz']:.3f} Hz",
+           f"{row['velocity_mps']:.3f} m/s", row["bound"], f"{row['sensor_ceiling_mps']:.2f} m/s",
+           f"{row['compute_ceiling_mps']:.2f} m/s"]
+          for row in flying),
+    ])  # fmt: skip
+    yield ""
+    yield from columns([
+        [f"over {over}", "velocity", "time", "energy", "missions", "flight time", "power",
+         "energy", "a charge"],
+        *([row["scheme"], *(f"x {row[name]:.4f}" for name in RATIOS),
+           f"{row['flight_time_s']:.1f} s", f"{row['power_w']:.1f} W",
+           f"{row['energy_j'] / 1000:.2f} kJ", f"{row['missions']:.1f} missions"]
+          for row in flying),
+    ])  # fmt: skip
+    for row in one["schemes"]:
+        if row["problem"] is not None:
+            yield f"{row['scheme']}: {row['problem']}"
+    yield from _sensitivity(one["sensitivity"])
+    yield from _calibrations(one["calibrations"])
+    yield from _sources(one)
+
+
+def _sensitivity(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    yield ""
+    yield "Sensitivity: velocity with detection and recovery; flight time with TMR over it"
+    for row in rows:
+        slopes = [row["velocity_elasticity_ratio"], row["tmr_time_elasticity_ratio"]]
+        told = ["-" if slope is None else f"{slope:+.3f} %" for slope in slopes]
+        yield (
+            f"  {row['parameter']} {row['value']:.4g} {row['unit']}; 1 % more: velocity {told[0]}, "
+            f"TMR's time ratio {told[1]}"
+        )
+        yield from columns(_point(point, row["unit"]) for point in row["points"])
+
+
+def _point(point: Mapping[str, Any], unit: str) -> list[str]:
+    velocity, ratio = point["velocity_mps"], point["tmr_flight_time_ratio"]
+    return [
+        f"    {point['value']:.4g} {unit}",
+        "cannot lift it" if velocity is None else f"{velocity:.3f} m/s",
+        "TMR cannot be lifted" if ratio is None else f"x {ratio:.4f}",
+    ]
+
+
+def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    if not rows:
+        return
+    yield ""
+    yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
+    yield from columns([
+        ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
+        *([f"  {row['board']}", f"{1000 * row['board_kg']:.0f} g",
+           f"{row['parameter']} = {row['value']:.4g} {row['unit']}", f"x {row['tmr_ratio']:.4f}",
+           f"x {row['published_tmr_ratio']:g}", f"x {row['predicted_dmr_ratio']:.4f}"]
+          for row in rows),
+    ])  # fmt: skip
+
+
+def _sources(one: Mapping[str, Any]) -> Iterator[str]:
+    yield ""
+    rows = [["number", "value", "source"]]
+    rows += [
+        [row["parameter"], f"{row['value']:.5g} {row['unit']}", row["source"]]
+        for row in one["parameters"]
+    ]
+    rows += [
+        [f"scheme {row['scheme']}", f"{row['overhead_percent']:.4g} %", row["source"]]
+        for row in one["schemes"]
+    ]
+    yield from wrapped(rows)
+
+
+# Beside flights -----------------------------------------------------------------------------------
+
+_MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
+_NUMBERS = (
+    # heading, name, unit in the key, unit as printed, factor, digits
+    ("Mean velocity against the model's safe velocity", "velocity", "_mps", "m/s", 1.0, 2),
+    ("Top velocity against it", "top_velocity", "_mps", "m/s", 1.0, 2),
+    ("Flight time", "flight_time", "_s", "s", 1.0, 1),
+    ("Energy of rotors and boards", "energy", "_j", "kJ", 1.0e-3, 2),
+    ("Response time, median", "response", "_s", "s", 1.0, 3),
+)
+_HEAD = ["scheme", "model", "flight", "", "flight against model"]
+_RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
+
+
+def _flight_lines(flights: Mapping[str, Any]) -> list[str]:
+    lines = [
+        "",
+        f"Flights in {', '.join(flights['worlds'])}: {flights['missions_each']} missions a scheme "
+        f"and world, seeds from {flights['first_seed']}, stack {flights['stack']}",
+        "Numbers are of successful flights, (low to high) are 95 % intervals over missions",
+        f"Detectors: {flights['detectors']}",
+    ]
+    for one in flights["vehicles"]:
+        lines += ["", *_flown(one, flights)]
+    lines += ["", *_overheads(flights["overheads"]), "", "What the flights do not scale:"]
+    return [*lines, *wrapped(["", text] for text in flights["not_scaled"])]
+
+
+def redundancy_csv(flights: Mapping[str, Any]) -> str:
+    """CSV text, one row per vehicle and scheme; the header names the units."""
+    rows = [
+        {
+            "vehicle": one["vehicle"],
+            "board": one["board"],
+            **{
+                key: "; ".join(value) if isinstance(value, list) else value
+                for key, value in row.items()
+                if key != "outcomes"
+            },
+        }
+        for one in flights["vehicles"]
+        for row in one["schemes"]
+    ]
+    return csv_text(rows)
+
+
+def _flown(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
+    yield f"== {one['vehicle']} flown, board {one['board']} =="
+    rows = [row for row in one["schemes"] if row["problem"] is None]
+    yield from columns([
+        ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
+        *([row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
+           f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
+           _success(row), ", ".join(f"{count} {name}" for name, count in row["outcomes"].items())]
+          for row in rows),
+    ])  # fmt: skip
+    for heading, name, key, unit, factor, digits in _NUMBERS:
+        yield ""
+        yield f"{heading}:"
+        told = (_beside(row, name, key, unit, factor, digits) for row in rows)
+        yield from columns([_HEAD, *told])
+    yield ""
+    yield "Why flights take longer than the model says:"
+    yield from columns([["scheme", "path", "pace", "replans", "alarms"], *(_why(r) for r in rows)])
+    over, paper = flights["ratios_over"], flights["paper_ratios_over"]
+    for name, title, suffix in (
+        *((name, f"{title} over {over}", "") for name, title in _RATIOS),
+        ("flight_time", f"Flight time over {paper}, as the paper's Fig. 15", f"_over_{paper}"),
+    ):
+        yield ""
+        yield f"{title}:"
+        told = (_ratio(row, name, suffix) for row in rows if f"pairs{suffix}" in row)
+        yield from columns([_HEAD, *told])
+    for row in one["schemes"]:
+        yield from _remarks(row)
+
+
+def _success(row: Mapping[str, Any]) -> str:
+    return (
+        f"{row['success_percent']:.0f} % ({row['success_low_percent']:.0f} to "
+        f"{row['success_high_percent']:.0f} %)"
+    )
+
+
+def _beside(
+    row: Mapping[str, Any], name: str, key: str, unit: str, factor: float, digits: int
+) -> list[str]:
+    model, flight, low, high = (
+        factor * row[f"{which}{key}"]
+        for which in (f"model_{name}", f"flight_{name}", f"flight_{name}_low",
+                      f"flight_{name}_high")
+    )  # fmt: skip
+    return [
+        row["scheme"],
+        _known(f"{model:.{digits}f} {unit}", model),
+        _known(f"{flight:.{digits}f} {unit}", flight),
+        _known(f"({low:.{digits}f} to {high:.{digits}f} {unit})", low, ""),
+        _known(f"{row[f'{name}_difference_percent']:+.1f} %", flight),
+    ]
+
+
+def _why(row: Mapping[str, Any]) -> list[str]:
+    pace = row["model_velocity_mps"] / row["flight_velocity_mps"]
+    alarms = row["flight_alarms"]
+    return [
+        row["scheme"],
+        _known(f"x {row['flight_path_ratio']:.3f} longer", row["flight_path_ratio"]),
+        _known(f"x {pace:.3f} slower", pace),
+        _known(f"{row['flight_replans']:.1f} a flight", row["flight_replans"]),
+        "no detector" if alarms != alarms else f"{alarms:.1f} a flight",
+    ]
+
+
+def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
+    key = f"{name}{suffix}"
+    flight, low, high = (row[f"flight_{key}{end}_ratio"] for end in ("", "_low", "_high"))
+    ends = _known(f"x {low:.4f} to x {high:.4f}, ", low, "")
+    return [
+        row["scheme"],
+        f"x {row[f'model_{key}_ratio']:.4f}",
+        _known(f"x {flight:.4f}", flight),
+        f"({ends}{row[f'pairs{suffix}']} pairs)",
+        _known(f"{row[f'{key}_ratio_difference_percent']:+.1f} %", flight),
+    ]
+
+
+def _known(text: str, value: float, otherwise: str = "-") -> str:
+    """The text of a value, if it has one: without successful flights there is none."""
+    return otherwise if math.isnan(value) else text
+
+
+def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
+    if row["problem"] is not None:
+        yield f"{row['scheme']}: not flown: {row['problem']}"
+        return
+    if row["overhead_percent"]:
+        yield (
+            f"{row['scheme']}: an overhead of {row['overhead_percent']:.4g} % in its flights and "
+            "in the model beside them"
+        )
+    if row["flight_alarms"] >= _MANY_ALARMS:
+        yield (
+            f"{row['scheme']}: {row['flight_alarms']:.0f} alarms in a flight without a fault: its "
+            "model was fitted to other flights; --train fits one to these"
+        )
+    if row["cut"]:
+        yield f"{row['scheme']}: flown with {', '.join(row['cut'])}"
+    if row["errors"]:
+        many = len(row["errors"])
+        yield f"{row['scheme']}: {many} could not begin, the first: {row['errors'][0]}"
+
+
+def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    if not rows:
+        yield "Overhead of detection and recovery: no flight with a detector"
+        return
+    yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
+    yield from columns([
+        ["detector", "measured", "of it checks", "paper", "recomputations",
+         "checks of this host's kernel time"],
+        *([row["detector"], f"{row['measured_percent']:.4g} %", f"{row['checks_percent']:.4g} %",
+           f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights",
+           f"{row['checks_of_host_kernels_percent']:.4g} %"]
+          for row in rows),
+    ])  # fmt: skip
+    yield f"({HOST_CHECKS})"
+
+
+# Pictures -----------------------------------------------------------------------------------------
+
+# Roofline: safe velocity against action throughput -----------------------------------------------
+
+_OF_COPIES = {1: "none", 2: "dmr", 3: "tmr"}
+_MOST_HZ = 1000.0
+_LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
+
+
+def draw_roofline_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with throughput in Hz and velocity in m/s on logarithmic axes."""
+    vehicles = report["vehicles"]
+    figure = new_figure(max(6.4, 4.9 * len(vehicles)), 4.9)
+    panels = figure.subplots(1, len(vehicles), squeeze=False, sharey=True)[0]
+    for axes, one in zip(panels, vehicles, strict=True):
+        _roofline_panel(axes, one, report["knee_velocity_over_roof_ratio"])
+    panels[0].set_ylabel("safe velocity, m/s")
+    panels[0].set_ylim(top=1.25 * max(row["roof_mps"] or 0.0 for one in vehicles
+                                      for row in one["schemes"]))  # fmt: skip
+    handles: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        handles.values(), handles, loc="outside upper center", ncols=4, frameon=False, fontsize=8
+    )
+    share = 100.0 * report["knee_velocity_over_roof_ratio"]
+    figure.supxlabel(
+        f"action throughput, Hz\n{report['model']}; knee: {share:g} % of the roof", fontsize=9
+    )
+    return figure
+
+
+def _roofline_panel(axes: Axes, one: Mapping[str, Any], share: float) -> None:
+    flying = {row["boards"]: row for row in reversed(one["schemes"]) if row["problem"] is None}
+    for copies in sorted(flying):
+        row, colour = flying[copies], SCHEMES[_OF_COPIES[copies]]
+        curve = one["curves"]["velocity_mps"][str(copies)]
+        axes.plot(
+            one["curves"]["throughput_hz"], curve, color=colour, linewidth=1.8,
+            label=_LABELS[copies],
+        )  # fmt: skip
+        axes.axhline(row["roof_mps"], color=colour, linewidth=0.8, linestyle=(0, (5, 3)))
+        axes.plot(
+            row["knee_hz"], share * row["roof_mps"], marker="D", markersize=5,
+            color=colour, markeredgecolor=INK, linestyle="none", markeredgewidth=0.6,
+        )  # fmt: skip
+        axes.plot(
+            row["throughput_hz"], row["velocity_mps"], marker="o", markersize=7, color=colour,
+            markeredgecolor=INK, linestyle="none",
+        )  # fmt: skip
+    axes.plot([], [], "D", color="white", markeredgecolor=INK, markersize=5, label="knee")
+    axes.plot([], [], "o", color="white", markeredgecolor=INK, markersize=7, label="flies here")
+    axes.plot([], [], color=NOTE, linewidth=0.8, linestyle=(0, (5, 3)), label="roof")
+    axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="ceiling of one board")
+    _ceilings(axes, one, flying[1])
+    _log_axes(axes, one)
+
+
+def _ceilings(axes: Axes, one: Mapping[str, Any], row: Mapping[str, Any]) -> None:
+    """Draw the ceilings that the rates of sensor and computer set for one board."""
+    sensor_hz = next(p["value"] for p in one["parameters"] if p["parameter"] == "sensor_hz")
+    label = [f"one board\nroof {row['roof_mps']:.2f} m/s, knee {row['knee_hz']:.1f} Hz"]
+    for name, at_hz, ceiling in (
+        ("sensor", sensor_hz, row["sensor_ceiling_mps"]),
+        ("compute", row["compute_hz"], row["compute_ceiling_mps"]),
+    ):
+        if at_hz < row["knee_hz"]:
+            axes.hlines(ceiling, at_hz, _MOST_HZ, color=INK, linewidth=1.0, linestyle=":")
+            label.append(f"{name} ceiling {ceiling:.2f} m/s at {at_hz:.3g} Hz")
+    axes.text(
+        0.98, 0.04, "\n".join(label), transform=axes.transAxes, ha="right", va="bottom",
+        fontsize=8, color=NOTE,
+    )  # fmt: skip
+
+
+def _log_axes(axes: Axes, one: Mapping[str, Any]) -> None:
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlim(one["curves"]["throughput_hz"][0], _MOST_HZ)
+    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="#e6e9ee", linewidth=0.6)
+    open_frame(axes)
+    tmr = next((row for row in one["schemes"] if row["boards"] == 3), None)
+    heavy = "; TMR cannot be lifted" if tmr is not None and tmr["problem"] else ""
+    bound = next(row["bound"] for row in one["schemes"] if row["boards"] == 1)
+    axes.set_title(
+        f"{one['vehicle']}, board {one['board']}: {bound} bound{heavy}", fontsize=9.5, color=INK
+    )
+
+
+# Cost of redundancy: flight time and energy over detection and recovery ---------------------------
+
+_QUANTITIES = (("flight_time_ratio", "flight time"), ("energy_ratio", "energy"))
+_COST_WIDTH = 0.15
+
+
+def draw_redundancy_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with a panel per vehicle, a bar per scheme and ratios to the reference."""
+    vehicles = report["vehicles"]
+    figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
+    panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
+    for axes, one in zip(panels, vehicles, strict=True):
+        _cost_panel(axes, one)
+    panels[0].set_ylabel("times that with detection (autoencoder)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8
+    )
+    figure.supxlabel(_cost_caption(report), fontsize=7.5, color=NOTE)
+    return figure
+
+
+def _cost_panel(axes: Axes, one: Mapping[str, Any]) -> None:
+    rows = one["schemes"]
+    highest = max(row[key] or 0.0 for row in rows for key, _ in _QUANTITIES)
+    for number, row in enumerate(rows):
+        places = [k + (number - (len(rows) - 1) / 2) * _COST_WIDTH for k in range(len(_QUANTITIES))]
+        heights = [row[key] for key, _ in _QUANTITIES]
+        axes.bar(
+            places, [height or 0.0 for height in heights], width=0.92 * _COST_WIDTH,
+            color=SCHEMES[row["scheme"]], label=row["title"],
+        )  # fmt: skip
+        for place, height in zip(places, heights, strict=True):
+            axes.annotate(
+                "cannot be lifted" if height is None else f"{height:.2f}", (place, height or 0.0),
+                xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=7.5,
+                color=INK, rotation=90.0 if height is None else 0.0,
+            )  # fmt: skip
+    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))
+    axes.set_xticks(range(len(_QUANTITIES)), [title for _, title in _QUANTITIES])
+    axes.set_ylim(0.0, 1.12 * highest)
+    open_frame(axes)
+    axes.set_title(f"{one['vehicle']}, board {one['board']}", fontsize=9.5, color=INK)
+
+
+def _cost_caption(report: Mapping[str, Any]) -> str:
+    """Return the caption, which lists the calibrated numbers and their sources."""
+    lines = [f"{report['model']}; flights of {report['distance_m']:g} m at the safe velocity"]
+    for one in report["vehicles"]:
+        if any(row["calibrated"] for row in one["parameters"]):
+            found = one["calibrations"][0]
+            lines.append(
+                f"{one['vehicle']}: {found['parameter']} = {found['value']:.4g} {found['unit']} is "
+                f"calibrated on the paper's TMR flight time x {found['published_tmr_ratio']:g}"
+            )
+    return "\n".join(lines)
+
+
+# Model against flight: velocity, flight time and energy of every scheme ---------------------------
+
+_FLOWN_RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("energy", "energy"))
+_STEP = 0.17
+
+
+def draw_flight_plot(report: Mapping[str, Any]) -> Figure:
+    """Draw a figure with a row per vehicle: velocities left, ratios to the reference right.
+
+    A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
+    """
+    flights = report["flights"]
+    vehicles = flights["vehicles"]
+    figure = new_figure(9.6, 1.0 + 3.1 * len(vehicles))
+    panels = figure.subplots(
+        len(vehicles), 2, squeeze=False, gridspec_kw={"width_ratios": (1.0, 1.7)}
+    )
+    for (left, right), one in zip(panels, vehicles, strict=True):
+        _velocities(left, one)
+        _ratios(right, one, flights["ratios_over"])
+    handles = [
+        panels[0][0].bar(0, 0, color=SCHEMES[row["scheme"]], label=row["title"])
+        for row in vehicles[0]["schemes"]
+    ]
+    handles += panels[0][0].plot([], [], "D", color="white", markeredgecolor=INK, markersize=5,
+                                 label="model")  # fmt: skip
+    handles += panels[0][0].plot([], [], "_", color=INK, markersize=9, label="top of a flight")
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    figure.supxlabel(
+        f"bars: means of successful flights in {', '.join(flights['worlds'])}, "
+        f"{flights['missions_each']} missions each; whiskers: 95 % intervals over missions; "
+        "ratios: over the same missions",
+        fontsize=7.5, color=NOTE,
+    )  # fmt: skip
+    return figure
+
+
+def _velocities(axes: Axes, one: Mapping[str, Any]) -> None:
+    highest = 0.0
+    for place, row in enumerate(one["schemes"]):
+        if row["problem"] is not None:
+            _not_flown(axes, place)
+            continue
+        _bar(axes, place, 0.7, row, "velocity", "_mps")
+        model, top = row["model_velocity_mps"], row["flight_top_velocity_mps"]
+        axes.plot(place, top, "_", color=INK, markersize=12)
+        highest = max(highest, model, 0.0 if math.isnan(top) else top)
+        axes.annotate(
+            _success_of(row), (place, 0.0), xytext=(0, 3), textcoords="offset points", ha="center",
+            va="bottom", fontsize=7, color=INK, rotation=90.0,
+        )  # fmt: skip
+    axes.set_xticks(range(len(one["schemes"])), [row["scheme"] for row in one["schemes"]])
+    axes.set_ylim(0.0, 1.12 * highest or 1.0)
+    axes.set_ylabel("mean velocity, m/s", fontsize=8.5)
+    axes.tick_params(labelsize=8)
+    open_frame(axes)
+    axes.set_title(f"{one['vehicle']}, board {one['board']}", fontsize=9.5, color=INK)
+
+
+def _success_of(row: Mapping[str, Any]) -> str:
+    return f"{row['success_percent']:.0f} % of {row['missions']} succeed"
+
+
+def _ratios(axes: Axes, one: Mapping[str, Any], reference: str) -> None:
+    rows = one["schemes"]
+    for number, row in enumerate(rows):
+        for place, (name, _) in enumerate(_FLOWN_RATIOS):
+            at = place + (number - (len(rows) - 1) / 2) * _STEP
+            if f"model_{name}_ratio" in row:
+                _bar(axes, at, 0.9 * _STEP, row, name, "_ratio")
+            else:
+                _not_flown(axes, at)
+    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))
+    axes.set_xticks(range(len(_FLOWN_RATIOS)), [title for _, title in _FLOWN_RATIOS])
+    axes.set_ylabel(f"times that with {reference}", fontsize=8.5)
+    axes.set_ylim(bottom=0.0)
+    axes.tick_params(labelsize=8)
+    open_frame(axes)
+    axes.set_title(f"{one['vehicle']}: ratios, model and flight", fontsize=9.5, color=INK)
+
+
+def _bar(
+    axes: Axes, place: float, width: float, row: Mapping[str, Any], name: str, unit: str
+) -> None:
+    flight, low, high = (row[f"flight_{name}{end}{unit}"] for end in ("", "_low", "_high"))
+    if not math.isnan(flight):
+        axes.bar(place, flight, width=width, color=SCHEMES[row["scheme"]])
+        if not (math.isnan(low) or math.isnan(high)):
+            axes.errorbar(
+                place, flight, yerr=[[max(0.0, flight - low)], [max(0.0, high - flight)]],
+                fmt="none", ecolor=NOTE, elinewidth=1.0, capsize=2.0,
+            )  # fmt: skip
+    axes.plot(
+        place, row[f"model_{name}{unit}"], "D", color="white", markeredgecolor=INK, markersize=5
+    )
+
+
+def _not_flown(axes: Axes, place: float) -> None:
+    axes.annotate(
+        "not flown", (place, 0.0), xytext=(0, 3), textcoords="offset points", ha="center",
+        va="bottom", fontsize=7, color=NOTE, rotation=90.0,
+    )  # fmt: skip

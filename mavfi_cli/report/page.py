@@ -1,0 +1,268 @@
+"""The page: fills the template. Numbers become words, and charts their places.
+
+Charts are SVG by matplotlib, small enough for a phone, each with its data as CSV. The SVG stands in
+the page itself, so it takes font and colours from the page: light, dark, print. No library of
+interactive charts: plotly alone is 5 MB in each page, and a page without script has nothing that
+can fail.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavfi_cli.campaigns.specification_file import to_toml
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import require_output
+from mavfi_cli.report.columns import csv_text
+from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, svg
+from mavfi_cli.report.paper import (
+    DETECTOR_TITLES,
+    PALETTE,
+    SMALLEST,
+    as_csv,
+    cells_of,
+    count_of,
+    print_axes,
+    print_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FOLDER = Path(__file__).parent
+_LIBRARIES = ("jinja2", "scipy")  # of the extra `report`
+_NONE = "\N{EN DASH}"
+
+
+def require_page(path: Path) -> None:
+    """Check what a page needs before its numbers are computed.
+
+    Raises:
+        MavfiError: a library of the extra `report` is not installed. Says how to install it.
+        RecordError: the page's folder does not exist.
+    """
+    lacking = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    if lacking:
+        raise MavfiError(
+            f"the report needs {' and '.join(lacking)}; install with: pip install 'mavfi[report]'"
+        )
+    require_output(path)
+
+
+def render(told: Mapping[str, Any]) -> str:
+    """The page as one HTML text; equal values give equal pages.
+
+    Args:
+        told: `mavfi_cli.paper.document.document`.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_unbroken,
+    )  # fmt: skip
+    environment.filters |= FILTERS
+    style = (_FOLDER / "page.css").read_text(encoding="utf-8")
+    return environment.get_template("page.html").render(**told, style=style, charts=_charts(told))
+
+
+def _unbroken(value: Any) -> Any:
+    """A number stays in one line with its sign of per cent."""
+    plain_text = isinstance(value, str) and not hasattr(value, "__html__")
+    return value.replace(" %", "\N{NARROW NO-BREAK SPACE}%") if plain_text else value
+
+
+# Charts -------------------------------------------------------------------------------------------
+
+_LOST = "#b2182b"
+_THEME = {INK: "var(--ink)", NOTE: "var(--note)", GRID: "var(--rule)", "#ffffff": "none",
+          PALETTE[0]: "var(--deep)"}  # fmt: skip
+_OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not unique in a page
+_FONT = re.compile(r"font: (?:[a-z0-9]+ )*?([0-9.]+px)[^;\"]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chart:
+    """A picture in the page.
+
+    Attributes:
+        name: of its CSV file, without suffix.
+        title: what it shows, in words, also for those who cannot see it.
+        csv: its numbers.
+    """
+
+    name: str
+    title: str
+    figure: Figure
+    csv: str
+
+    @property
+    def markup(self) -> str:
+        """An SVG element in the page's font and colours."""
+        text = svg(self.figure)
+        markup = _OWN_ID.sub("", text[text.index("<svg") :])
+        markup = _FONT.sub(r"font-size: \1", markup)
+        for colour, variable in _THEME.items():
+            markup = markup.replace(colour, variable)
+        return markup.strip()
+
+
+def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
+    stacks = told["stacks"]
+    return {
+        "items": {
+            (each.item.name, part.stack): _item_chart(each.item, part)
+            for each in told["items"]
+            for part in each.shown
+            if part.figure is not None
+        },
+        "states": [
+            _Chart(
+                name=f"states-{stack}",
+                title=f"Faults in states, {stack}",
+                figure=each["figure"],
+                csv=csv_text(each["rows"]),
+            )
+            for stack, each in told["spreads"].items()
+            if each
+        ],
+        "arms": [_arm_chart(each["campaign"], each["arms"]) for each in told["arms"]],
+        "flows": [_flow_chart(s, told["flows"][s]) for s in stacks if told["flows"][s]],
+    }
+
+
+def _item_chart(item: Any, shown: Any) -> _Chart:
+    name = f"{item.name}-{shown.stack}".replace(" ", "-")
+    return _Chart(
+        name=f"{name}-flights" if shown.flights else name,
+        title=f"{item.paper}, {shown.stack}",
+        figure=shown.figure,
+        csv=csv_text(shown.flights) if shown.flights else as_csv(shown.table),
+    )
+
+
+def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
+    """Lost missions of each arm with their intervals."""
+    figure = print_figure("one", 0.6 + 0.17 * len(arms))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, arm in enumerate(arms):
+        telling = arm.corrected_p is not None and arm.corrected_p < 0.05
+        colour = _LOST if arm.corrected_p is None else DETECTORS["gad"] if telling else NONE
+        axes.hlines(place, 100 * arm.lost.low, 100 * arm.lost.high, color=colour, linewidth=1.4)
+        axes.plot(100 * arm.lost.share, place, "o", color=colour, markersize=4)
+    axes.set_yticks(range(len(arms)), [each.name for each in arms], fontsize=SMALLEST)
+    axes.set_ylim(len(arms) - 0.4, -0.6)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
+    rows = [
+        {"arm": each.name, "lost": each.lost.count, "of": each.lost.total, "low": each.lost.low,
+         "high": each.lost.high, "p": "" if each.corrected_p is None else each.corrected_p}
+        for each in arms
+    ]  # fmt: skip
+    title = f"Lost missions of each arm of {campaign}"
+    return _Chart(name=f"arms-{campaign}", title=title, figure=figure, csv=csv_text(rows))
+
+
+_FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
+          "crashed": "#e4572e", "hung": "#f2b134"}  # fmt: skip
+
+
+def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
+    """What struck kernels did, a bar a kernel."""
+    figure = print_figure("one", 0.9 + 0.26 * len(flows))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, flow in enumerate(flows):
+        total, left = sum(each.total for each in flow.fates.values()), 0.0
+        for fate, share in flow.fates.items():
+            part = 100.0 * share.total / total
+            label = fate.value if not place else None
+            axes.barh(place, part, left=left, height=0.66, color=_FATES[fate.value], label=label)
+            left += part
+    names = [each.kernel.replace("_", " ") for each in flows]
+    axes.set_yticks(range(len(flows)), names, fontsize=SMALLEST)
+    axes.set_ylim(len(flows) - 0.5, -0.5)
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("share of struck kernels, %", fontsize=SMALLEST)
+    figure.legend(
+        loc="outside upper center", ncols=3, frameon=False, fontsize=SMALLEST, handlelength=1.0,
+        columnspacing=1.0, labelcolor=INK,
+    )  # fmt: skip
+    rows = [
+        {"kernel": each.kernel, "fate": fate.value, "missions": share.total, "lost": share.count}
+        for each in flows for fate, share in each.fates.items()
+    ]  # fmt: skip
+    title = f"What struck kernels did, {stack}"
+    return _Chart(name=f"kernels-{stack}", title=title, figure=figure, csv=csv_text(rows))
+
+
+# Numbers as words ---------------------------------------------------------------------------------
+
+
+def _percent(value: float | None, digits: int = 0, sign: str = "") -> str:
+    """A share of one as per cent."""
+    if value is None or not math.isfinite(value):
+        return _NONE
+    return f"{100 * value:{sign}z.{digits}f} %"
+
+
+def _ends(share: Any, scale: float = 100.0, digits: int = 0) -> str:
+    """The ends of an interval."""
+    return f"{scale * share.low:z.{digits}f} to {scale * share.high:z.{digits}f}"
+
+
+def _effect(found: Any, unit: str) -> str:
+    """An effect with its interval, in per cent or in points of a success rate."""
+    if found is None:
+        return _NONE
+    if unit == "number":
+        return f"{found.value:.2f} ({_ends(found, 1.0, 2)})"
+    largest = max(abs(found.low), abs(found.high))
+    digits = 0 if largest >= 0.1 else 1 if largest >= 0.001 else 4
+    value = f"{100 * found.value:{'+' if unit == 'points' else ''}z.{digits}f}"
+    return f"{value} {'points' if unit == 'points' else '%'} ({_ends(found, digits=digits)})"
+
+
+def _p_value(chance: float | None) -> str:
+    """A p-value."""
+    if chance is None:
+        return _NONE
+    return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
+
+
+def _detector(name: str | None) -> str:
+    """A detector as the page calls it."""
+    return DETECTOR_TITLES.get(name, name) if name else "none"
+
+
+def _hourly(rates: tuple[float, float, float]) -> str:
+    """A rate with its interval, two digits each."""
+    point, low, high = (f"{each:.2g}" for each in rates)
+    return f"{point} ({low} to {high})"
+
+
+def _shade(share: float | None) -> str:
+    """The strength of a cell's colour, from 0 to 100."""
+    return "0" if share is None or not math.isfinite(share) else f"{100 * math.sqrt(share):.0f}"
+
+
+def _link(text: str) -> str:
+    """A link that holds CSV text."""
+    code = base64.b64encode(text.encode()).decode()
+    return f"data:text/csv;charset=utf-8;base64,{code}"
+
+
+FILTERS: Mapping[str, Callable[..., Any]] = {
+    "percent": _percent, "ends": _ends, "effect": _effect, "of": count_of, "p": _p_value,
+    "detector": _detector, "hourly": _hourly, "shade": _shade, "csv": csv_text,
+    "cells": cells_of, "table_csv": as_csv, "link": _link, "toml": to_toml,
+}  # fmt: skip
+"""By the names that page.html uses."""

@@ -1,0 +1,482 @@
+"""The form of the paper's items: tables with our numbers beside the paper's, figures for print."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.report.columns import WIDTH, blocks, csv_text
+from mavfi_cli.report.drawing import GRID, INK, NOTE, new_figure, open_frame
+from mavfi_cli.stats.shares import Share
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Printed = float | str | None  # a number of the paper, its words for it, or nothing
+DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperCell:
+    """A number of ours with its interval and count, and the paper's.
+
+    Attributes:
+        value, low, high: NaN if there are none; a maximum has no interval.
+        count: missions, pairs or runs that it is from.
+        paper: None if the paper prints nothing.
+    """
+
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    count: int = 0
+    paper: Printed = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperColumn:
+    """A column of numbers.
+
+    Attributes:
+        title: with the unit.
+        digits: behind the point.
+        ends: digits of the interval's ends; None means as many.
+        sign: whether positive numbers have a plus.
+    """
+
+    title: str
+    digits: int = 1
+    ends: int | None = None
+    sign: bool = False
+
+    def told(self, value: float, digits: int | None = None) -> str:
+        """A number in the column's form; a dash if there is none."""
+        shape = f"{'+' if self.sign else ''}.{self.digits if digits is None else digits}f"
+        return f"{value:{shape}}" if math.isfinite(value) else "-"
+
+    def printed(self, paper: Printed) -> str:
+        """A number of the paper in its own form."""
+        if isinstance(paper, float):
+            return self.told(paper)
+        return paper or ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperRow:
+    """One row: its labels, and a number for each column."""
+
+    labels: tuple[str, ...]
+    cells: tuple[PaperCell, ...]
+
+    @property
+    def count(self) -> str:
+        """What the row's numbers are from: one count, or the smallest and the largest."""
+        counts = sorted({cell.count for cell in self.cells if not math.isnan(cell.value)})
+        if len(counts) < 2:
+            return str(counts[0]) if counts else "0"
+        return f"{counts[0]} to {counts[-1]}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperTable:
+    """A table of the paper, or the numbers of one of its figures.
+
+    Attributes:
+        name: of the item, such as `table4`.
+        title: the paper's name of it, and what it shows.
+        labels: headings of the rows' labels.
+        notes: a line each.
+        result: the item's result in one line.
+    """
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    columns: tuple[PaperColumn, ...]
+    rows: tuple[PaperRow, ...]
+    notes: tuple[str, ...] = ()
+    result: str = ""
+
+    def printed_in(self, place: int) -> bool:
+        """Whether the paper prints anything in a column."""
+        return any(row.cells[place].paper is not None for row in self.rows)
+
+    def told(self, row: PaperRow, place: int, unit: str = " %") -> str:
+        """Our number in a row and a column, with the paper's in brackets if it prints one."""
+        column, cell = self.columns[place], row.cells[place]
+        paper = column.printed(cell.paper)
+        return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
+
+    def ranked(self, place: int) -> list[PaperRow]:
+        """The rows with a number in a column, the largest first."""
+        rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
+        return sorted(rows, key=lambda row: -row.cells[place].value)
+
+
+def _ours(column: PaperColumn, cell: PaperCell) -> str:
+    value = column.told(cell.value)
+    if math.isnan(cell.low) or math.isnan(cell.high):
+        return value
+    low, high = (column.told(end, column.ends) for end in (cell.low, cell.high))
+    return f"{value} ({low} to {high})"
+
+
+def cells_of(table: PaperTable) -> list[list[str]]:
+    """The table as cells of text, headings first: labels, n, then ours and the paper's."""
+    head = [*table.labels, "n"]
+    for place, column in enumerate(table.columns):
+        head += [column.title, *(["paper"] if table.printed_in(place) else [])]
+    rows = [head]
+    for row in table.rows:
+        cells = [*row.labels, row.count]
+        for place, (column, cell) in enumerate(zip(table.columns, row.cells, strict=True)):
+            cells.append(_ours(column, cell))
+            if table.printed_in(place):
+                cells.append(column.printed(cell.paper))
+        rows.append(cells)
+    return rows
+
+
+def as_text(table: PaperTable) -> str:
+    """Aligned columns; those beyond the width continue below."""
+    lines = [table.title, *_in_pairs(table), *table.notes]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _in_pairs(table: PaperTable) -> list[str]:
+    """The aligned table, in which the paper's number is never cut off from ours."""
+    rows = cells_of(table)
+    labels = len(table.labels)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    together = [1, *(1 + table.printed_in(place) for place in range(len(table.columns)))]
+    joined = []
+    for row in rows:
+        numbers = map(str.rjust, row[labels:], widths[labels:])
+        joined.append([*row[:labels], *("  ".join(islice(numbers, each)) for each in together)])
+    return blocks(joined, labels + 1, WIDTH)
+
+
+def _as_markdown(table: PaperTable) -> str:
+    """A pipe table."""
+    head, *rows = cells_of(table)
+    aligned = ["---"] * len(table.labels) + ["---:"] * (len(head) - len(table.labels))
+    lines = [_piped(row) for row in (head, aligned, *rows)]
+    return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]).rstrip() + "\n"
+
+
+def _piped(row: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"\textless{}", ">": r"\textgreater{}",
+}  # fmt: skip
+
+
+# Sizes of 8 and of 7 points: a character and the gap between two columns of a table are so wide, in
+# points, and so are a column of a printed page and the page.
+_SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsize", 3.9, 4.0))
+_PLACES = (("table", 252.0), ("table*", 516.0))
+
+
+def _as_latex(table: PaperTable) -> str:
+    """A float with a plain tabular, which needs no package.
+
+    It is as wide as a column of two, or as the page, in the largest size that fits.
+    """
+    head, *rows = cells_of(table)
+    form = "l" * len(table.labels) + "r" * (len(head) - len(table.labels))
+    place, size, gap_pt = _latex_place([head, *rows])
+    lines = [
+        rf"\begin{{{place}}}",
+        rf"\caption{{{_latex(table.title)}}}",
+        rf"\label{{tab:{table.name}}}",
+        rf"\centering{size}\setlength{{\tabcolsep}}{{{gap_pt / 2:g}pt}}",
+        rf"\begin{{tabular}}{{{form}}}",
+        r"\hline",
+        _latex_row(head),
+        r"\hline",
+        *map(_latex_row, rows),
+        r"\hline",
+        r"\end{tabular}",
+        *(rf"\par {_latex(note)}" for note in table.notes),
+        rf"\end{{{place}}}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _latex_place(rows: Sequence[Sequence[str]]) -> tuple[str, str, float]:
+    """The narrowest float and the largest size that hold the table, and the gap; else the last."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for place, width_pt in _PLACES:
+        for size, character_pt, gap_pt in _SIZES:
+            if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
+                return place, size, gap_pt
+    return place, size, gap_pt
+
+
+def _latex_row(row: Sequence[str]) -> str:
+    return " & ".join(map(_latex, row)) + r" \\"
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(each, each) for each in text)
+
+
+def as_csv(table: PaperTable) -> str:
+    """One number a line, in full precision."""
+    return csv_text(_long(table))
+
+
+def _long(table: PaperTable) -> Iterator[Mapping[str, object]]:
+    for row in table.rows:
+        for column, cell in zip(table.columns, row.cells, strict=True):
+            yield {
+                "item": table.name,
+                **dict(zip(table.labels, row.labels, strict=True)),
+                "quantity": column.title,
+                **{name: _plain(getattr(cell, name)) for name in ("value", "low", "high")},
+                "n": cell.count,
+                "paper": "" if cell.paper is None else cell.paper,
+            }
+
+
+def count_of(share: Share) -> str:
+    """The counts of a share, such as `3 of 98`."""
+    return f"{share.count:,} of {share.total:,}"
+
+
+def _plain(value: float) -> object:
+    return "" if math.isnan(value) else value
+
+
+FORMATS: Mapping[str, Callable[[PaperTable], str]] = {
+    "text": as_text,
+    "markdown": _as_markdown,
+    "latex": _as_latex,
+    "csv": as_csv,
+}
+
+
+# Figures for print --------------------------------------------------------------------------------
+
+WIDTHS_IN = {"one": 3.5, "two": 7.16}  # columns of an IEEE page
+SMALLEST = 7.0  # points
+PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; no two alike in grey
+MARKERS = ("o", "s", "^", "D")
+_PAPER = {"marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
+          "markeredgewidth": 0.9, "linestyle": "none"}  # fmt: skip
+_TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
+_LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
+_NAME = 36  # characters in a line of a row's name
+
+
+def print_figure(columns: str, height_in: float) -> Figure:
+    """An empty figure as wide as one or two columns of a page."""
+    return new_figure(WIDTHS_IN[columns], height_in)
+
+
+def print_axes(axes: Axes, title: str = "") -> None:
+    """The frame and the text sizes of a panel in print."""
+    axes.tick_params(labelsize=SMALLEST, color=GRID, length=2.5, pad=2)
+    axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    open_frame(axes)
+    if title:
+        axes.set_title(title, fontsize=SMALLEST + 0.5, loc="left", color=INK, pad=3)
+
+
+# A table as dots ---------------------------------------------------------------------------------
+
+
+def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
+    """A panel for each column of a table: ours with its interval, the paper's as a diamond.
+
+    Args:
+        table: at least one row.
+    """
+    shown = [
+        place
+        for place in range(len(table.columns))
+        if any(math.isfinite(row.cells[place].value) for row in table.rows)
+    ] or [0]
+    across = min(len(shown), 4 if columns == "two" else 2)
+    down = math.ceil(len(shown) / across)
+    whole = (", ".join(label for label in row.labels if label) for row in table.rows)
+    names = [textwrap.fill(name, _NAME) for name in whole]
+    row_in = _LINE_IN + _NEXT_LINE_IN * max(name.count("\n") for name in names)
+    height = down * (0.62 + row_in * max(2, len(table.rows)))
+    figure = print_figure(columns, height + 0.25)
+    grid = figure.subplots(down, across, squeeze=False, sharey=True)
+    for panel, place in zip(grid.flat, shown, strict=False):
+        _dots(panel, table, place)
+    for panel in grid.flat[len(shown) :]:
+        panel.set_visible(False)
+    grid[0, 0].set_yticks(range(len(table.rows)), names, fontsize=SMALLEST)
+    grid[0, 0].set_ylim(len(table.rows) - 0.5, -0.5)
+    _explain(figure, any(table.printed_in(place) for place in shown))
+    return figure
+
+
+def _dots(axes: Axes, table: PaperTable, place: int) -> None:
+    print_axes(axes, table.columns[place].title)
+    axes.margins(x=0.08)
+    for y, row in enumerate(table.rows):
+        cell = row.cells[place]
+        if isinstance(cell.paper, float):
+            axes.plot(cell.paper, y, **_PAPER)  # type: ignore[arg-type]
+        if not math.isfinite(cell.value):
+            continue
+        if math.isfinite(cell.low) and math.isfinite(cell.high):
+            axes.hlines(y, cell.low, cell.high, color=PALETTE[0], linewidth=1.2)
+        axes.plot(cell.value, y, "o", color=PALETTE[0], markersize=4)
+
+
+def _explain(figure: Figure, paper: bool) -> None:
+    axes = figure.axes[0]
+    handles = [axes.plot([], [], "o-", color=PALETTE[0], markersize=4, linewidth=1.2,
+                         label="ours, 95 % interval")[0]]  # fmt: skip
+    if paper:
+        handles += axes.plot([], [], label="paper", **_PAPER)  # type: ignore[arg-type]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALLEST
+    )
+
+
+# Flights as distributions ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Strip:
+    """The flights of one row of a panel.
+
+    Attributes:
+        values: one for each flight, (n,).
+        style: place in PALETTE.
+        paper: the paper's largest value; None if it prints none.
+    """
+
+    label: str
+    values: FloatArray
+    style: int = 0
+    paper: float | None = None
+
+
+def draw_strips(
+    panels: Mapping[str, Sequence[Strip]], quantity: str, columns: str = "one"
+) -> Figure:
+    """Each flight as a dot, the middle half of them as a bar, the median, and the paper's largest.
+
+    Args:
+        panels: the rows of each panel from top to bottom, by its title; all have the same labels.
+        quantity: of the horizontal axis, with its unit.
+    """
+    across = min(len(panels), 4 if columns == "two" else 2)
+    down = math.ceil(len(panels) / across)
+    rows = max(map(len, panels.values()))
+    figure = print_figure(columns, down * (0.45 + _LINE_IN * rows) + 0.45)
+    grid = figure.subplots(down, across, squeeze=False, sharey=True, sharex=True)
+    for axes, (title, strips) in zip(grid.flat, panels.items(), strict=False):
+        print_axes(axes, title)
+        for y, strip in enumerate(strips):
+            _strip(axes, y, strip)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    labels = [strip.label for strip in next(iter(panels.values()))]
+    grid[0, 0].set_yticks(range(rows), labels, fontsize=SMALLEST)
+    grid[0, 0].set_ylim(rows - 0.5, -0.5)
+    figure.supxlabel(quantity, fontsize=SMALLEST + 0.5, color=INK)
+    printed = any(strip.paper is not None for strips in panels.values() for strip in strips)
+    _explain_strips(figure, printed)
+    return figure
+
+
+def _strip(axes: Axes, y: int, strip: Strip) -> None:
+    values, colour = strip.values, PALETTE[strip.style]
+    if strip.paper is not None:
+        axes.plot(strip.paper, y, **_PAPER)  # type: ignore[arg-type]
+    if not len(values):
+        axes.text(0.02, y, "no flight", transform=axes.get_yaxis_transform(), va="center",
+                  fontsize=SMALLEST, color=NOTE)  # fmt: skip
+        return
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    axes.hlines(y, low, high, color=INK, linewidth=1.0)
+    axes.vlines(middle, y - 0.3, y + 0.3, color=INK, linewidth=1.0)
+    heights = y + 0.56 * ((0.5 + np.arange(len(values)) * _TURN) % 1.0 - 0.5)
+    axes.plot(
+        values, heights, MARKERS[strip.style], color=colour, markersize=2.6, alpha=0.7,
+        markeredgewidth=0.0,
+    )  # fmt: skip
+    axes.plot(values.max(), y, "|", color=INK, markersize=7, markeredgewidth=1.4)
+
+
+def _explain_strips(figure: Figure, paper: bool) -> None:
+    axes = figure.axes[0]
+    handles = axes.plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
+    if paper:
+        handles += axes.plot([], [], label="paper's longest", **_PAPER)  # type: ignore[arg-type]
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=min(len(handles), 3), frameon=False,
+        fontsize=SMALLEST, columnspacing=1.0, handletextpad=0.3,
+    )  # fmt: skip
+
+
+# Stacked shares ----------------------------------------------------------------------------------
+
+_HATCHES = ("", "////", "....", "")
+
+
+def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
+    """A bar of a hundred per cent for each row, cut into the table's columns."""
+    rows = len(table.rows)
+    figure = print_figure(columns, 0.85 + 1.25 * _LINE_IN * rows)
+    axes = figure.subplots()
+    print_axes(axes)
+    left = np.zeros(rows)
+    for style, column in enumerate(table.columns):
+        shares = np.array([row.cells[style].value for row in table.rows])
+        axes.barh(
+            range(rows), shares, left=left, height=0.7, color=PALETTE[style], edgecolor="white",
+            linewidth=0.4, hatch=_HATCHES[style], label=column.title.removesuffix(", %"),
+        )  # fmt: skip
+        left += shares
+    axes.set_yticks(range(rows), [row.labels[0] for row in table.rows], fontsize=SMALLEST)
+    axes.set_ylim(rows - 0.4, -0.6)
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("share of injected runs, %", fontsize=SMALLEST + 0.5)
+    figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=SMALLEST)
+    return figure
+
+
+# Histograms --------------------------------------------------------------------------------------
+
+
+def draw_histograms(
+    rows: Sequence[tuple[str, FloatArray, FloatArray]], columns: str = "one"
+) -> Figure:
+    """Two histograms for each row on one scale: values, and their deltas."""
+    from matplotlib.ticker import NullFormatter
+
+    figure = print_figure(columns, 0.35 + 0.95 * len(rows))
+    grid = figure.subplots(len(rows), 2, squeeze=False)
+    for (name, *both), panels in zip(rows, grid, strict=True):
+        spans = [float(np.abs(each).max()) if len(each) else 1.0 for each in both]
+        for kind, values, axes in zip(("value", "delta"), both, panels, strict=True):
+            print_axes(axes, f"{name}: {kind}")
+            axes.hist(values, bins=61, range=(-max(spans), max(spans)), color=PALETTE[0])
+            if len(values):
+                axes.set_yscale("log")
+                axes.set_ylim(bottom=0.8)
+            axes.yaxis.set_minor_formatter(NullFormatter())
+    figure.supylabel("control ticks", fontsize=SMALLEST + 0.5)
+    return figure

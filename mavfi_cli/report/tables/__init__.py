@@ -1,1 +1,0 @@
-"""Output of commands: text tables of at most 100 columns, and CSV."""

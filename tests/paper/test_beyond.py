@@ -1,0 +1,126 @@
+"""From kernel to mission, where a bit hurts, failures an hour, and the arms of a campaign."""
+
+import pytest
+from flown import flights, row
+
+from mavfi_cli.paper.beyond import Fate, arms, hourly_failures, kernel_flows, state_map
+
+LOST = {"outcome": "timeout"}
+
+
+def struck_kernel(seed, **how):
+    told = {"struck_kernel": "rrtstar", "instruction": True, "seed": seed, **how}
+    return row("planning", **told)
+
+
+def test_a_struck_kernel_is_told_by_the_flight():
+    rows = [row(seed=seed) for seed in range(1, 7)]
+    rows += [
+        struck_kernel(1, activation="overwritten", injected="not_activated"),
+        struck_kernel(2),
+        struck_kernel(3, time_s=21.0),
+        struck_kernel(4, node_ended="killed by SIGSEGV", **LOST),
+        struck_kernel(5, node_ended="hang"),
+        struck_kernel(6, **LOST),
+    ]
+    (flow,) = kernel_flows(flights(rows), {"rrtstar": (30, 100)})
+    counts = {fate: (each.count, each.total) for fate, each in flow.fates.items()}
+    assert counts == {
+        Fate.UNREAD: (0, 1), Fate.SAME: (0, 1), Fate.CHANGED: (1, 2), Fate.CRASH: (1, 1),
+        Fate.HANG: (0, 1),
+    }  # fmt: skip
+    assert (flow.lost.count, flow.harmed.count) == (2, 2)
+    assert flow.given_silent[0] == pytest.approx((1 / 6) / 0.3)  # one lost without a crash
+
+
+def test_a_quotient_above_1_is_no_probability():
+    rows = [row(seed=1), struck_kernel(1, **LOST)]
+    (flow,) = kernel_flows(flights(rows), {"rrtstar": (1, 100)})
+    assert flow.given_silent is None
+
+
+def test_a_state_is_told_by_its_highest_bit():
+    rows = [row(seed=seed) for seed in (1, 2, 3)]
+    where = {"strike_phase": "flying"}
+    rows += [
+        row("planning", seed=1, struck_state="waypoint_x", struck_bits="62", **where, **LOST),
+        row("waypoint_position", seed=2, struck_state="waypoint_x;waypoint_y", struck_bits="3;63",
+            **where),
+        row("planning", seed=3, struck_state="plan_trajectory_seq", struck_bits="15", **where),
+    ]  # fmt: skip
+    cells = state_map(flights(rows))
+    assert cells.keys() == {
+        ("waypoint_x", "exponent 62 to 57", "flying"),
+        ("waypoint_position", "bit 63, sign", "flying"),
+        ("plan_trajectory_seq", "bits 15 to 8", "flying"),
+    }
+    assert cells["waypoint_x", "exponent 62 to 57", "flying"].lost.count == 1
+
+
+def test_failures_an_hour_follow_the_rate_and_the_detector():
+    rows = [row(seed=seed) for seed in (1, 2)]
+    rows += [row("planning", seed=1, **LOST), row("planning", seed=2)]
+    rows += [row("planning", seed=seed, detector="aad") for seed in (1, 2)]
+    (found,) = hourly_failures(flights(rows), 0.5)
+    assert found.where == "state: planning, sparse"
+    assert found.per_hour[""][0] == pytest.approx(0.25)
+    assert found.per_hour["aad"][0] == 0.0
+
+
+def test_faults_of_other_kinds_are_counted_apart():
+    rows = [row(seed=1), row("time_to_collision", seed=1, fault={"together": True})]
+    rows += [
+        row("waypoint_position", seed=1, fault=how, **LOST)
+        for how in ({}, {"field": "exponent", "together": True}, {"bits": 5})
+    ]
+    found = {each.where: each.lost[""].total for each in hourly_failures(flights(rows), 1.0)}
+    assert found == {
+        "state: waypoint_position, sparse": 1,
+        "state: waypoint_position, exponent, all components, sparse": 1,
+        "state: waypoint_position, 5 bits, sparse": 1,
+        "state: time_to_collision, sparse": 1,
+    }
+
+
+def test_a_detector_of_one_stage_is_not_counted_as_one_of_all_stages():
+    rows = [row(seed=1), row("planning", seed=1, **LOST)]
+    rows.append(row("planning", seed=1, detector="gad"))
+    rows += [row("planning", seed=1, detector="gad", protect=("control",), **LOST)]
+    (found,) = hourly_failures(flights(rows), 1.0)
+    assert (found.lost["gad"].count, found.lost["gad"].total) == (0, 1)
+
+
+def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
+    guard = {"config": {"stack": "mavbench:guards_tracking=true"}}
+    rows = []
+    for seed in range(1, 8):
+        lost = LOST if seed < 7 else {}
+        read = "overwritten" if seed == 6 else "read"
+        rows += [row(seed=seed), row("waypoint_position", seed=seed, activation=read, **lost)]
+        rows += [row("waypoint_position", seed=seed, **guard)]
+    plain, guarded = arms(flights(rows))
+    assert (plain.name, guarded.name) == ("unprotected", "tracking guard")
+    assert (plain.lost.count, plain.lost.total) == (5, 6)
+    assert (guarded.lost.count, guarded.lost.total) == (0, 6)
+    assert guarded.by_site["position"].total == 6
+    assert guarded.p_value == guarded.corrected_p == pytest.approx(2 / 2**5)
+    assert plain.p_value is None
+
+
+def test_variants_of_the_stack_with_all_checks_are_arms_of_their_own():
+    rows = [row("planning", seed=1, **LOST)]
+    for stack in ("mavbench-protected", "mavbench-protected:guards_tracking=true"):
+        lost = LOST if ":" in stack else {}
+        rows.append(row("planning", seed=1, config={"stack": stack}, **lost))
+    found = {arm.name: arm.lost.count for arm in arms(flights(rows))}
+    assert found == {"unprotected": 1, "all four checks": 0, "all four checks, tracking guard": 1}
+
+
+def test_the_unprotected_arm_alone_compares_nothing():
+    rows = [row("planning", seed=1, config={"stack": stack}) for stack in ("mavbench", "hardened")]
+    assert arms(flights(rows)) == []
+
+
+def test_one_stack_has_no_arms():
+    rows = [row(seed=1), row("planning", seed=1), row("planning", seed=1, detector="gad")]
+    assert arms(flights(rows)) == []

@@ -1,0 +1,62 @@
+"""Figures that are drawn from run folders: from a campaign that has kept them."""
+
+from types import SimpleNamespace
+
+import pytest
+from flown import table
+
+from mavfi_cli.campaigns.missions import canonical, changes_of
+from mavfi_cli.paper import document
+from mavfi_cli.paper.flights import flown_missions, pooled
+from mavfi_cli.paper.items import BY_NAME, FlightsPlan
+from mavfi_cli.paper.sources import STACKS
+
+FIG13 = BY_NAME["fig13"]
+KINDS = FlightsPlan(items=[FIG13], stack="mavbench").kinds()
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What is shown of Fig. 13 on `mavbench`, and the run folders that are drawn."""
+    monkeypatch.setattr(document, "ITEMS", [FIG13])
+    monkeypatch.setattr(document, "draw", lambda *given: given[1]["path"].to_pylist())
+
+    def of(*exports):
+        tables = [flown_missions(each) for each in exports]
+        evidence = SimpleNamespace(
+            campaigns=[SimpleNamespace(flights=each) for each in tables], isolated={}
+        )
+        flights = {stack: pooled(tables, stack) for stack in STACKS}
+        shown = document.shown_items(evidence, flights)
+        return next(each for item in shown for each in item.parts if each.stack == "mavbench")
+
+    return of
+
+
+def export(seed, folder=None):
+    """The missions of Fig. 13 with a seed, whose run folders are this one."""
+    rows = []
+    for place, mission in enumerate(KINDS):
+        changes = {**changes_of(mission.config), "seed": seed}
+        level = "instruction" if mission.config.instruction else None
+        rows.append(
+            {"number": place, "pair": str(seed), "stack": "mavbench", "level": level,
+             "world": "dense", "planner": "rrtstar", "platform": "x86", "detector": None,
+             "protect": None, "state": "flown", "outcome": "success", "flight_time_s": 20.0,
+             "fault_target": "planning" if level else None, "fault_field": "any",
+             "fault_bits": 1, "fault_seed": 1, "changes": canonical(changes),
+             "path": None if folder is None else str(folder)}
+        )  # fmt: skip
+    return table(rows)
+
+
+def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):
+    found = shown(export(1), export(2, tmp_path))
+    assert found.figure == [str(tmp_path)] * len(KINDS)
+    assert found.table is not None
+
+
+def test_without_run_folders_there_is_a_table_and_no_picture(shown, tmp_path):
+    found = shown(export(1), export(2, tmp_path / "gone"))
+    assert found.figure is None
+    assert found.table is not None

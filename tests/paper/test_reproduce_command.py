@@ -1,0 +1,148 @@
+"""`mavfi reproduce`, `campaign report` and `campaign status` as a user calls them."""
+
+import csv
+import io
+
+import pytest
+from test_reproductions import TASK, flown, no_vehicle, plan  # noqa: F401
+
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.run import run_campaign
+from mavfi_cli.campaigns.specification_file import load_spec
+from mavfi_cli.paper.flying import Forecast
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The folder of a reproduction of fig9."""
+    asked = plan(tmp_path, "fig9")
+    flown(asked)
+    return asked.folder
+
+
+@pytest.fixture
+def table3(tmp_path, mavfi):
+    """The folder of a campaign of a preset."""
+    missions = load_spec("table3").scaled(0.02).missions()
+    folder = tmp_path / "campaigns/table3"
+    run_campaign(missions, folder, TASK).close()
+    with Ledger(folder, writing=True) as ledger:
+        ledger.set_meta({"name": "table3"})  # as `begin` does
+    return folder
+
+
+def test_a_reproduction_ends_with_a_line_an_item(folder, mavfi):
+    run = mavfi("reproduce", "fig9", "fig15", "--scale", "0.02", "--out", folder.parent)
+    assert (run.returncode, run.stderr) == (0, "8 missions, 8 of them flown\n")
+    title, result, *rest = run.stdout.splitlines()
+    assert title == "Fig. 9: faults in each field of float64"
+    assert "over its own golden one" in result
+    assert rest[0] == "Fig. 15: flight time with redundant computers"
+    assert (
+        rest[1]
+        == "  flight time with TMR: x airsim 1.060 (paper 1.060), x spark 1.910 (paper 1.910)"
+    )
+    assert f"mavfi campaign report {folder} --item ITEM" in run.stdout
+    assert f"mavfi report {folder.parent} -o report.html" in run.stdout
+
+
+def test_one_item_is_shown_whole(tmp_path, mavfi):
+    run = mavfi("reproduce", "fig15", "--out", tmp_path / "new")
+    assert run.returncode == 0
+    assert "tmr" in run.stdout
+    assert "campaign report" not in run.stdout
+    assert not (tmp_path / "new").exists()  # the model flies nothing
+
+
+def test_the_forecast_is_one_line():
+    forecast = Forecast(
+        missions=100, over=10, seconds=3700, disk_bytes=2.5e6, measured=10, jobs=2, runs=7
+    )
+    assert forecast.told == (
+        "100 missions, 10 of them flown; 7 runs of kernels; what is left takes about 1:01:40 h on "
+        "this machine (2 at a time, from 10 missions) and 2 MB"
+    )
+    assert Forecast(missions=8, over=8).told == "8 missions, 8 of them flown"
+
+
+def test_unknown_items_are_usage_errors(mavfi, tmp_path):
+    run = mavfi("reproduce", "tabel4")
+    assert (run.returncode, run.stdout) == (2, "")
+    assert "did you mean 'table4'" in run.stderr
+    run = mavfi("reproduce", "table1")
+    assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
+    assert "is not an experiment" in run.stderr
+    assert mavfi("reproduce", "fig9", "--scale", "0").returncode == 2
+    run = mavfi("reproduce", "fig9", "--stack", "mavbnch", "--out", tmp_path)
+    assert "did you mean 'mavbench'" in run.stderr
+
+
+def test_report_prints_a_table_and_draws_its_figure(folder, mavfi, tmp_path):
+    text = mavfi("campaign", "report", folder, "--item", "fig9").stdout
+    assert text.startswith("Fig. 9: ")
+    told = mavfi("campaign", "report", folder, "--item", "fig9", "--format", "csv").stdout
+    rows = list(csv.DictReader(io.StringIO(told)))
+    assert [row["field"] for row in rows[::3]] == ["golden", "sign", "exponent", "mantissa"]
+    for name in ("a.svg", "b.pdf", "c.png"):
+        run = mavfi("campaign", "report", folder, "--item", "fig9", "--output", tmp_path / name,
+                    "--columns", "two")  # fmt: skip
+        assert (run.stdout, run.stderr) == (text, f"figure: {tmp_path / name}\n")
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_report_and_status_of_a_preset_show_the_papers_table(table3, mavfi):
+    home = table3.parent.parent
+    text = mavfi("campaign", "report", "table3", cwd=home).stdout
+    assert text.startswith("Table III: number of flipped bits\n")
+    assert mavfi("campaign", "report", "table3", "--item", "table3", cwd=home).stdout == text
+    status = mavfi("campaign", "status", "table3", cwd=home).stdout
+    assert status == f"table3: 8 of 8 missions\n\n{text}"
+    assert mavfi("campaign", "report", table3, "--item", "fig9").returncode == 2
+
+
+def test_a_reproduction_tells_its_items(folder, mavfi):
+    text = mavfi("campaign", "status", folder).stdout
+    lines = text.splitlines()
+    assert lines[0] == "mavbench: 8 of 356 missions"
+    assert lines[1].startswith("348 missing: about ")
+    assert len(lines) <= 24
+    (row,) = [line for line in lines if line.startswith("fig9")]
+    assert row.split()[-3:] == ["8", "8", "100"]
+    (row,) = [line for line in lines if line.startswith("table3")]
+    assert row.split()[-3:] == ["8", "2", "25"]
+
+
+def test_full_status_is_still_there(folder, mavfi):
+    whole = mavfi("campaign", "status", folder, "--full").stdout
+    assert "mean replans" in whole
+    quality = mavfi("campaign", "status", folder, "--quality").stdout
+    assert quality.startswith(whole)
+
+
+def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
+    for arguments, told in (
+        (("--item", "fig99"), "unknown item 'fig99'"),
+        (("--item", "fig2"), "is not an experiment"),
+        (("--item", "fig9", "--output", "x.jpg"), "name a file that ends in .svg, .pdf or .png"),
+        (("--item", "fig9", "--output", tmp_path / "no/x.png"), "its folder does not exist"),
+        (("--item", "fig6"), "no runs of kernels"),
+    ):
+        run = mavfi("campaign", "report", folder, *arguments)
+        assert (run.returncode > 0, run.stdout) == (True, "")
+        assert len(run.stderr.splitlines()) == 1
+        assert told in run.stderr
+
+
+def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi):
+    """What all settings share is said once, below the table."""
+    with Ledger(table3, writing=True) as ledger:
+        ledger.set_meta({"name": "mine"})
+    lines = mavfi("campaign", "status", table3).stdout.splitlines()
+    (shared,) = [line for line in lines if "site=waypoint_acceleration" in line]
+    assert shared.startswith("in all settings that have it: ")
+    assert "mavfi campaign report has distance, energy, replans" in lines
+    heads = [line for line in lines if line.startswith("setting")]
+    assert [head.split()[:3] for head in heads] == [["setting", "bits", "n"]]
+    whole = mavfi("campaign", "report", table3).stdout
+    assert whole.count("site=waypoint_acceleration") == 1
+    assert "energy, kJ" in whole

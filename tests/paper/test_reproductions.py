@@ -1,0 +1,159 @@
+"""Reproductions without flights: forecast, resumption after a kill, growth, and bad folders."""
+
+import multiprocessing
+import os
+import shutil
+import signal
+from collections import namedtuple
+
+import pytest
+
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.paper import flying
+from mavfi_cli.paper.items import FlightsPlan, items_named
+from mavfi_cli.paper.status import shown
+from mavfi_cli.spec.mission import MissionConfig
+
+TASK = Options(jobs=2, task="fake_task")
+SCALE = 0.02  # two of each hundred
+
+
+@pytest.fixture(autouse=True)
+def no_vehicle(monkeypatch):
+    """Let nothing start a vehicle, and let the workers find the task that flies nothing."""
+    monkeypatch.setattr(flying, "check_kinds", lambda missions: None)
+    folder = os.path.join(os.path.dirname(__file__), os.pardir, "campaigns")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", folder)
+
+
+def plan(out, *names, scale=SCALE, stack="mavbench"):
+    return FlightsPlan(items=items_named(names), stack=stack, scale=scale, out=out)
+
+
+def flown(asked, options=TASK, spectator=None):
+    """Reproduce; the forecast."""
+    told = []
+    flying.reproduce(asked, options, spectator or Spectator(), told.append)
+    (forecast,) = told
+    return forecast
+
+
+def over(asked):
+    with Ledger(asked.folder) as ledger:
+        return ledger.over()
+
+
+def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
+    asked = plan(tmp_path, "fig9")
+    assert flown(asked).missions == len(asked.missions()) == 8
+    with Ledger(asked.folder) as ledger:
+        assert (ledger.over(), ledger.planned()) == (8, 356)
+        assert FlightsPlan.stored(ledger).scale == SCALE
+        table, flights = shown(ledger, "fig9")
+        assert (table.rows[0].cells[0].count, flights.num_rows) == (2, 8)
+        assert shown(ledger, "fig15")[1] is None
+        assert shown(ledger, "table3")[1].num_rows == 2  # the golden ones, shared
+    more = flown(plan(tmp_path, "table3"))
+    assert (more.missions, more.over) == (8, 2)
+    assert over(asked) == 14
+
+
+def test_the_forecast_comes_from_missions_that_count(tmp_path):
+    asked = plan(tmp_path, "fig16")
+    notes = []
+    watched = Spectator()
+    watched.on_note = notes.append
+    forecast = flown(asked, spectator=watched)
+    assert notes == ["measuring 12 missions"]
+    assert (forecast.missions, forecast.over, forecast.measured) == (40, 12, 12)
+    assert forecast.seconds > 0.0
+    assert forecast.disk_bytes > 0.0
+    assert over(asked) == 40
+
+
+def test_run_folders_are_kept_for_the_pictures(tmp_path):
+    asked = plan(tmp_path, "fig11", "fig13", "fig9")
+    flown(asked)
+    with Ledger(asked.folder) as ledger:
+        kept = [each.number for each in ledger.results() if each.path is not None]
+        drawn = [shown(ledger, name)[1]["number"].to_pylist() for name in ("fig11", "fig13")]
+        assert kept == sorted({*drawn[0], *drawn[1]}) == asked.kept(ledger)
+    assert all(drawn)
+
+
+class _Killer(Spectator):
+    """Kills its own process, as kill -9 does, once some missions are over."""
+
+    def on_progress(self, progress):
+        if progress.over >= 20:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _die(asked):
+    flown(asked, spectator=_Killer())
+
+
+def test_a_killed_reproduction_resumes(tmp_path):
+    asked = plan(tmp_path, "fig16")
+    child = multiprocessing.get_context("fork").Process(target=_die, args=(asked,))
+    child.start()
+    child.join(60)
+    assert child.exitcode == -signal.SIGKILL
+    done = over(asked)
+    assert 20 <= done < 40
+    forecast = flown(asked)
+    assert (forecast.over, over(asked)) == (done, 40)
+    whole = plan(tmp_path / "whole", "fig16")
+    flown(whole)
+    with Ledger(asked.folder) as first, Ledger(whole.folder) as second:
+        results = [[each.result for each in ledger.results()] for ledger in (first, second)]
+    assert results[0] == results[1]
+
+
+def test_a_folder_grows_to_a_larger_scale_and_never_shrinks(tmp_path):
+    small = plan(tmp_path, "fig9")
+    flown(small)
+    forecast = flown(plan(tmp_path, "fig9", scale=0.03))
+    assert (forecast.missions, forecast.over) == (12, 8)
+    with pytest.raises(ConfigError, match="cannot shrink to 0"):
+        flown(small)
+
+
+def test_each_stack_has_its_own_folder(tmp_path):
+    ours = plan(tmp_path, "fig9", stack="mavbench:guards_tracking=true")
+    flown(ours)
+    assert ours.folder == tmp_path / "mavbench-guards_tracking=true"
+    shutil.copytree(ours.folder, tmp_path / "mavbench")
+    with pytest.raises(ConfigError, match="flies the stack mavbench:guards_tracking=true, not"):
+        flown(plan(tmp_path, "fig9"))
+
+
+def test_another_campaign_is_refused(tmp_path):
+    missions = [PlannedMission(config=MissionConfig(world="flat"), labels={})]
+    run_campaign(missions, tmp_path / "mavbench", TASK).close()
+    with pytest.raises(ConfigError, match="holds a campaign that is not a reproduction"):
+        flown(plan(tmp_path, "fig9"))
+
+
+def test_other_versions_are_refused(tmp_path, monkeypatch):
+    asked = plan(tmp_path, "fig9")
+    flown(asked)
+    with Ledger(asked.folder, writing=True) as ledger:
+        ledger.set_meta({"versions": '{"mavfi":"0.1"}'})
+    with pytest.raises(ConfigError, match="begun with other versions"):
+        flown(plan(tmp_path, "fig9", scale=0.03))
+    with Ledger(asked.folder) as ledger:
+        assert FlightsPlan.stored(ledger).scale == SCALE  # nothing was changed
+
+
+def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(flying.shutil, "disk_usage", lambda place: usage(1000, 1000, 0))
+    with pytest.raises(RecordError, match="GB are free"):
+        flown(plan(tmp_path, "fig16"))
+    assert over(plan(tmp_path)) == 12

@@ -1,0 +1,232 @@
+"""What is found in folders, what is missing there, and what cannot be read."""
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from flown import row, table
+
+from mavfi_cli.analysis.flights import exported
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.installed import installed_versions
+from mavfi_cli.paper.document import shown_items
+from mavfi_cli.paper.sources import STACKS, gather
+from mavfi_cli.report.campaign import write_flights
+from mavfi_cli.spec.mission import MissionConfig
+
+KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    """Make the folder of a campaign with planned and flown golden missions."""
+
+    def make(name, planned, flown, versions=None):
+        with Ledger(tmp_path / name, writing=True) as ledger:
+            told = json.dumps(installed_versions() | (versions or {}))
+            ledger.set_meta({"name": name, "versions": told})
+            ledger.plan(
+                PlannedMission(config=MissionConfig(seed=seed), labels={"setting": "golden"})
+                for seed in range(planned)
+            )
+            for number in range(flown):
+                ledger.add(
+                    number, state=ResultState.FLOWN, reason="", injected=Injected.GOLDEN,
+                    wall_s=1.0, attempts=1, path=None,
+                    result={"outcome": "success", "host": {"machine": "x86_64", "cores": 4}},
+                )  # fmt: skip
+        return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def export(tmp_path):
+    """Write an export of some rows."""
+
+    def make(name, *rows):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table(rows), path)
+        return path
+
+    return make
+
+
+def test_a_whole_campaign_has_no_problems(campaign):
+    found = gather([campaign("whole", 3, 3)])
+    assert found.problems == []
+    (source,) = found.campaigns
+    assert (source.name, source.planned, source.flights.num_rows) == ("whole", 3, 3)
+    assert source.host["machine"] == "x86_64"
+    assert source.versions == installed_versions()
+
+
+def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
+    folder = campaign("half", 5, 2)
+    with Ledger(folder) as ledger:
+        write_flights(exported(ledger), tmp_path / "half.parquet")
+    found = [gather([place]) for place in (folder, tmp_path / "half.parquet")]
+    there, here = (each.campaigns[0] for each in found)
+    assert (here.planned, here.versions, here.host) == (there.planned, there.versions, there.host)
+    (problem,) = found[1].problems
+    assert problem.endswith("2 of 5 missions have flown. An export holds no list.")
+
+
+def test_what_has_not_flown_is_told(campaign):
+    (problem,) = gather([campaign("half", 5, 2)]).problems
+    assert "2 of 5 missions have flown" in problem
+
+
+def test_the_rest_of_a_reproduction_is_flown_by_naming_no_item(campaign, tmp_path):
+    with Ledger(campaign("mavbench", 5, 2), writing=True) as ledger:
+        ledger.set_meta({"reproduction": '{"stack": "mavbench", "scale": 0.5}'})
+    (problem,) = gather([tmp_path]).problems
+    assert problem.endswith(
+        f"2 of 5 missions have flown. mavfi reproduce --stack mavbench --scale 0.5 --out {tmp_path}"
+        " flies the rest."
+    )
+
+
+def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
+    campaign("new", 1, 1)
+    campaign("old", 1, 1, {"numpy": "1.0"})
+    (problem,) = gather([tmp_path]).problems
+    assert "old and" in problem
+    assert "numpy was" in problem
+    assert "is 1.0" in problem
+
+
+def test_a_build_that_is_not_this_one_is_told(campaign):
+    (problem,) = gather([campaign("old", 1, 1, {"ompl": "0.1"})]).problems
+    assert "another build than this one" in problem
+    assert "ompl was 0.1" in problem
+
+
+def test_nothing_is_an_error(tmp_path, campaign):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordError, match="empty: holds no campaign"):
+        gather([tmp_path / "empty"])
+    with pytest.raises(RecordError, match="does not exist"):
+        gather([tmp_path / "absent"])
+    with pytest.raises(RecordError, match="no mission has flown yet"):
+        gather([campaign("unflown", 4, 0)])
+
+
+def test_an_empty_folder_beside_another_is_told(tmp_path, campaign):
+    (tmp_path / "empty").mkdir()
+    (problem,) = gather([campaign("whole", 1, 1), tmp_path / "empty"]).problems
+    assert "empty: holds no campaign" in problem
+
+
+def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
+    campaign("whole", 1, 1)
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "ledger.sqlite").write_bytes(b"SQLite format 3\0 and no more")
+    (tmp_path / "other.parquet").write_bytes(b"PAR1")
+    pq.write_table(table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
+    pq.write_table(table([row() | {"changes": "no json"}]), tmp_path / "odd.parquet")
+    (tmp_path / "kernels.json").write_text("[]")
+    found = gather([tmp_path])
+    assert len(found.campaigns) == 1
+    told = "\n".join(found.problems)
+    for name in ("torn", "other.parquet", "foreign.parquet", "odd.parquet", "kernels.json"):
+        assert name in told
+    assert "no column 'pair'" in told
+
+
+@pytest.mark.parametrize("lacks", ["title", "runs", "outcomes"])
+def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
+    campaign("whole", 1, 1)
+    summary = json.loads(KERNELS.read_text())
+    if lacks == "outcomes":
+        del summary["kernels"][0]["outcomes"]["crash"]
+    else:
+        del summary["kernels"][0][lacks]
+    (tmp_path / "kernels.json").write_text(json.dumps(summary))
+    found = gather([tmp_path])
+    assert len(found.campaigns) == 1
+    (problem,) = found.problems
+    assert "kernels.json: not a whole summary of `mavfi kernels`" in problem
+
+
+def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
+    campaign("whole", 1, 1)
+    export("whole/runs/0-sparse-1/trace.parquet", row())
+    export("whole/world-search/found.parquet", row())
+    export("whole/kernels.parquet", row())
+    assert len(gather([tmp_path]).campaigns) == 1
+
+
+def test_a_campaign_may_lie_in_a_folder_of_any_name(tmp_path, campaign):
+    (tmp_path / "runs").mkdir()
+    campaign("runs/whole", 1, 1)
+    assert len(gather([tmp_path]).campaigns) == 1
+
+
+def test_a_part_has_the_specification_beside_it(export, tmp_path):
+    (tmp_path / "mine.toml").write_text("repetitions = 3\n[[setting]]\n")
+    (source,) = gather([export("mine-part2.parquet", row())]).campaigns
+    assert source.spec.repetitions == 3
+    assert source.planned is None
+    assert len(source.digest) == 64
+
+
+def test_a_kernel_in_two_places_counts_once(tmp_path):
+    told = json.loads(KERNELS.read_text())
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        told["kernels"] = told["kernels"][:2]
+        (tmp_path / name / "kernels.json").write_text(json.dumps(told))
+        told["kernels"][0]["runs"] = 7
+    found = gather([tmp_path])
+    (first, *_) = found.isolated.values()
+    assert first["runs"] == 7
+    assert len(found.problems) == 2
+    assert found.problems[0].endswith(f"both have {first['kernel']}; the latter counts.")
+    flights = {stack: found.flights(stack) for stack in STACKS}
+    fig6 = next(each for each in shown_items(found, flights) if each.item.name == "fig6")
+    assert [len(part.table.rows) for part in fig6.parts] == [2]
+
+
+def test_a_mission_in_two_places_counts_once(export):
+    places = [export("one.parquet", row(seed=1)), export("two.parquet", row(seed=1), row(seed=2))]
+    found = gather(places)
+    assert found.flights().num_rows == found.flights("mavbench").num_rows == 2
+    assert found.flights("hardened").num_rows == 0
+
+
+def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
+    failed = {"state": "error", "outcome": None}
+    places = [export("one.parquet", row(seed=1, **failed), row(seed=2)),
+              export("two.parquet", row(seed=1))]  # fmt: skip
+    found = gather(places)
+    assert found.flights().num_rows == found.flights("mavbench").num_rows == 2
+
+
+def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
+    rows = []
+    for seed in (7, 8):
+        rows.append(row(seed=seed))
+        for field in ("sign", "mantissa"):
+            fault = {"field": field, "together": True}
+            rows.append(row("waypoint_position", seed=seed, fault=fault))
+    rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
+    found = gather([export("a.parquet", *rows)])
+    flights = {stack: found.flights(stack) for stack in STACKS}
+    shown = {
+        (each.item.name, part.stack): part
+        for each in shown_items(found, flights)
+        for part in each.parts
+    }
+    found = shown["fig9", "mavbench"]
+    counts = {line.labels[0]: line.cells[0].count for line in found.table.rows}
+    assert counts == {"golden": 2, "sign": 2, "mantissa": 2}
+    assert {each["fault_field"] for each in found.flights} == {"sign", "mantissa"}
+    assert shown["fig9", "hardened"].table is None
+    assert shown["table4", "mavbench"].table is None
+    assert shown["fig6", "isolated kernels"].table is None
+    assert shown["fig15", "performance model"].figure is not None

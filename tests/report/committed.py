@@ -1,0 +1,15 @@
+"""What the page tells of some committed campaigns."""
+
+from pathlib import Path
+
+from mavfi_cli.paper.document import document
+from mavfi_cli.paper.sources import gather
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+_CAMPAIGNS = ("instruction", "effects-part2", "protected-part2", "hardening-part1", "sight-part1")
+
+
+def everything():
+    """The whole document, made anew."""
+    exports = [RESULTS / f"{name}.parquet" for name in _CAMPAIGNS]
+    return document(gather([*exports, RESULTS / "kernels.json"]))
