@@ -16,10 +16,10 @@ from collections import defaultdict
 
 import numpy as np
 
-from mavfi_cli.autonomy import collision, planners, planning, point_cloud, tracking, warm
+from mavfi_cli.autonomy import collision, planners, point_cloud, tracking, warm
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.trajectory import reference_waypoint
+from mavfi_cli.autonomy.tracking import reference_waypoint
 from mavfi_cli.core.frames import quaternion_from_euler
 from mavfi_cli.core.types import DepthFrame, Trajectory
 from sitl.camera.depth import render_depth
@@ -132,10 +132,10 @@ class Flight:
             trajectory_seq=self._plans,
         )
         plan = functools.partial(
-            planning.plan,
+            planners.plan,
             bounds_enu_m=self._bounds,
             seed=1000 * self._seed + self._plans,
-            params=planning.StageParams(),
+            params=planners.PlanningParams(),
         )
         found = self._watch.call("planner + smoothing", plan, self._planner, request, snapshot)
         self._next = found if isinstance(found, Trajectory) else None

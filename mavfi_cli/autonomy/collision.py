@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.autonomy.trajectory import locate, reference_waypoint
+from mavfi_cli.autonomy.tracking import locate, reference_waypoint
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
 
@@ -80,7 +80,7 @@ def step(
         trajectory = inputs.trajectory
         if inputs.front_enu_m is not None:
             trajectory = _shifted(trajectory, inputs.time_s, inputs.front_enu_m)
-        time_s = time_to_collision(inputs.snapshot, trajectory, inputs.time_s, params)
+        time_s = _time_to_collision(inputs.snapshot, trajectory, inputs.time_s, params)
     collision = math.isfinite(time_s)
     seq, on_seq = state.future_collision_seq, None
     if inputs.trajectory is not None and not params.owns_sequence_numbers:
@@ -99,7 +99,7 @@ def step(
     return CollisionState(future_collision_seq=seq, foreseen_on_seq=on_seq), report
 
 
-def time_to_collision(
+def _time_to_collision(
     snapshot: MapSnapshot, trajectory: Trajectory, time_s: float, params: CollisionParams
 ) -> float:
     """Return the time from `time_s` along the trajectory to the first contact, s; inf if free.

@@ -5,7 +5,7 @@ is a directive: the trajectory to track, the point on it, the rate of its clock,
 a new plan if one is needed.
 
 A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
-stays on the checked path; see `trajectory.ActivePlan`. A vehicle that stops on a report drops the
+stays on the checked path; see `tracking.ActivePlan`. A vehicle that stops on a report drops the
 trajectory and brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
@@ -17,8 +17,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.autonomy.tracking import TrackingInputs
-from mavfi_cli.autonomy.trajectory import ActivePlan
+from mavfi_cli.autonomy.tracking import ActivePlan, TrackingInputs
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
@@ -37,26 +36,17 @@ class PilotMode(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Departure:
-    """Start of a trajectory: state of motion and sequence numbers."""
+class PlanRequest:
+    """Request for a trajectory from a state of motion to the goal."""
 
     stamp_s: float
+    position_enu_m: FloatArray  # (3,)
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
-    trajectory_seq: int = 0
-    future_collision_seq: int = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlanRequest(Departure):
-    """Request for a trajectory from a position to the goal.
-
-    `trajectory_seq` is the newest known number; the planner's node takes the next.
-    """
-
-    position_enu_m: FloatArray  # (3,)
     goal_enu_m: FloatArray  # (3,)
     attempt: int  # number of the plan in the mission; seeds the planner
+    trajectory_seq: int = 0  # newest known number; the planner's node takes the next
+    future_collision_seq: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

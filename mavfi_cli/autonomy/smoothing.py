@@ -1,9 +1,15 @@
 """Smoothing: turns a path into a trajectory within the limits, sampled every 0.5 s.
 
-The motion along the path has constant accelerations and parabolic corners (see `corners`). Its
-samples at equal times are the control points of a uniform quadratic B-spline, and the knots of the
-spline are the waypoints. Interpolated as in `trajectory` (p + v t + a t^2 / 2), the waypoints are
-exactly that spline. Between the waypoints, too:
+On each straight segment of the path the vehicle accelerates constantly, cruises, and brakes
+constantly. One blend of constant acceleration cuts each corner, from velocity c u_1 to c u_2 (c the
+corner speed, u the directions). It lasts |c u_2 - c u_1| / a, starts and ends
+h = c^2 sin(theta / 2) / a from the corner, and passes the corner at c^2 sin(theta / 2)^2 / (2 a).
+The velocity is continuous. The norms of velocity and acceleration keep their limits exactly,
+because the velocity inside a blend is a convex combination of the velocities at its ends.
+
+The samples of this motion at equal times are the control points of a uniform quadratic B-spline,
+and the knots of the spline are the waypoints. Interpolated as in `tracking`
+(p + v t + a t^2 / 2), the waypoints are exactly that spline. Between the waypoints, too:
 
 - speed and acceleration never exceed those of the motion that was sampled: each is an average
   of it;
@@ -23,60 +29,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.autonomy import corners
-from mavfi_cli.autonomy.corners import Motion, MotionLimits
 from mavfi_cli.autonomy.grid import ObstacleGrid
-from mavfi_cli.autonomy.pilot import Departure
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 SHORTEST_M = 0.3  # minimum horizontal distance that defines a direction
-
 NEGLIGIBLE_MPS = 0.1  # lower speeds count as rest
 RUN_OUT_RESERVE = 1.02  # factor on the stopping distance, for rounding errors
 SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a stop
-
-
-def headings(
-    positions_enu_m: FloatArray, start_yaw_rad: float, ahead: int, turn_max_rad: float
-) -> FloatArray:
-    """Return the yaw (n,) of waypoints at positions (n, 3), continuous from `start_yaw_rad`.
-
-    Each yaw points to the position `ahead` waypoints later, or to the first later position that is
-    far enough if that one is too near. The yaw stays constant at the end. It turns by at most
-    `turn_max_rad` from one waypoint to the next.
-    """
-    count = len(positions_enu_m)
-    yaws = np.empty(count)
-    yaw = yaws[0] = start_yaw_rad if math.isfinite(start_yaw_rad) else 0.0
-    for k in range(1, count):
-        wanted = _direction(positions_enu_m, k, ahead)
-        if wanted is not None:
-            yaw += float(np.clip(wrap_angle(wanted - yaw), -turn_max_rad, turn_max_rad))
-        yaws[k] = yaw
-    return yaws
-
-
-def _direction(positions: FloatArray, k: int, ahead: int) -> float | None:
-    """Return the yaw from position k to the first far enough one, `ahead` or more later."""
-    ways = positions[min(k + ahead, len(positions) - 1) :, :2] - positions[k, :2]
-    far = np.flatnonzero(np.hypot(ways[:, 0], ways[:, 1]) >= SHORTEST_M)
-    if not len(far):
-        return None
-    return math.atan2(ways[far[0], 1], ways[far[0], 0])
-
-
-def turn_time_s(
-    yaw_rad: float, direction: FloatArray, threshold_rad: float, rate_radps: float
-) -> float:
-    """Return the time to turn from a yaw to a direction of travel (3,).
-
-    It is 0 within the threshold and for a vertical direction.
-    """
-    if math.hypot(direction[0], direction[1]) < 0.1 or not math.isfinite(yaw_rad):
-        return 0.0
-    turn = abs(wrap_angle(math.atan2(direction[1], direction[0]) - yaw_rad))
-    return turn / rate_radps if turn > threshold_rad else 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,58 +62,142 @@ class SmoothingParams:
     passes_max: int = 40
 
     @property
-    def limits(self) -> MotionLimits:
-        """Return the limits of the planned motion."""
-        return MotionLimits(
-            speed_mps=self.speed_share * self.v_max_mps,
-            climb_mps=self.climb_max_mps,
-            descent_mps=self.descent_max_mps,
-            acceleration_mps2=self.acceleration_share * self.a_max_mps2,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Smoothed:
-    """A trajectory, and a flag that is True if all of it lies in free space."""
-
-    trajectory: Trajectory
-    free: bool
+    def acceleration_mps2(self) -> float:
+        """Return the acceleration of the planned motion."""
+        return self.acceleration_share * self.a_max_mps2
 
 
 def smooth(
-    path_enu_m: FloatArray,
-    grid: ObstacleGrid,
-    departure: Departure,
-    params: SmoothingParams,
-) -> _Smoothed:
+    path_enu_m: FloatArray, grid: ObstacleGrid, request: PlanRequest, params: SmoothingParams
+) -> tuple[Trajectory, bool]:
     """Compute the trajectory along a free path (n, 3) from its first to its last point.
 
-    It begins with the departure's velocity, limited to v_max. A trajectory that begins in motion
+    It begins with the request's velocity, limited to v_max. A trajectory that begins in motion
     first runs straight on for the stopping distance, then turns to the path as fast as the corner
-    allows. If the straight part is not free, `free` is False.
+    allows.
+
+    Returns:
+        The trajectory, and True if all of it lies in free space.
     """
-    velocity = _cut(departure.velocity_enu_mps, params.v_max_mps)
+    velocity = _cut(request.velocity_enu_mps, params.v_max_mps)
     path = np.asarray(path_enu_m, np.float64)
     vertices, free = _with_run_out(path, velocity, grid, params)
-    limits, period = params.limits, params.sample_period_s
-    line = corners.polyline(vertices, limits)
-    speed, acceleration = float(np.linalg.norm(velocity)), limits.acceleration_mps2
+    line, period, a = _Polyline(vertices, params), params.sample_period_s, params.acceleration_mps2
+    speed = float(np.linalg.norm(velocity))
     before = path[0] - 0.5 * period * velocity
     # squared speeds that cut each corner by `corner_cut_m` at most
-    caps = 2.0 * acceleration * params.corner_cut_m / np.maximum(line.half_sines, 1e-6) ** 2
+    caps = 2.0 * a * params.corner_cut_m / np.maximum(line.half_sines, 1e-6) ** 2
     for _ in range(params.passes_max):
-        q = corners.squared_corner_speeds(line, speed, caps, acceleration)
-        dwells_s = _dwells(line.directions, q, departure.yaw_rad, params)
-        moving = corners.motion(line, q, dwells_s, acceleration)
+        q = _squared_corner_speeds(line, speed, caps, a)
+        moving = _motion(line, q, _dwells(line.directions, q, request.yaw_rad, params), a)
         count = math.ceil(moving.duration_s / period) + 2
         ahead = moving.position(np.arange(count, dtype=np.float64) * period)
         spline = np.vstack([before, ahead])
-        blamed = [c for c in _blocked_corners(spline, moving, grid, params) if q[c] > 0.0]
+        blamed = [c for c in _blocked_corners(spline, moving, grid, period) if q[c] > 0.0]
         if not blamed:
             break
         caps[blamed] = np.where(q[blamed] > SLOWEST_SQUARED, 0.25 * q[blamed], 0.0)
     free = free and bool(_piecewise_free(spline, grid).all())
-    return _Smoothed(trajectory=_waypoints(spline, departure, params), free=free)
+    return _trajectory(spline, request, params), free
+
+
+def _cut(velocity: FloatArray, limit: float) -> FloatArray:
+    """Limit a velocity (3,). Return zero if it is negligible or not finite."""
+    velocity = np.asarray(velocity, np.float64)
+    largest = float(np.abs(velocity).max())
+    if not np.isfinite(velocity).all() or largest == 0.0:
+        return np.zeros(3)
+    speed = largest * float(np.linalg.norm(velocity / largest))
+    if speed < NEGLIGIBLE_MPS:
+        return np.zeros(3)
+    return velocity if speed <= limit else velocity / largest * (limit * largest / speed)
+
+
+def _with_run_out(
+    path: FloatArray, velocity: FloatArray, grid: ObstacleGrid, params: SmoothingParams
+) -> tuple[FloatArray, bool]:
+    """Return the vertices to fly, and True if the straight stretch from the start is free.
+
+    A vehicle in motion runs straight on for half a sample, then brakes to a stop. From there the
+    path leads to the farthest path vertex in line of sight, or back to the start of the path if
+    none is in sight.
+    """
+    speed = float(np.linalg.norm(velocity))
+    if speed == 0.0:
+        return path, True
+    begin = path[0] + 0.5 * params.sample_period_s * velocity
+    braking_s = 0.5 * speed / params.acceleration_mps2
+    stop = begin + RUN_OUT_RESERVE * braking_s * velocity
+    free = grid.segment_free(path[0], stop)
+    for k in range(len(path) - 1, 0, -1):
+        if grid.segment_free(stop, path[k]):
+            return np.vstack([begin, stop, path[k:]]), free
+    return np.vstack([begin, stop, path]), free
+
+
+class _Polyline:
+    """Geometry of a path (n, 3) without points within 1 mm of their predecessor."""
+
+    def __init__(self, path: FloatArray, params: SmoothingParams) -> None:
+        kept = [path[0]]
+        for vertex in path[1:]:
+            if np.linalg.norm(vertex - kept[-1]) > 1e-3:
+                kept.append(vertex)
+        self.vertices = np.array(kept)  # (n, 3)
+        steps = np.diff(self.vertices, axis=0)
+        self.lengths = np.linalg.norm(steps, axis=1)  # (n - 1,)
+        self.directions = steps / self.lengths[:, None]  # (n - 1, 3)
+        caps = [_speed_cap(float(u[2]), params) for u in self.directions]
+        self.speed_caps = np.array(caps)  # (n - 1,) m/s
+        # (n,) sin of half the turn at each vertex, 0 at the ends; |u_2 - u_1| = 2 sin(theta / 2)
+        self.half_sines = np.zeros(len(self.vertices))
+        self.half_sines[1:-1] = 0.5 * np.linalg.norm(np.diff(self.directions, axis=0), axis=1)
+
+
+def _speed_cap(rise: float, params: SmoothingParams) -> float:
+    """Return the speed that keeps the vertical limits along a direction of vertical part `rise`."""
+    cap = params.speed_share * params.v_max_mps
+    if rise > 0.0:
+        cap = min(cap, params.climb_max_mps / rise)
+    elif rise < 0.0:
+        cap = min(cap, params.descent_max_mps / -rise)
+    return cap
+
+
+def _squared_corner_speeds(
+    line: _Polyline, start_speed_mps: float, caps: FloatArray, a: float
+) -> FloatArray:
+    """Return the highest squared speeds at the vertices (n,) that caps and lengths allow.
+
+    The start has its given speed, the end is at rest. `caps` (n,) are squares of speeds. The first
+    segment must be long enough to stop from the start speed.
+    """
+    lengths, sines = line.lengths, line.half_sines
+    last = len(lengths)
+    q = np.minimum(caps, np.inf)
+    q[0], q[last] = start_speed_mps**2, 0.0
+    for i in range(1, last):
+        q[i] = min(q[i], line.speed_caps[i - 1] ** 2, line.speed_caps[i] ** 2)
+        if sines[i] > 0.0:
+            q[i] = min(q[i], 0.5 * min(lengths[i - 1], lengths[i]) * a / sines[i])
+    if last > 1 and sines[1] > 0.5:  # the first corner's blend shortens the braking distance
+        room = 2.0 * a * lengths[0] - q[0]
+        q[1] = min(q[1], max(0.0, room) / (2.0 * sines[1] - 1.0))
+    for _ in range(last + 2):
+        before = q.copy()
+        for i in range(last - 1):
+            q[i + 1] = min(q[i + 1], _reachable(q[i], sines[i], sines[i + 1], lengths[i], a))
+        for i in range(last - 1, 0, -1):
+            q[i] = min(q[i], _reachable(q[i + 1], sines[i + 1], sines[i], lengths[i], a))
+        if np.array_equal(before, q):
+            return q
+    q[1:] = 0.0
+    return q
+
+
+def _reachable(q_from: float, sine_from: float, sine_to: float, length: float, a: float) -> float:
+    """Return the largest squared speed at one end of a segment, given that at the other end."""
+    return max(0.0, (q_from * (1.0 - 2.0 * sine_from) + 2.0 * a * length) / (1.0 + 2.0 * sine_to))
 
 
 def _dwells(
@@ -161,73 +206,114 @@ def _dwells(
     """Return the waiting time at each vertex (n,), which includes the time to turn at rest."""
     dwells = np.zeros(len(q))
     for i, direction in enumerate(directions):
+        steep = math.hypot(direction[0], direction[1]) < 0.1
+        azimuth = math.atan2(direction[1], direction[0])
         if q[i] == 0.0:
-            turning = turn_time_s(
-                yaw_rad, direction, params.turn_first_rad, params.yaw_rate_max_radps
-            )
             # Two control points on a corner keep the spline on the two segments.
-            settling = 2.0 * params.sample_period_s if i > 0 else 0.0
-            dwells[i] = max(turning, settling)
-        if math.hypot(direction[0], direction[1]) >= 0.1:
-            yaw_rad = math.atan2(direction[1], direction[0])
+            dwells[i] = 2.0 * params.sample_period_s if i > 0 else 0.0
+            turn = (
+                0.0 if steep or not math.isfinite(yaw_rad) else abs(wrap_angle(azimuth - yaw_rad))
+            )
+            if turn > params.turn_first_rad:
+                dwells[i] = max(turn / params.yaw_rate_max_radps, dwells[i])
+        if not steep:
+            yaw_rad = azimuth
     return dwells
 
 
-def _cut(velocity: FloatArray, limit: float) -> FloatArray:
-    """Limit a velocity (3,). Return zero if it is negligible or not finite."""
-    velocity = np.asarray(velocity, np.float64)
-    if not np.isfinite(velocity).all():
-        return np.zeros(3)
-    largest = float(np.abs(velocity).max())
-    if largest == 0.0:
-        return np.zeros(3)
-    speed = largest * float(np.linalg.norm(velocity / largest))
-    if speed < NEGLIGIBLE_MPS:
-        return np.zeros(3)
-    return velocity if speed <= limit else velocity / largest * (limit * largest / speed)
+class _Motion:
+    """Consecutive phases of constant acceleration, built one by one."""
+
+    def __init__(self, position: FloatArray) -> None:
+        self.duration_s = 0.0
+        self.end = position  # (3,) where the phases so far end
+        self._rows: list[tuple[float, FloatArray, FloatArray, FloatArray, int]] = []
+
+    def add(
+        self, duration_s: float, velocity: FloatArray, acceleration: FloatArray, corner: int = -1
+    ) -> None:
+        """Append a phase with a velocity (3,) at its start unless its duration is zero.
+
+        `corner` is the vertex that the phase rounds or waits at; -1 for none.
+        """
+        if not duration_s > 0.0:
+            return
+        self._rows.append((self.duration_s, self.end, velocity, acceleration, corner))
+        self.duration_s += duration_s
+        self.end = self.end + velocity * duration_s + 0.5 * acceleration * duration_s * duration_s
+
+    def change_speed(self, direction: FloatArray, begin: float, end: float, a: float) -> None:
+        """Append a phase that changes the speed along a direction (3,)."""
+        rate = math.copysign(a, end - begin)
+        self.add((end - begin) / rate, begin * direction, rate * direction)
+
+    def position(self, times_s: FloatArray) -> FloatArray:
+        """Return positions (k, 3) at the times (k,). After its end the motion rests there."""
+        starts_s, positions, velocities, accelerations, _ = map(
+            np.array, zip(*self._rows, strict=True)
+        )
+        times = np.clip(times_s, 0.0, self.duration_s)
+        index = np.searchsorted(starts_s, times, side="right") - 1
+        t = (times - starts_s[index])[:, None]
+        position: FloatArray = (
+            positions[index] + velocities[index] * t + 0.5 * accelerations[index] * t * t
+        )
+        return position
+
+    def corners_during(self, begin_s: float, end_s: float) -> set[int]:
+        """Return the vertices of the phases in an interval of time."""
+        starts_s = [row[0] for row in self._rows]
+        ends_s = [*starts_s[1:], self.duration_s]
+        return {
+            row[4]
+            for row, phase_ends_s in zip(self._rows, ends_s, strict=True)
+            if row[0] <= end_s and phase_ends_s >= begin_s and row[4] >= 0
+        }
 
 
-def _run_out(position: FloatArray, velocity: FloatArray, params: SmoothingParams) -> FloatArray:
-    """Return vertices (1 or 2, 3) that run straight on for half a sample, then brake to a stop."""
-    speed = float(np.linalg.norm(velocity))
-    if speed == 0.0:
-        return np.array([position])
-    begin = position + 0.5 * params.sample_period_s * velocity
-    braking_s = 0.5 * speed / params.limits.acceleration_mps2
-    return np.array([begin, begin + RUN_OUT_RESERVE * braking_s * velocity])
+def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _Motion:
+    """Return the motion along the line with squared corner speeds `q` (n,).
 
-
-def _with_run_out(
-    path: FloatArray, velocity: FloatArray, grid: ObstacleGrid, params: SmoothingParams
-) -> tuple[FloatArray, bool]:
-    """Return the vertices to fly, and True if the straight stretch from the start is free.
-
-    From the stopping point the path leads to the farthest path vertex in line of sight, or back to
-    the start of the path if none is in sight.
+    `dwells_s` (n,) is the waiting time at each vertex. It must be 0 unless the speed there is 0.
     """
-    vertices = _run_out(path[0], velocity, params)
-    if len(vertices) == 1:
-        return path, True
-    stop = vertices[-1]
-    free = grid.segment_free(path[0], stop)
-    for k in range(len(path) - 1, 0, -1):
-        if grid.segment_free(stop, path[k]):
-            return np.vstack([vertices, path[k:]]), free
-    return np.vstack([vertices, path]), free
+    found = _Motion(line.vertices[0])
+    zero = np.zeros(3)
+    found.add(dwells_s[0], zero, zero, 0)
+    speeds = np.sqrt(q)
+    trims = q * line.half_sines / a
+    for i, direction in enumerate(line.directions):
+        distance = max(0.0, float(line.lengths[i] - trims[i] - trims[i + 1]))
+        first, last = float(speeds[i]), float(speeds[i + 1])
+        # Accelerate as far as the cap and the distance allow, cruise, and brake.
+        peak = math.sqrt(max(0.0, a * distance + 0.5 * (first * first + last * last)))
+        peak = max(min(peak, line.speed_caps[i]), last)
+        used = (abs(peak * peak - first * first) + abs(peak * peak - last * last)) / (2.0 * a)
+        found.change_speed(direction, first, peak, a)
+        if peak > 0.0:
+            found.add((distance - used) / peak, peak * direction, zero)
+        found.change_speed(direction, peak, last, a)
+        if i + 1 < len(line.directions):
+            if q[i + 1] > 0.0:
+                turn = speeds[i + 1] * (line.directions[i + 1] - direction)
+                lasting = float(np.linalg.norm(turn)) / a
+                if lasting > 0.0:
+                    found.add(lasting, speeds[i + 1] * direction, turn / lasting, i + 1)
+            else:
+                found.end = line.vertices[i + 1]  # drops accumulated rounding errors
+                found.add(dwells_s[i + 1], zero, zero, i + 1)
+    found.end = line.vertices[-1]
+    found.add(1e-3, zero, zero)
+    return found
 
 
 def _blocked_corners(
-    spline: FloatArray, moving: Motion, grid: ObstacleGrid, params: SmoothingParams
+    spline: FloatArray, moving: _Motion, grid: ObstacleGrid, period: float
 ) -> list[int]:
     """Return the vertices that are rounded by spline pieces that are not free."""
-    period = params.sample_period_s
     blamed: set[int] = set()
-    ends_s = np.append(moving.starts_s[1:], moving.duration_s)
     for piece in np.flatnonzero(~_piecewise_free(spline, grid)):
         # Piece k depends on the control points at (k - 1) T, k T and (k + 1) T.
-        begin_s, end_s = (piece - 1) * period, (piece + 1) * period
-        during = (moving.starts_s <= end_s) & (ends_s >= begin_s) & (moving.corners >= 0)
-        blamed.update(moving.corners[during].astype(int).tolist())
+        blamed |= moving.corners_during((piece - 1) * period, (piece + 1) * period)
     return sorted(blamed)
 
 
@@ -241,23 +327,37 @@ def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]
     return np.array([grid.path_free(piece) for piece in points], np.bool_)
 
 
-def _waypoints(spline: FloatArray, departure: Departure, params: SmoothingParams) -> Trajectory:
+def _trajectory(spline: FloatArray, request: PlanRequest, params: SmoothingParams) -> Trajectory:
     """Convert control points (m, 3) to the trajectory of the spline's m - 1 knots."""
     period = params.sample_period_s
     velocities = np.diff(spline, axis=0) / period
     accelerations = np.zeros_like(velocities)
     accelerations[:-1] = np.diff(velocities, axis=0) / period
-    waypoints = np.empty((len(velocities), 10))
-    waypoints[:, 0:3] = 0.5 * (spline[:-1] + spline[1:])
-    waypoints[:, 3] = headings(
-        waypoints[:, 0:3], departure.yaw_rad, 2, params.yaw_rate_max_radps * period
-    )
-    waypoints[:, 4:7] = velocities
-    waypoints[:, 7:10] = accelerations
+    positions = 0.5 * (spline[:-1] + spline[1:])
+    yaws = _headings(positions, request.yaw_rad, params.yaw_rate_max_radps * period)
     return Trajectory(
-        stamp_s=departure.stamp_s,
-        waypoints=waypoints,
-        durations_s=np.full(len(waypoints), period),
-        trajectory_seq=departure.trajectory_seq,
-        future_collision_seq=departure.future_collision_seq,
+        stamp_s=request.stamp_s,
+        waypoints=np.column_stack([positions, yaws, velocities, accelerations]),
+        durations_s=np.full(len(positions), period),
+        trajectory_seq=request.trajectory_seq,
+        future_collision_seq=request.future_collision_seq,
     )
+
+
+def _headings(positions: FloatArray, start_yaw_rad: float, turn_max_rad: float) -> FloatArray:
+    """Return the yaw (n,) of waypoints at positions (n, 3), continuous from `start_yaw_rad`.
+
+    Each yaw points to the position two waypoints later, or to the first later position that is far
+    enough if that one is too near. The yaw stays constant at the end. It turns by at most
+    `turn_max_rad` from one waypoint to the next.
+    """
+    yaws = np.empty(len(positions))
+    yaw = yaws[0] = start_yaw_rad if math.isfinite(start_yaw_rad) else 0.0
+    for k in range(1, len(positions)):
+        ways = positions[min(k + 2, len(positions) - 1) :, :2] - positions[k, :2]
+        far = np.flatnonzero(np.hypot(ways[:, 0], ways[:, 1]) >= SHORTEST_M)
+        if len(far):
+            wanted = math.atan2(ways[far[0], 1], ways[far[0], 0])
+            yaw += float(np.clip(wrap_angle(wanted - yaw), -turn_max_rad, turn_max_rad))
+        yaws[k] = yaw
+    return yaws

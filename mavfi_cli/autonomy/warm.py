@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 
-from mavfi_cli.autonomy import collision, planning, point_cloud, tracking
-from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
+from mavfi_cli.autonomy import OUR_PLANNERS, collision, planners, point_cloud, tracking
+from mavfi_cli.autonomy.occupancy import OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.planners.ompl import OMPL_PLANNERS
-from mavfi_cli.autonomy.trajectory import reference_waypoint
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.types import DepthFrame, Trajectory
 
@@ -24,55 +22,36 @@ def is_compiled() -> bool:
 
 def warm_up() -> None:
     """Run every kernel: observe a wall, map it, plan round it, check the plan and track it."""
-    snapshot = _see_a_wall()
-    start, goal = np.array([0.0, 0.0, 5.0]), np.array([9.0, 0.0, 5.0])
-    trajectory: Trajectory | None = None
-    request = PlanRequest(
-        stamp_s=0.0,
-        position_enu_m=start,
-        velocity_enu_mps=np.array([0.0, 1.0, 0.0]),
-        yaw_rad=0,
-        goal_enu_m=goal,
-        attempt=1,
-    )
-    params = planning.StageParams()
-    for planner in OMPL_PLANNERS:
-        found = planning.plan(
-            planner, request, snapshot, bounds_enu_m=_BOUNDS, seed=1, params=params
-        )
-        trajectory = found if isinstance(found, Trajectory) else None
-    _check_and_track(snapshot, trajectory)
-
-
-def _see_a_wall() -> MapSnapshot:
+    start = np.array([0.0, 0.0, 5.0])
     depth = np.full((48, 64), math.inf)
     depth[:, 20:44] = 4.0
     frame = DepthFrame(
-        stamp_s=0.0,
-        depth_m=depth,
-        hfov_rad=math.pi / 2.0,
-        position_enu_m=np.array([0.0, 0.0, 5.0]),
+        stamp_s=0.0, depth_m=depth, hfov_rad=math.pi / 2.0, position_enu_m=start,
         quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-    )
+    )  # fmt: skip
     occupancy = OccupancyMap(OccupancyParams())
     occupancy.insert(point_cloud.generate(frame, point_cloud.PointCloudParams()))
-    return occupancy.snapshot()
-
-
-def _check_and_track(snapshot: MapSnapshot, trajectory: Trajectory | None) -> None:
+    snapshot = occupancy.snapshot()
+    request = PlanRequest(
+        stamp_s=0.0, position_enu_m=start, velocity_enu_mps=np.array([0.0, 1.0, 0.0]), yaw_rad=0.0,
+        goal_enu_m=np.array([9.0, 0.0, 5.0]), attempt=1,
+    )  # fmt: skip
+    trajectory: Trajectory | None = None
+    for name in OUR_PLANNERS:
+        found = planners.plan(
+            planners.find(name), request, snapshot,
+            bounds_enu_m=_BOUNDS, seed=1, params=planners.PlanningParams(),
+        )  # fmt: skip
+        trajectory = found if isinstance(found, Trajectory) else None
     checked = collision.CollisionInputs(
         stamp_s=0.0, snapshot=snapshot, trajectory=trajectory, time_s=0.0
     )
     collision.step(collision.CollisionState(), checked, collision.CollisionParams())
     if trajectory is not None:
-        reference_waypoint(trajectory, 0.0)
+        tracking.reference_waypoint(trajectory, 0.0)
     tracked = tracking.TrackingInputs(
-        stamp_s=0.02,
-        position_enu_m=np.zeros(3),
-        velocity_enu_mps=np.zeros(3),
-        trajectory=trajectory,
-        hold_enu_m=np.zeros(3),
-        hold_yaw_rad=0.0,
-    )
+        stamp_s=0.02, position_enu_m=np.zeros(3), velocity_enu_mps=np.zeros(3),
+        trajectory=trajectory, hold_enu_m=np.zeros(3), hold_yaw_rad=0.0,
+    )  # fmt: skip
     state = tracking.TrackingState(yaw_rad=0.0, stamp_s=0.0)
     tracking.step(state, tracked, tracking.TrackingParams(stretches_clock=True))

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from mavfi_cli.autonomy import collision, occupancy, planning, point_cloud, smoothing, tracking
+from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
-from mavfi_cli.autonomy.planners.base import Planner, PlanningParams
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.core.types import (
     Briefing,
@@ -42,7 +41,7 @@ class Kernels:
     """Kernels of all nodes. Each public method is one kernel: (input, start stamp) -> output."""
 
     def __init__(
-        self, config: MissionConfig, stack: Stack, planner: Planner, briefing: Briefing
+        self, config: MissionConfig, stack: Stack, planner: planners.Planner, briefing: Briefing
     ) -> None:
         self._stack = stack
         self._seed = config.seed
@@ -60,8 +59,8 @@ class Kernels:
             **settings_of(stack, collision.CollisionParams),
         )
         self._collision_state = collision.CollisionState()
-        self._planning_params = planning.StageParams(
-            clearance=PlanningParams(radius_m=stack.planner_radius_m),
+        self._planning_params = planners.PlanningParams(
+            radius_m=stack.planner_radius_m,
             smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max),
         )
         self._bounds_enu_m = briefing.bounds_enu_m
@@ -103,7 +102,7 @@ class Kernels:
         newest = request.trajectory_seq
         if self._stack.owns_sequence_numbers:
             newest, self._plans = self._plans, self._plans + 1
-        return planning.plan(
+        return planners.plan(
             self._planner,
             replace(request, trajectory_seq=_next_int32(newest)),
             snapshot,

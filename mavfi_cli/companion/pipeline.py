@@ -20,9 +20,8 @@ import numpy as np
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanRequest
-from mavfi_cli.autonomy.planners.base import Planner
-from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
-from mavfi_cli.autonomy.trajectory import waypoint_index
+from mavfi_cli.autonomy.planners import Planner
+from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState, waypoint_index
 from mavfi_cli.companion.executor import Executor, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import Pilot
-from mavfi_cli.autonomy.trajectory import without_waypoint
+from mavfi_cli.autonomy.tracking import without_waypoint
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.states import Message
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
-from mavfi_cli.autonomy.planners.base import Planner
+from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection, Protection

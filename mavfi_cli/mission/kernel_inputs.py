@@ -17,7 +17,7 @@ from mavfi_cli.attack.kernels.inputs import (
 )
 from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionInputs
-from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, TargetError
 from mavfi_cli.core.files import writing
@@ -134,7 +134,7 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
             bounds_enu_m=recorder.briefing.bounds_enu_m,
             seed=derive(config.seed, Stream.PLANNER, request.attempt),
         )
-        grid = pose_problem(
+        grid = PlanningProblem.pose(
             snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         ).grid
         if grid.point_free(task.goal_enu_m) and grid.point_free(task.start_enu_m):

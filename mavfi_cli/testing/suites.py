@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem, pose_problem
+from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.core.errors import ConfigError, LinkLost, ModelError
 from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect import base
@@ -282,7 +282,7 @@ class PlannerContract:
         params: PlanningParams = PARAMS,
     ) -> PlanningProblem:
         """Return the problem between start and goal, (3,), ENU, m, in a map."""
-        return pose_problem(snapshot, start, goal, BOUNDS, params)
+        return PlanningProblem.pose(snapshot, start, goal, BOUNDS, params)
 
     @pytest.fixture
     def name(self) -> str:

@@ -11,7 +11,6 @@ from mavfi_cli.autonomy.collision import (
     CollisionInputs,
     CollisionParams,
     CollisionState,
-    time_to_collision,
 )
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core.types import Trajectory
@@ -37,6 +36,12 @@ def wall(x=20.1, half_width=3.0):
     across = np.arange(-half_width, half_width, 0.2) + 0.1
     y, z = np.meshgrid(across, across + 5.0)
     return MapSnapshot.of_points(np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1))
+
+
+def time_to_collision(snapshot, trajectory, time_s, params):
+    return collision.step(CollisionState(), inputs(snapshot, trajectory, time_s), params)[
+        1
+    ].time_to_collision_s
 
 
 def inputs(snapshot, trajectory, time_s=0.0):

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mavfi_cli.autonomy import collision, planning, warm
+from mavfi_cli.autonomy import collision, planners, warm
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.planners import find
 from mavfi_cli.core.types import Trajectory
 
 BOUNDS = np.array([-5.0, -12.0, 1.0, 25.0, 12.0, 10.0])
@@ -37,9 +36,9 @@ def request(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0)):
 
 
 def plan(planner, asked, seed=1):
-    params = planning.StageParams()
-    return planning.plan(
-        find(planner), asked, blocks(), bounds_enu_m=BOUNDS, seed=seed, params=params
+    params = planners.PlanningParams()
+    return planners.plan(
+        planners.find(planner), asked, blocks(), bounds_enu_m=BOUNDS, seed=seed, params=params
     )
 
 
@@ -49,8 +48,11 @@ def test_plans_pass_the_collision_check_at_rest_and_in_motion():
         velocity = rng.uniform(-1, 1, 3) * [1.5, 1.5, 0.2] if seed % 2 else np.zeros(3)
         found = plan("rrtstar", request(velocity), seed)
         assert isinstance(found, Trajectory), found.reason
-        free_s = collision.time_to_collision(blocks(), found, 0.0, collision.CollisionParams())
-        assert free_s == math.inf
+        inputs = collision.CollisionInputs(
+            stamp_s=0.0, snapshot=blocks(), trajectory=found, time_s=0.0
+        )
+        _, checked = collision.step(collision.CollisionState(), inputs, collision.CollisionParams())
+        assert checked.time_to_collision_s == math.inf
         assert found.trajectory_seq == 5
         assert np.ptp(found.waypoints[:, 1:3]) > 0.5  # it goes round the blocks
 

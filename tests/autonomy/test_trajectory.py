@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy.trajectory import (
-    angle_between,
+from mavfi_cli.autonomy.tracking import (
     reference_waypoint,
     waypoint_index,
     without_waypoint,
@@ -107,5 +106,6 @@ def test_the_only_waypoint_stays():
     ("start", "end", "turn"), [(0, 1, 1), (3, -3, 2 * math.pi - 6), (-3, 3, 6 - 2 * math.pi)]
 )
 def test_turns(start, end, turn):
-    assert angle_between(float(start), float(end)) == pytest.approx(turn)
-    assert angle_between(start + 20 * math.pi, float(end)) == pytest.approx(turn)
+    for begin in (float(start), start + 20 * math.pi):
+        trajectory = made([[0.0] * 3 + [yaw] + [0.0] * 6 for yaw in (begin, end)])
+        assert reference_waypoint(trajectory, 0.25)[3] - begin == pytest.approx(turn / 2)

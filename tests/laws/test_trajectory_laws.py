@@ -10,10 +10,15 @@ from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionParams
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.autonomy.pilot import Departure
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
-from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
-from mavfi_cli.autonomy.trajectory import reference_waypoint, without_waypoint
+from mavfi_cli.autonomy.tracking import (
+    TrackingInputs,
+    TrackingParams,
+    TrackingState,
+    reference_waypoint,
+    without_waypoint,
+)
 from mavfi_cli.core.types import Trajectory
 
 PARAMS = SmoothingParams()
@@ -26,12 +31,19 @@ speeds = st.floats(0.0, 3.0)
 angles = st.floats(-math.pi, math.pi)
 
 
+def departing(velocity, yaw_rad):
+    return PlanRequest(
+        stamp_s=0.0, position_enu_m=np.zeros(3), velocity_enu_mps=np.array(velocity),
+        yaw_rad=yaw_rad, goal_enu_m=np.zeros(3), attempt=1, trajectory_seq=1,
+    )  # fmt: skip
+
+
 @st.composite
 def departures(draw):
     speed, azimuth, slope = draw(speeds), draw(angles), draw(st.floats(-0.5, 0.5))
     flat = speed * math.cos(slope)
     velocity = [flat * math.cos(azimuth), flat * math.sin(azimuth), speed * math.sin(slope)]
-    return Departure(stamp_s=0.0, velocity_enu_mps=np.array(velocity), yaw_rad=draw(angles))
+    return departing(velocity, draw(angles))
 
 
 def rows_of(trajectory):
@@ -39,7 +51,7 @@ def rows_of(trajectory):
     return times, np.array([reference_waypoint(trajectory, float(t)) for t in times])
 
 
-ONE_VERTEX_M = 1e-3  # vertices no farther apart are one (corners.polyline)
+ONE_VERTEX_M = 1e-3  # vertices no farther apart are one (see smoothing)
 
 
 def assert_flyable(trajectory, start, end, departure, end_atol=1e-9):
@@ -68,16 +80,15 @@ def assert_flyable(trajectory, start, end, departure, end_atol=1e-9):
 @settings(max_examples=150, deadline=None)
 @given(paths, departures())
 def test_any_path_is_flown_within_the_limits(path, departure):
-    made = smooth(path, OPEN, departure, PARAMS)
+    made, _ = smooth(path, OPEN, departure, PARAMS)
     last_leg_m = np.linalg.norm(path[-1] - path[-2])
     end_atol = 1e-9 if last_leg_m > ONE_VERTEX_M else ONE_VERTEX_M
-    assert_flyable(made.trajectory, path[0], path[-1], departure, end_atol)
+    assert_flyable(made, path[0], path[-1], departure, end_atol)
 
 
 def flown_trajectory():
     path = np.array([[0.0, 0, 5], [10, 0, 5], [14, 9, 6]])
-    departure = Departure(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0, trajectory_seq=1)
-    return smooth(path, OPEN, departure, PARAMS).trajectory
+    return smooth(path, OPEN, departing(np.zeros(3), 0.0), PARAMS)[0]
 
 
 def flip(array, flips):

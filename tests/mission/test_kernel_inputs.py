@@ -7,7 +7,7 @@ from missions import POSTS
 
 from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
 from mavfi_cli.autonomy import collision
-from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
+from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.core.errors import ConfigError, TargetError
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight, record_inputs
 from mavfi_cli.spec.mission import MissionConfig
@@ -37,7 +37,7 @@ def test_every_kernel_has_five_inputs_that_differ(inputs):
 
 def test_a_straight_line_answers_none_of_the_planning_problems(inputs):
     for task in (each.task for each in inputs):
-        posed = pose_problem(
+        posed = PlanningProblem.pose(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         )
         assert posed.grid.point_free(task.start_enu_m)
@@ -48,7 +48,7 @@ def test_a_straight_line_answers_none_of_the_planning_problems(inputs):
 def test_some_trajectories_are_free_and_some_are_not_if_the_flight_had_both(inputs):
     params, checks = collision.CollisionParams(), [each.check for each in inputs]
     times_s = [
-        collision.time_to_collision(check.snapshot, check.trajectory, check.time_s, params)
+        collision.step(collision.CollisionState(), check, params)[1].time_to_collision_s
         for check in checks
     ]
     assert sum(map(math.isinf, times_s)) >= 3

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mavfi_cli.autonomy import planning, point_cloud, tracking
+from mavfi_cli.autonomy import planners, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
 from mavfi_cli.companion import node_process
 from mavfi_cli.companion.executor import Executor, Node
@@ -84,7 +84,7 @@ def test_a_crashed_node_is_restarted_and_the_mission_goes_on(fly_short, at_invoc
 
 
 def test_a_planner_that_dies_over_the_first_plan_is_asked_again(fly_short, at_invocation):
-    at_invocation(planning, "plan", 1, crash)
+    at_invocation(planners, "plan", 1, crash)
     _, result = record(fly_short(isolate=("planner",)))
     assert (result["nodes"]["planner"]["restarts"], result["outcome"]) == (1, "success")
     assert result["pilot"]["plans_requested"] == 2

@@ -29,8 +29,8 @@ from mavfi_cli.attack.kernels.outputs import (
 )
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, tracking
 from mavfi_cli.autonomy.grid import segment_free
-from mavfi_cli.autonomy.planners.base import PlanningParams, pose_problem
-from mavfi_cli.autonomy.trajectory import waypoint_index
+from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
+from mavfi_cli.autonomy.tracking import waypoint_index
 from mavfi_cli.core.errors import TargetError, UnknownName
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _planner(name: str) -> Callable[[KernelInputs], Call]:
     def prepare(inputs: KernelInputs) -> Call:
         """Prepare a planner's call on the recorded task, with the problem already set up."""
         task, planner = inputs.task, planners.find(name)
-        problem = pose_problem(
+        problem = PlanningProblem.pose(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         )
 
