@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from golden_runs import MATERIAL, Run, apart, golden_runs, samples_of
 
-from mavfi_cli.core.states import BY_NAME, DType
+from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.detect.preprocess import DETECTED
 
 

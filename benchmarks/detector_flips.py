@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from golden_runs import MATERIAL, Run, apart, fresh_rows, golden_runs
 
-from mavfi_cli.core.states import DType
+from mavfi_cli.core.types import DType
 from mavfi_cli.detect import base
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.offline import replay

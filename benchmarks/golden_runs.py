@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.states import BY_NAME
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import BY_NAME, Stage
 from mavfi_cli.detect.offline import columns_of
 from mavfi_cli.detect.preprocess import NAMES, SPANS
 

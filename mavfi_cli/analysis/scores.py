@@ -20,8 +20,7 @@ from mavfi_cli.analysis.detector_pairs import NONE, harmful
 from mavfi_cli.analysis.detectors import Scored
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.states import BY_NAME
-from mavfi_cli.core.types import Stage, Trajectory
+from mavfi_cli.core.types import BY_NAME, Stage, Trajectory
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits

@@ -11,7 +11,7 @@ import click
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def states(as_json: bool) -> None:
     """List the monitored states, which are the injection sites of source-level faults."""
-    from mavfi_cli.core.states import STATES
+    from mavfi_cli.core.types import STATES
 
     rows = [
         {

@@ -27,17 +27,18 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
 from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
-from mavfi_cli.core.states import Message, of_stage
 from mavfi_cli.core.types import (
     Briefing,
     CollisionReport,
     Command,
     DepthFrame,
+    Message,
     PointCloud,
     Reaction,
     Stage,
     Trajectory,
     VehicleState,
+    of_stage,
 )
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.injector import Moment

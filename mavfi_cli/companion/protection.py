@@ -38,8 +38,7 @@ import numpy as np
 from mavfi_cli.autonomy.pilot import Pilot
 from mavfi_cli.autonomy.tracking import without_waypoint
 from mavfi_cli.core.compiled import in_cache
-from mavfi_cli.core.states import Message
-from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
+from mavfi_cli.core.types import CollisionReport, Command, Message, Stage, Trajectory, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.detect.preprocess import take_tick

@@ -1,10 +1,17 @@
-"""Messages between kernels: frozen records in SI units, ENU world frame and FLU body frame."""
+"""Messages between kernels, and the table of their monitored states.
+
+Messages are frozen records in SI units, ENU world frame and FLU body frame. A state is a scalar, or
+one component of a vector, that one kernel passes to the next. fi, detect and report iterate over
+the table. All reads and writes of a state go through it, so that no other module knows its place.
+Source of the list: paper, section IV-C and V-A; reference facts, sections 1.3 and 1.4.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,3 +151,86 @@ class StackMark:
 
     name: str
     digest: str
+
+
+Message = CollisionReport | Trajectory | Command
+Scalar = float | int | bool
+_STAGES: dict[type[Message], Stage] = {
+    CollisionReport: Stage.PERCEPTION, Trajectory: Stage.PLANNING, Command: Stage.CONTROL,
+}  # fmt: skip
+
+
+class DType(Enum):
+    """Storage type of a state, whose bits a fault flips."""
+
+    FLOAT64 = "float64"
+    INT32 = "int32"
+    BOOL = "bool"
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A monitored inter-kernel state and injection site."""
+
+    name: str
+    message: type[Message]
+    source: str  # field of the message: a scalar, or an array with a row per waypoint or axis
+    unit: str = "1"
+    _: KW_ONLY
+    column: int | None = None  # of a waypoint, or of a vector
+    dtype: DType = DType.FLOAT64
+    group: str = ""  # states that the paper corrupts together, e.g. components of a velocity
+    detected: bool = False  # True for the 13 inputs of the autoencoder
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "group", self.group or self.name)
+
+    @property
+    def stage(self) -> Stage:
+        """Stage that outputs the state."""
+        return _STAGES[self.message]
+
+    def read(self, message: Message, index: int) -> Scalar:
+        """Return the value in a message; `index` is that of the waypoint."""
+        value: Any = getattr(message, self.source)
+        return float(value[self._place(index)]) if isinstance(value, np.ndarray) else value
+
+    def write(self, message: Message, index: int, value: Scalar) -> Message:
+        """Return a copy of a message with the value; `index` is that of the waypoint."""
+        changed: Any = getattr(message, self.source)
+        if isinstance(changed, np.ndarray):
+            changed = changed.copy()
+            changed[self._place(index)] = value
+        else:
+            changed = value
+        return replace(message, **{self.source: changed})
+
+    def _place(self, index: int) -> Any:
+        if self.message is not Trajectory:
+            return self.column
+        return index if self.column is None else (index, self.column)
+
+
+_KINDS = [("position", "m")] * 3 + [("yaw", "rad")]  # of the columns of a waypoint
+_KINDS += [("velocity", "m/s")] * 3 + [("acceleration", "m/s^2")] * 3
+STATES: tuple[State, ...] = (
+    State("time_to_collision", CollisionReport, "time_to_collision_s", "s", detected=True),
+    State("future_collision_seq", CollisionReport, "future_collision_seq", dtype=DType.INT32,
+          detected=True),
+    State("collision", CollisionReport, "collision", dtype=DType.BOOL),
+    *(State(f"waypoint_{name}", Trajectory, "waypoints", _KINDS[column][1], column=column,
+            group=f"waypoint_{_KINDS[column][0]}", detected=_KINDS[column][0] != "acceleration")
+      for column, name in enumerate(WAYPOINT_FIELDS)),
+    State("waypoint_duration", Trajectory, "durations_s", "s"),
+    *(State(f"plan_{name}", Trajectory, name, dtype=DType.INT32)
+      for name in ("trajectory_seq", "future_collision_seq")),
+    *(State(f"command_v{axis}", Command, "velocity_enu_mps", "m/s", column=column,
+            group="command_velocity", detected=True) for column, axis in enumerate("xyz")),
+    State("command_yaw", Command, "yaw_rad", "rad", detected=True),
+)  # fmt: skip
+BY_NAME: dict[str, State] = {state.name: state for state in STATES}
+
+
+def of_stage(stage: Stage) -> tuple[State, ...]:
+    """Return the states that a stage outputs, in table order."""
+    return tuple(state for state in STATES if state.stage is stage)

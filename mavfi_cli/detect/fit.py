@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.states import DType
-from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.core.types import DType, FloatArray, Stage
 from mavfi_cli.detect import gaussian, span
 from mavfi_cli.detect.autoencoder import CODED, HIDDEN, AutoencoderDetector
 from mavfi_cli.detect.base import Detector

@@ -19,8 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.states import BY_NAME, STATES, DType
-from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
+from mavfi_cli.core.types import (
+    BY_NAME,
+    STATES,
+    CollisionReport,
+    Command,
+    DType,
+    FloatArray,
+    Stage,
+    Trajectory,
+)
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate

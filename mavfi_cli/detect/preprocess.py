@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.states import STATES, DType, State
-from mavfi_cli.core.types import FloatArray, Stage
+from mavfi_cli.core.types import STATES, DType, FloatArray, Stage, State
 
 Codes = NDArray[np.int16]
 IntArray = NDArray[np.int64]

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mavfi_cli.core.states import BY_NAME, Message, Scalar
-from mavfi_cli.core.types import CollisionReport, Trajectory
+from mavfi_cli.core.types import BY_NAME, CollisionReport, Message, Scalar, Trajectory
 from mavfi_cli.detect.preprocess import LIMIT, Codes
 
 EXTENDED = tuple(

@@ -12,7 +12,7 @@ import numpy as np
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import file_digest
-from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import BY_NAME
 from mavfi_cli.mission.record.run_folder import Run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import measured_factor

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from mavfi_cli.analysis.flights import chosen, flags
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.states import BY_NAME, DType
+from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.flights import (
     by_value,
     comparable,

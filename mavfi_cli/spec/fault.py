@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import BY_NAME
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.source.fault import (
     GROUPS,

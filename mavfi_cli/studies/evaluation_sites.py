@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.seeds import Stream, derive
-from mavfi_cli.core.states import DType
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import DType, Stage
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 

@@ -1,8 +1,16 @@
 import numpy as np
 import pytest
 
-from mavfi_cli.core.states import BY_NAME, STATES, DType, of_stage
-from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.core.types import (
+    BY_NAME,
+    STATES,
+    CollisionReport,
+    Command,
+    DType,
+    Stage,
+    Trajectory,
+    of_stage,
+)
 
 TRAJECTORY = Trajectory(
     stamp_s=1.0,

@@ -17,7 +17,7 @@ from pyarrow.parquet import read_schema
 
 from mavfi_cli import cli
 from mavfi_cli.analysis.flights import EXPORTED
-from mavfi_cli.core.states import BY_NAME
+from mavfi_cli.core.types import BY_NAME
 from mavfi_cli.spec.mission import MissionConfig
 
 ROOT = Path(__file__).parents[2]

@@ -18,8 +18,14 @@ from mavfi_cli.core.files import (
     write_parquet,
     write_text,
 )
-from mavfi_cli.core.states import STATES
-from mavfi_cli.core.types import CollisionReport, Command, Reaction, Trajectory, VehicleState
+from mavfi_cli.core.types import (
+    STATES,
+    CollisionReport,
+    Command,
+    Reaction,
+    Trajectory,
+    VehicleState,
+)
 from mavfi_cli.mission import briefing
 from mavfi_cli.mission.record import quality
 from mavfi_cli.mission.record.run_folder import RunFolder, load_run

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from missions import RECORD
 
-from mavfi_cli.core.states import STATES
+from mavfi_cli.core.types import STATES
 from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.record.tables import read_plans
 

@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.analysis.detector_pairs import NONE
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
-from mavfi_cli.core.states import BY_NAME, DType
+from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.detect import model as model_file
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.model import Model, training_flights

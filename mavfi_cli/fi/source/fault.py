@@ -17,8 +17,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.states import BY_NAME, State, of_stage
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import BY_NAME, Stage, State, of_stage
 from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field, mask_of
 
 

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.states import Message, Scalar, State
-from mavfi_cli.core.types import CollisionReport, Command, Trajectory
+from mavfi_cli.core.types import CollisionReport, Command, Message, Scalar, State, Trajectory
 from mavfi_cli.fi import bits as bit_operations
 from mavfi_cli.fi.source.fault import (
     Corruption,

@@ -11,14 +11,18 @@ import numpy as np
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import read_parquet, write_parquet
-from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, State
 from mavfi_cli.core.types import (
+    BY_NAME,
+    STATES,
     WAYPOINT_FIELDS,
     CollisionReport,
     Command,
+    DType,
     FloatArray,
     Invocation,
+    Message,
     Reaction,
+    State,
     Trajectory,
     VehicleState,
 )

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.core.states import of_stage
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import Stage, of_stage
 from mavfi_cli.report.drawing import rgb
 from mavfi_cli.report.view import (
     Boxes,

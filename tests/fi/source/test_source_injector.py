@@ -7,8 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.core.errors import BitOutsideWidth, FaultSpecError, FieldUnavailable, UnknownName
-from mavfi_cli.core.states import BY_NAME, STATES, DType, Message, of_stage
-from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
+from mavfi_cli.core.types import (
+    BY_NAME,
+    STATES,
+    CollisionReport,
+    Command,
+    DType,
+    Message,
+    Stage,
+    Trajectory,
+    of_stage,
+)
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
 from mavfi_cli.fi.source.fault import (
     GROUPS,
