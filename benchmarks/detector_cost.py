@@ -22,7 +22,7 @@ from missions import fly
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect import base
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.mission.record.detection_cost import detection_cost
+from mavfi_cli.mission.measures import detection_cost
 from mavfi_cli.spec.detector import DetectorConfig, detector_of
 
 CALM = ("--stack", "hardened", "--world", "dense")

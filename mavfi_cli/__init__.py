@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from mavfi_cli.core.installed import __version__
     from mavfi_cli.fi.value import inject
     from mavfi_cli.library import campaign, fly
-    from mavfi_cli.mission.record.run_folder import load_run
-    from mavfi_cli.mission.repetition import paired_golden
+    from mavfi_cli.mission.run import paired_golden
+    from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.spec.detector import DetectorConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
@@ -47,8 +47,8 @@ _MODULES = {  # name -> module that defines it
     "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.value",
-    "load_run": "mavfi_cli.mission.record.run_folder",
-    "paired_golden": "mavfi_cli.mission.repetition",
+    "load_run": "mavfi_cli.mission.run_folder",
+    "paired_golden": "mavfi_cli.mission.run",
     "run_campaign": "mavfi_cli.campaigns.run",
 }
 

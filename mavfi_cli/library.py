@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mavfi_cli.mission.progress import Recorder, Watcher
-    from mavfi_cli.mission.record.run_folder import Run
+    from mavfi_cli.mission.run_folder import Run
     from mavfi_cli.spec.mission import MissionConfig
 
 
@@ -47,8 +47,8 @@ def fly(
 
         start_early(PROGRAM)
     from mavfi_cli.mission.progress import Watcher
-    from mavfi_cli.mission.record.run_folder import load_run
     from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.run_folder import load_run
 
     folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder)
     return load_run(folder.path)

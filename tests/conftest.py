@@ -22,7 +22,7 @@ from mavfi_cli import cli
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
-from mavfi_cli.mission.vehicle import start_vehicle
+from mavfi_cli.mission.vehicle import Vehicle
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 from sitl.camera.component import COMPONENT_ID, Camera
@@ -43,7 +43,7 @@ def fly_short(tmp_path_factory):
     """Fly the short mission with changes, in this process; its run folder."""
     out = tmp_path_factory.mktemp("runs")
 
-    def fly(watcher=None, *, launch=start_vehicle, **changes):
+    def fly(watcher=None, *, launch=Vehicle.start, **changes):
         if "link" in changes and not changes.get("eyes"):  # a flight without a world
             changes = {"world": MissionConfig().world, "start": None, **changes}
         return fly_mission(replace(SHORT, **changes), out, watcher or Watcher(), launch=launch)

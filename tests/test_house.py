@@ -100,7 +100,9 @@ def test_tables_csv_and_pictures_are_made_in_report_only():
         r"^\s*(import csv|from csv|from pyarrow import .*csv|from rich\.table|.*import.*matplotlib)"
     )
     assert mentions(made, room="mavfi_cli.report") == {"sitl.world.draw"}  # the vehicle's own
-    assert mentions(r"report\.columns import", room="mavfi_cli.report") <= {"mavfi_cli.cli.doctor"}
+    assert mentions(r"report\.columns import", room="mavfi_cli.report") <= {
+        "mavfi_cli.cli.inventory"
+    }
 
 
 def test_the_command_line_holds_no_data():
@@ -135,6 +137,6 @@ def test_every_public_function_has_a_caller():
 
 
 def test_a_record_is_read_in_one_module():
-    """Others take sections and measures from `mission.record.measures`."""
+    """Others take sections and measures from `mission.measures`."""
     reads = r"\bresult(\[|\.get\()[\"']"
-    assert mentions(reads) == {"mavfi_cli.mission.record.run_folder"}  # upgrades older records
+    assert mentions(reads) == {"mavfi_cli.mission.run_folder"}  # upgrades older records

@@ -26,9 +26,14 @@ from mavfi_cli.campaigns.missions import (
     changes_of,
 )
 from mavfi_cli.core.types import FloatArray, Outcome
-from mavfi_cli.mission.record.detection_cost import RECOMPUTED, detection_cost
-from mavfi_cli.mission.record.measures import STRUCK, measures_of, record_of
-from mavfi_cli.mission.record.quality import QUALITY
+from mavfi_cli.mission.measures import (
+    QUALITY,
+    RECOMPUTED,
+    STRUCK,
+    detection_cost,
+    measures_of,
+    record_of,
+)
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
@@ -48,7 +53,7 @@ IntArray = NDArray[np.int64]
 def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     """The finished missions; those that could not begin have the state `error`.
 
-    Columns: what `mission.record.measures` tells of a record, of CONFIG and of the fault's FAULT
+    Columns: what `mission.measures` tells of a record, of CONFIG and of the fault's FAULT
     what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
     `counted`: golden, or with a fault that struck something that was read or caught; and the shares
     of the flight time that detection takes (`check_share`) and recovery (`recovery_share_STAGE`).

@@ -19,8 +19,8 @@ from mavfi_cli.analysis.groups import RESAMPLES, Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.record.detection_cost import HOST_CHECKS, DetectionCost, detection_cost
-from mavfi_cli.mission.record.run_folder import RESULT, load_run
+from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost, detection_cost
+from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval
 

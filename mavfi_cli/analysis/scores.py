@@ -24,8 +24,7 @@ from mavfi_cli.core.types import BY_NAME, Stage, Trajectory
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.record.tables import read_plans
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
 
 SCORES = "scores.json"
@@ -56,7 +55,7 @@ def _kept_of(path: Path) -> _Kept:
         for change in strike["changes"]
         if change["state"] in BY_NAME and BY_NAME[change["state"]].stage is Stage.PLANNING
     ]  # fmt: skip
-    return _Kept(columns=columns_of(run.trace), plans=read_plans(run.folder.plans), strikes=strikes)
+    return _Kept(columns=columns_of(run.trace), plans=run.folder.read_plans(), strikes=strikes)
 
 
 def _value(state: str, pattern: str) -> float | int | bool:

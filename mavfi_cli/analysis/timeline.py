@@ -12,8 +12,7 @@ from typing import Any
 
 from mavfi_cli.companion.pipeline import SAME_TICK_S
 from mavfi_cli.core.types import Invocation, Outcome, Reaction
-from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.mission.record.tables import read_timetable
+from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.spec.platform import KERNELS
 
 CHAIN = (
@@ -56,13 +55,12 @@ def _timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, An
     Raises:
         RecordError: the time table cannot be read.
     """
-    timetable = read_timetable(run.folder.kernels)
+    ran, reactions = run.folder.read_timetable()
     told = {e["stamp_s"]: e["text"] for e in run.record.events if e["kind"] in _ANSWERS}
     stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
-    reaction = typical(timetable.reactions, told)
+    reaction = typical(reactions, told)
     if reaction is None:
         return None
-    ran = timetable.invocations
     zero_s, answer_s = reaction.frame_stamp_s, reaction.setpoint_stamp_s
     chain = chain_of(ran, reaction)
     plan = _planned(ran, answer_s) if answer_s in told else None

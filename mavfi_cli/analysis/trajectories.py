@@ -11,8 +11,8 @@ from mavfi_cli.analysis.groups import TREATMENT, untreated
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.record.measures import fields_of
-from mavfi_cli.mission.record.run_folder import RESULT
+from mavfi_cli.mission.measures import fields_of
+from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"

@@ -32,7 +32,7 @@ from mavfi_cli.core.errors import (
     VehicleProcessError,
 )
 from mavfi_cli.core.files import write_text
-from mavfi_cli.mission.record.measures import fields_of
+from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig

@@ -27,7 +27,7 @@ from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.campaigns.workers import TASK, AttemptEnd, CampaignStopped, LocalWorkers, Workers
 from mavfi_cli.core.fork_server import SCRATCH
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.mission.record.run_folder import FAULT, RESULT
+from mavfi_cli.mission.run_folder import FAULT, RESULT
 
 if TYPE_CHECKING:
     from distributed import Client, Future

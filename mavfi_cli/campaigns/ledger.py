@@ -33,7 +33,7 @@ from mavfi_cli.campaigns.missions import (
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import plain
-from mavfi_cli.mission.record.measures import fields_of, record_of
+from mavfi_cli.mission.measures import fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 SCHEMA = 1

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
-from mavfi_cli.mission.record.measures import FlightRecord, record_of
+from mavfi_cli.mission.measures import FlightRecord, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None

@@ -40,8 +40,8 @@ from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.processes import interruptible
-from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.run_folder import RESULT
+from mavfi_cli.mission.measures import record_of
+from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
 
 WORK, PROFILES = "work", "profiles"

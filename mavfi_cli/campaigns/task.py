@@ -13,11 +13,11 @@ def prepare() -> None:
 
     import mavfi_cli.mission.run
     from mavfi_cli.autonomy import warm
-    from mavfi_cli.mission import vehicle
+    from mavfi_cli.mission.vehicle import VehicleInProcess
 
     assert mavfi_cli.mission.run
     warm.warm_up()
-    vehicle.warm_up()
+    VehicleInProcess.warm_up()
 
 
 def perform(changes: Mapping[str, Any], out: Path) -> Path:

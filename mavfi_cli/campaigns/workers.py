@@ -18,8 +18,8 @@ from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.run_folder import RunFolder
+from mavfi_cli.mission.measures import record_of
+from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.spec.fault import PROCESS
 
 

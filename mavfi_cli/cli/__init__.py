@@ -17,7 +17,7 @@ _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
     "sitl": ("sitl", "Run the simulated vehicle alone, for any MAVLink client."),
     "world": ("sitl.world", "List, make, check and draw worlds."),
-    "replay": ("mavfi_cli.cli.replay", "Repeat a run and compare the records."),
+    "replay": ("mavfi_cli.cli.runs", "Repeat a run and compare the records."),
     "kernels": ("mavfi_cli.cli.kernels", "Flip bits in isolated kernels, one fault per run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
     "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
@@ -26,12 +26,12 @@ _COMMANDS = {
     "report": ("mavfi_cli.cli.paper", "Write one page: the paper's claims beside flown missions."),
     "compare": ("mavfi_cli.cli.compare", "Fly the same missions on several platforms."),
     "vpm": ("mavfi_cli.cli.vpm", "Model the cost of DMR and TMR in speed, time and energy."),
-    "platforms": ("mavfi_cli.cli.platforms", "List the compute platforms and their latencies."),
-    "stacks": ("mavfi_cli.cli.stacks", "List and compare the stacks of the companion."),
-    "states": ("mavfi_cli.cli.states", "List the states that can be corrupted."),
-    "show": ("mavfi_cli.cli.show", "Summarise a recorded run."),
+    "platforms": ("mavfi_cli.cli.inventory", "List the compute platforms and their latencies."),
+    "stacks": ("mavfi_cli.cli.inventory", "List and compare the stacks of the companion."),
+    "states": ("mavfi_cli.cli.inventory", "List the states that can be corrupted."),
+    "show": ("mavfi_cli.cli.runs", "Summarise a recorded run."),
     "view": ("mavfi_cli.cli.view", "Look at a recorded run in rerun or Foxglove."),
-    "doctor": ("mavfi_cli.cli.doctor", "Test what works on this machine."),
+    "doctor": ("mavfi_cli.cli.inventory", "Test what works on this machine."),
 }
 
 

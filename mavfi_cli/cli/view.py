@@ -9,7 +9,7 @@ import click
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.progress import Recorder
-    from mavfi_cli.mission.record.run_folder import Run
+    from mavfi_cli.mission.run_folder import Run
 
 
 @click.command()
@@ -23,7 +23,7 @@ def view(run: Path, save: Path | None) -> None:
     The mission is flown again, because depth frames, clouds and maps are not in the record. A
     flight with a fault is shown together with its golden flight, which is flown once and kept.
     """
-    from mavfi_cli.mission.record.run_folder import load_run
+    from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report import view as viewers
     from mavfi_cli.report.view import ViewedFlight
 
@@ -46,7 +46,7 @@ def view(run: Path, save: Path | None) -> None:
 def _golden(run: Run) -> Run | None:
     """Return the golden flight of the pair; None if it cannot be flown."""
     from mavfi_cli.core.errors import RecordError
-    from mavfi_cli.mission.repetition import paired_golden
+    from mavfi_cli.mission.run import paired_golden
 
     try:
         return paired_golden(run, _note)
@@ -58,11 +58,10 @@ def _golden(run: Run) -> Run | None:
 def _again(run: Run) -> Recorder | None:
     """Fly a run again and return what its nodes received; None if it does not repeat."""
     from mavfi_cli.core.errors import RecordError
-    from mavfi_cli.mission.repetition import watch_again
-    from mavfi_cli.mission.replay import config_of
+    from mavfi_cli.mission.run import watch_again
 
     try:
-        config = config_of(run)
+        config = run.mission()
         _note(f"flying again: {config.world}, seed {config.seed}")
         recorder, same = watch_again(run)
     except RecordError as error:

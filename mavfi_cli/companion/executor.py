@@ -23,20 +23,74 @@ from __future__ import annotations
 import contextlib
 import functools
 import heapq
+import math
 import types
 from collections.abc import Callable, Coroutine, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeAlias, TypeVar
 
+import numpy as np
+
 from mavfi_cli.companion.node_process import NodeLost, NodeProcess
+from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import Invocation
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.spec.platform import KERNELS, PlatformProfile
 
 In = TypeVar("In")
 Out = TypeVar("Out")
 AnyNode: TypeAlias = "Node[Any, Any]"
 Turn: TypeAlias = "Coroutine[tuple[AnyNode, Any], Any, None]"
 _SAME_S = 1e-9
+
+
+class LatencyModel:
+    """Draws the latency of each invocation from a platform profile.
+
+    Each kernel has its own random stream, so the number of calls of one kernel never changes the
+    latencies of another. On a measured platform the latency is the host time of the kernel's newest
+    invocation, times the profile's factor.
+    """
+
+    def __init__(
+        self, profile: PlatformProfile, root_seed: int, wall: WallClock | None = None
+    ) -> None:
+        self._profile, self._wall = profile, wall
+        self._streams = {kernel: generator(root_seed, Stream.LATENCY, kernel) for kernel in KERNELS}
+        self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
+
+    def draw_s(self, kernel: str) -> float:
+        """Return the latency of the next invocation of a kernel, or of its measured one, s."""
+        if self._profile.measured_factor is not None:
+            assert self._wall is not None
+            host_s = self._wall.newest.get(kernel, 0.0)
+            self._host_s[kernel].append(host_s)
+            return self._profile.measured_factor * host_s
+        latency = self._profile.kernels[kernel]
+        if latency.spread == 0.0:
+            return latency.latency_s
+        return latency.latency_s * math.exp(
+            latency.spread * float(self._streams[kernel].standard_normal())
+        )
+
+    def summary(self) -> dict[str, Any] | None:
+        """Return the factor of a measured platform, and each kernel's medians, s; else None."""
+        factor = self._profile.measured_factor
+        if factor is None:
+            return None
+        medians = {kernel: float(np.median(s)) for kernel, s in self._host_s.items() if s}
+        return {
+            "platform": self._profile.name,
+            "factor": factor,
+            "kernels": {
+                kernel: {
+                    "host_median_s": median_s,
+                    "latency_median_s": factor * median_s,
+                    "invocations": len(self._host_s[kernel]),
+                }
+                for kernel, median_s in medians.items()
+            },
+        }
 
 
 class TurnOver(Exception):
@@ -134,6 +188,7 @@ class Executor:
         compute_first: Draw an invocation's latency after its computation.
         restart_s: Simulated time from a node's end until its successor is ready, s.
         watchdog_s: Simulated time after which an unfinished invocation is killed, s.
+        on_start: Called with node, input and start stamp of each invocation.
     """
 
     draw_latency_s: Callable[[str], float]
@@ -142,6 +197,7 @@ class Executor:
     compute_first: bool = False
     restart_s: float = 1.0
     watchdog_s: float = 5.0
+    on_start: Callable[[str, Any, float], None] = lambda _node, _input, _start_s: None
     now_s: float = 0.0
     nodes: dict[str, AnyNode] = field(default_factory=dict)
     losses: list[_Loss] = field(default_factory=list)
@@ -271,6 +327,7 @@ class Executor:
     def _begin_job(self, node: AnyNode, value: Any) -> _Job:
         node.invocations += 1
         node.on_start(value, self.now_s)
+        self.on_start(node.name, value, self.now_s)
         return _Job(node=node, start_s=self.now_s, input=value)
 
     def _book(self, job: _Job) -> float:

@@ -22,10 +22,9 @@ from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState, waypoint_index
-from mavfi_cli.companion.executor import Executor, Node, TurnOver
+from mavfi_cli.companion.executor import Executor, LatencyModel, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
-from mavfi_cli.companion.latency import LatencyModel
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.types import (
     Briefing,

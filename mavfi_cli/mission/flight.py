@@ -8,11 +8,9 @@ process of its own simulates the next tick while the heavy kernels run.
 from __future__ import annotations
 
 import contextlib
-import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -36,12 +34,8 @@ from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
 from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.mission.briefing import require_flyable
-from mavfi_cli.mission.flight_logger import FlightLogger
-from mavfi_cli.mission.foreign_clock import ForeignClock
-from mavfi_cli.mission.progress import Recorder, Watcher
-from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.tables import Trace
+from mavfi_cli.mission.progress import FlightLogger, Recorder, Watcher
+from mavfi_cli.mission.run_folder import Trace
 from mavfi_cli.mission.vehicle import signing_of
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
@@ -53,15 +47,55 @@ IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
+_PACE_AFTER_S = 1.0  # wall time after which the pace of a foreign vehicle is known
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
 
-def _start(
-    before: Callable[[Any, float], None], recorder: Recorder, node: str, value: Any, start_s: float
-) -> None:
-    """Tell the start of an invocation to whoever is told already, and to a recorder."""
-    before(value, start_s)
-    recorder.on_start(node, value, start_s)
+class ForeignClock:
+    """Time of a foreign vehicle, heard only in the stamps of its states, and of the wall.
+
+    Between two states the vehicle's clock is estimated. It runs at the pace that the flight has had
+    so far, but no faster than the wall's clock: a simulator may be slower than real time.
+
+    Args:
+        wall: Clock of the wall, s.
+
+    Attributes:
+        stamp_s: Stamp of the newest state; 0 before the first.
+        heard: True once a state has arrived.
+    """
+
+    def __init__(self, wall: Callable[[], float] = time.monotonic) -> None:
+        self._wall = wall
+        self._first = (0.0, 0.0)  # stamp and wall time of the first state
+        self._waited_s = 0.0
+        self._pace = 1.0
+        self.stamp_s = 0.0
+        self.heard = False
+
+    def hear(self, stamp_s: float) -> None:
+        """Note a new state."""
+        now_s = self._wall()
+        if not self.heard or stamp_s < self.stamp_s:
+            self.heard, self._first, self._pace = True, (stamp_s, now_s), 1.0
+        self.stamp_s, self._waited_s = stamp_s, 0.0
+        flown_s, passed_s = stamp_s - self._first[0], now_s - self._first[1]
+        if passed_s >= _PACE_AFTER_S:
+            self._pace = min(1.0, flown_s / passed_s)
+
+    def wait(self, waited_s: float) -> None:
+        """Note a time on the wall's clock without a new state."""
+        self._waited_s += waited_s
+
+    @property
+    def silence_s(self) -> float:
+        """Time without a new state that has passed on the vehicle's clock and on the wall's."""
+        return self._waited_s * self._pace
+
+    @property
+    def now_s(self) -> float:
+        """Estimate of the vehicle's time."""
+        return self.stamp_s + self.silence_s
 
 
 class Flight:
@@ -76,6 +110,7 @@ class Flight:
         planner: Planner,
         watcher: Watcher,
         interrupts: Sequence[int],
+        injection: NoInjection,
     ) -> None:
         self._config = config
         self._stack = stack
@@ -99,7 +134,7 @@ class Flight:
         self._patience_s = SILENCE_S if config.autopilot == OWN_AUTOPILOT else BOOT_S
         self._briefing: Briefing | None = None
         self.companion: Companion | None = None
-        self.injection = NoInjection()
+        self.injection = injection
         self.logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
@@ -142,20 +177,22 @@ class Flight:
         if self._session.failure is not None:
             raise self._session.failure
 
-    def brief(self, briefing: Briefing) -> None:
-        """Set goal and camera mounting, and create the companion."""
-        require_flyable(briefing, self._config.takeoff_height_m, self._stack.goal_tolerance_m)
+    def brief(self, briefing: Briefing, recorder: Recorder | None) -> Companion:
+        """Set goal and camera mounting, and create the companion.
+
+        Args:
+            recorder: Keeps the briefing and the inputs of the nodes.
+        """
+        config, protection = self._config, NoProtection()
+        config.require_flyable(briefing, self._stack.goal_tolerance_m)
         self._briefing = briefing
-        detector = self._config.detector
-        protection = NoProtection()
-        if detector is not None:
-            protection = Protection(detector, self._config.stack, self.wall)
-        if self._config.fault is not None:
-            self.injection = SourceInjection(
-                self._config.fault, self._shortest_flight_s(briefing), protection
-            )
+        if config.detector is not None:
+            protection = Protection(config.detector, config.stack, self.wall)
+        if config.fault is not None:
+            shortest_s = self._shortest_flight_s(briefing)
+            self.injection = SourceInjection(config.fault, shortest_s, protection)
         self.companion = Companion(
-            self._config,
+            config,
             self._stack,
             self._platform,
             self._planner,
@@ -164,13 +201,10 @@ class Flight:
             self.injection,
             protection,
         )
-
-    def record(self, recorder: Recorder) -> None:
-        """Attach a recorder of the nodes' inputs. Call it after `brief`."""
-        assert self.companion is not None
-        recorder.briefing = self._briefing
-        for name, node in self.companion.executor.nodes.items():
-            node.on_start = functools.partial(_start, node.on_start, recorder, name)
+        if recorder is not None:
+            recorder.briefing = briefing
+            self.companion.executor.on_start = recorder.on_start
+        return self.companion
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return a lower bound of the flight time.
@@ -438,17 +472,6 @@ class Flight:
     # Record ---------------------------------------------------------------------------------------
 
     @property
-    def goal_enu_m(self) -> FloatArray | None:
-        """Goal (3,), m; None before the briefing."""
-        return None if self._briefing is None else self._briefing.goal_enu_m
-
-    @property
     def goal_tolerance_m(self) -> float:
         """Distance from the goal that counts as reached, m: the mission's own, or the stack's."""
         return self._stack.goal_tolerance_m
-
-    def own_quality(self) -> dict[str, float | None]:
-        """Return the part of the quality of flight that the companion can compute."""
-        if self.goal_enu_m is None:
-            return dict.fromkeys(quality.QUALITY)
-        return quality.from_states(*self.trace.motion(), self.goal_enu_m)

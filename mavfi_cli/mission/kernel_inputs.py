@@ -23,7 +23,6 @@ from mavfi_cli.core.errors import ConfigError, TargetError
 from mavfi_cli.core.files import writing
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.mission.progress import Recorder
-from mavfi_cli.mission.record.measures import record_of
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -78,7 +77,7 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
 def _flown(config: MissionConfig) -> Recorder:
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
-        flight = record_of(fly_golden(config, Path(scratch), recorder))
+        flight = fly_golden(config, Path(scratch), recorder).record
     if not flight.succeeded:
         problem = f"ended with {flight.outcome}: {flight.reason}"
         raise TargetError(_flight_name(config), problem)

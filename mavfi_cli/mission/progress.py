@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.core.types import Briefing
+import numpy as np
+
+from mavfi_cli.autonomy.pilot import PilotMode
+from mavfi_cli.core.types import Briefing, VehicleState
+from mavfi_cli.link.session import OffboardSession, Phase
+
+if TYPE_CHECKING:
+    from mavfi_cli.companion.injection import NoInjection
+    from mavfi_cli.companion.pipeline import Companion
+
+_PROGRESS_EVERY_S = 1.0
+_MODES = {  # kind and text of the event with which a mode of the pilot begins
+    PilotMode.SLOWING: ("slow", "slows down before an obstacle"),
+    PilotMode.STOPPING: ("stop", "stops before an obstacle"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,3 +66,80 @@ class Recorder:
     def on_start(self, node: str, value: Any, start_s: float) -> None:
         """Record the start of an invocation."""
         self.orders.setdefault(node, []).append((value, start_s))
+
+
+class FlightLogger:
+    """Finds events by comparing each tick with the last, and tells them to a watcher."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self.events: list[Event] = []
+        self._watcher = watcher
+        self._phase: Phase | None = None
+        self._mode: PilotMode | None = None
+        self._texts = 0
+        self._losses = 0
+        self._next_progress_s = 0.0
+
+    def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
+        """Log an event at the vehicle's position."""
+        place = None
+        if state is not None:
+            x, y, z = (round(float(c), 3) for c in state.position_enu_m)
+            place = (x, y, z)
+        event = Event(stamp_s=round(stamp_s, 3), kind=kind, text=text, position_enu_m=place)
+        self.events.append(event)
+        self._watcher.on_event(event)
+
+    def tell(
+        self,
+        stamp_s: float,
+        session: OffboardSession,
+        companion: Companion | None,
+        injection: NoInjection,
+    ) -> None:
+        """Log the events of a tick, and report progress once per simulated second."""
+        state, phase = session.state, session.phase
+        if phase is not self._phase:
+            self._phase = phase
+            self.note(stamp_s, "phase", phase.value, state)
+        texts = session.telemetry.texts
+        for each in texts.since(self._texts):
+            self.note(stamp_s, "autopilot", each.text.strip(), state)
+        self._texts = texts.total
+        for text in injection.news():
+            self.note(stamp_s, "fault", text, state)
+        if companion is not None:
+            self._tell_of(companion, stamp_s, session)
+        if state is not None and stamp_s >= self._next_progress_s:
+            self._next_progress_s = stamp_s + _PROGRESS_EVERY_S
+            flies = companion is not None and phase is Phase.OFFBOARD
+            self._watcher.on_progress(
+                FlightProgress(
+                    stamp_s=stamp_s,
+                    phase=companion.mode.value if flies and companion else phase.value,
+                    speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
+                    goal_distance_m=None if companion is None else companion.goal_distance_m(state),
+                    replans=0 if companion is None else companion.pilot.counters.replans,
+                )
+            )
+
+    def _tell_of(self, companion: Companion, stamp_s: float, session: OffboardSession) -> None:
+        """Log alarms, losses of nodes, and a new mode of the pilot."""
+        for text in companion.protection.news():
+            self.note(stamp_s, "alarm", text, session.state)
+            session.announce(text)
+        losses = companion.executor.losses
+        for loss in losses[self._losses :]:
+            text = f"node {loss.node} {'' if loss.hung else 'crashed: '}{loss.how}"
+            self.note(stamp_s, "node", text, session.state)
+        self._losses = len(losses)
+        mode, before = companion.mode, self._mode
+        self._mode = mode
+        if mode is before:
+            return
+        if mode in _MODES:
+            self.note(stamp_s, *_MODES[mode], session.state)
+        elif mode is PilotMode.FLYING and before is not None:
+            again = companion.pilot.counters.replans > 0
+            kind, text = ("replan", "flies a new plan") if again else ("plan", "flies a plan")
+            self.note(stamp_s, kind, text, session.state)

@@ -1,14 +1,14 @@
-"""Flies one mission and writes its record. This is the function behind `mavfi fly`."""
+"""Flies one mission and writes its record: the function behind `mavfi fly`. Flies it again, too."""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-import functools
-import json
 import os
 import platform as host_platform
 import resource
+import shutil
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,25 +23,15 @@ from mavfi_cli.companion import protection
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
-from mavfi_cli.core.files import file_digest, write_json, write_parquet, write_text
+from mavfi_cli.core.files import file_digest, write_json, write_parquet, write_text, writing
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome, Reaction
-from mavfi_cli.link.images import ImageReceiver
-from mavfi_cli.mission import briefing
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.progress import Recorder, Watcher
-from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.measures import record_of
-from mavfi_cli.mission.record.run_folder import RunFolder, stem_of
-from mavfi_cli.mission.record.tables import Timetable, write_plans, write_timetable
-from mavfi_cli.mission.vehicle import (
-    StartVehicle,
-    Vehicle,
-    other_end,
-    start_vehicle,
-    with_firmware,
-)
+from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
+from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 
@@ -56,7 +46,7 @@ def fly_mission(
     recorder: Recorder | None = None,
     repeat: Mapping[str, Any] | None = None,
     for_debugger: Callable[[int], None] | None = None,
-    launch: StartVehicle = start_vehicle,
+    launch: StartVehicle = Vehicle.start,
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
@@ -73,22 +63,19 @@ def fly_mission(
         MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
             or its record could not be written.
     """
-    config = with_firmware(config)
+    config = config.with_firmware()
     platform, stack = load_platform(config.platform), config.loaded_stack()
     planner = planners.find(config.planner)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
     with (
-        _injection(config, out, repeat, for_debugger, launch) as injection,
+        _injection(config, out, repeat, for_debugger) as injection,
         interruptible() as interrupt,
         other_end(config, launch) as (link, vehicle),
     ):
-        flight = Flight(config, stack, link, platform, planner, watcher, interrupt)
-        if injection is not None:
-            flight.injection = injection
-        _begin(flight, config, vehicle, recorder)
-        name = stem_of(config.world) if config.link is None else "link"
-        folder = RunFolder.new(out, f"{name}-{config.seed}")
+        flight = Flight(config, stack, link, platform, planner, watcher, interrupt, injection)
+        companion = _begin(flight, config, vehicle, recorder)
+        folder = RunFolder.new(out, config.world if config.link is None else "link", config.seed)
         flight.injection.begin(folder.fault)
         flight_begun_s = time.perf_counter()
         with flight.isolated_nodes():
@@ -102,7 +89,7 @@ def fly_mission(
             "flight_wall_s": round(flight_wall_s, 3),
             **_host(config, flight, vehicle),
         }
-        _write(config, flight, folder, host, *_read_truth(vehicle), crash)
+        _write(config, flight, companion, folder, host, vehicle, crash)
     return folder
 
 
@@ -117,9 +104,26 @@ def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
         protection.warm_up(detector, config.stack)
 
 
+@contextlib.contextmanager
+def _injection(
+    config: MissionConfig,
+    out: Path,
+    repeat: Mapping[str, Any] | None,
+    for_debugger: Callable[[int], None] | None,
+) -> Iterator[NoInjection]:
+    """Create the instruction-level fault of a mission and start its node's process."""
+    if config.instruction is None:
+        yield NoInjection()
+        return
+    from mavfi_cli.mission.instruction.injection import injection_of  # loads the debugger
+
+    with contextlib.closing(injection_of(config, out, repeat, for_debugger)) as injection:
+        yield injection
+
+
 def _begin(
     flight: Flight, config: MissionConfig, vehicle: Vehicle | None, recorder: Recorder | None
-) -> None:
+) -> Companion:
     """Connect and brief the flight.
 
     Raises:
@@ -128,96 +132,15 @@ def _begin(
     try:
         flight.connect()
         if vehicle is None:
-            flight.brief(briefing.of_config(config, flight.place_enu_m))
-        else:
-            told = briefing.of_simulation(vehicle.folder)
-            foreign = config.link is not None
-            flight.brief(replace(told, start_enu_m=flight.place_enu_m) if foreign else told)
-        if recorder is not None:
-            flight.record(recorder)
+            return flight.brief(config.briefing(flight.place_enu_m), recorder)
+        told = vehicle.briefing()
+        if config.link is not None:
+            told = replace(told, start_enu_m=flight.place_enu_m)
+        return flight.brief(told, recorder)
     except MavfiError:
         if vehicle is not None and (failure := vehicle.end()):
             raise failure from None
         raise
-
-
-def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dict[str, Any]:
-    """Return what this machine did for the flight, which no repetition repeats."""
-    own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    told = _left_behind(vehicle, "host.json") or {}
-    return {
-        "machine": host_platform.machine(),
-        "cores": os.cpu_count(),
-        "isolated": list(config.isolate),
-        "memory_mb": {
-            "companion": round(own_mb, 1),
-            "vehicle": round(told.get("memory_mb", 0.0), 1),
-        },
-        "stage_wall_s": _rounded(flight.wall.totals),
-        "vehicle_stage_wall_s": _rounded(told.get("stage_wall_s", {})),
-    }
-
-
-def _left_behind(vehicle: Vehicle | None, name: str) -> dict[str, Any] | None:
-    """Read a JSON file that the vehicle has left; None if it has not."""
-    if vehicle is None or not (vehicle.folder / name).is_file():
-        return None
-    told: dict[str, Any] = json.loads((vehicle.folder / name).read_text())
-    return told
-
-
-@contextlib.contextmanager
-def _injection(
-    config: MissionConfig,
-    out: Path,
-    repeat: Mapping[str, Any] | None,
-    for_debugger: Callable[[int], None] | None,
-    launch: StartVehicle,
-) -> Iterator[NoInjection | None]:
-    """Create the instruction-level fault of a mission and start its node's process."""
-    if config.instruction is None:
-        yield None
-        return
-    from mavfi_cli.mission.instruction.injection import injection_of  # loads the debugger
-
-    injection = injection_of(
-        config,
-        out,
-        installed_versions(),
-        functools.partial(fly_golden, launch=launch),
-        repeat=repeat,
-        for_debugger=for_debugger,
-    )
-    try:
-        yield injection
-    finally:
-        injection.close()
-
-
-def fly_golden(
-    config: MissionConfig,
-    out: Path,
-    recorder: Recorder,
-    *,
-    launch: StartVehicle = start_vehicle,
-) -> dict[str, Any]:
-    """Fly a golden run, from which faults or inputs are drawn.
-
-    Returns:
-        Contents of its result.json.
-
-    Raises:
-        Interrupted: The run was cut off, so other faults would be drawn.
-        VehicleProcessError: The vehicle died, so there is nothing to draw from.
-    """
-    flown = fly_mission(config, out, Watcher(), recorder=recorder, launch=launch)
-    result: dict[str, Any] = json.loads(flown.result.read_text())
-    flight = record_of(result)
-    if flight.interrupted:
-        raise Interrupted("interrupted")
-    if flight.referee is None:
-        raise VehicleProcessError("the vehicle process of the golden flight died")
-    return result
 
 
 def _fly(flight: Flight, tlog: Path) -> str | None:
@@ -232,35 +155,45 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
     return None
 
 
-def _read_truth(vehicle: Vehicle | None) -> tuple[quality.Truth | None, dict[str, Any] | None]:
-    """Read the referee's log and report; None for a foreign autopilot or a dead vehicle."""
-    report = _left_behind(vehicle, "truth.json")
-    if vehicle is None or report is None:
-        return None, None
-    with np.load(vehicle.folder / "truth.npz") as data:
-        return {name: data[name] for name in data.files}, report
+# Record -------------------------------------------------------------------------------------------
 
 
-def _rounded(stages: Mapping[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in stages.items()}
+def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dict[str, Any]:
+    """Return what this machine did for the flight, which no repetition repeats."""
+    own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    told = (vehicle and vehicle.report("host")) or {}
+    walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": told.get("stage_wall_s")}
+    return {
+        "machine": host_platform.machine(),
+        "cores": os.cpu_count(),
+        "isolated": list(config.isolate),
+        "memory_mb": {
+            "companion": round(own_mb, 1),
+            "vehicle": round(told.get("memory_mb", 0.0), 1),
+        },
+        **{
+            name: {stage: round(value, 4) for stage, value in (stages or {}).items()}
+            for name, stages in walls.items()
+        },
+    }
 
 
 def _write(
     config: MissionConfig,
     flight: Flight,
+    companion: Companion,
     folder: RunFolder,
     host: dict[str, Any],
-    truth: quality.Truth | None,
-    referee: dict[str, Any] | None,
+    vehicle: Vehicle | None,
     crash: str | None,
 ) -> None:
-    companion, goal = flight.companion, flight.goal_enu_m
-    if truth is not None and goal is not None:
-        qof = quality.from_truth(truth, flight.takeover_s, flight.end_s, goal)
-    else:
-        qof = flight.own_quality()
+    truth = None if vehicle is None else vehicle.truth()
+    referee = (truth and vehicle and vehicle.report("truth")) or {}
     assert flight.outcome is not None
-    asked = config.fault or config.instruction
+    asked, goal = config.fault or config.instruction, companion.pilot.goal_enu_m
+    flown = flight.trace.motion() if truth is None else truth
+    failures = dict(companion.plan_failures)
+    files = {name: file_digest(name) for name in config.files}
     result = {
         "schema": 1,
         "outcome": flight.outcome.value,
@@ -268,49 +201,41 @@ def _write(
         "config": replace(config, goal_tolerance_m=flight.goal_tolerance_m).to_dict(),
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s - flight.begun_s,
-        "quality_of_flight": qof,
-        **_statistics(companion, flight.images),
-        "measured_platform": companion.latency.summary() if companion else None,
-        "response_time_s": response_times(companion.reactions if companion else []),
+        "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal),
+        "pilot": asdict(companion.pilot.counters),
+        **_nodes(companion),
+        "images": {"received": flight.images.received, "lost": flight.images.lost},
+        "measured_platform": companion.latency.summary(),
+        "response_time_s": response_times(companion.reactions),
         "events": [asdict(event) for event in flight.logger.events],
         "plans": [
             {"stamp_s": plan.stamp_s, "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist()}
-            for plan in (companion.plans if companion else [])
+            for plan in companion.plans
         ],
         "fault": flight.injection.finish(),
-        "detection": companion.protection.summary() if companion else None,
-        "goal_enu_m": None if goal is None else goal.tolist(),
-        "world": None if referee is None else referee["world"],
-        "referee": None if referee is None else {k: v for k, v in referee.items() if k != "world"},
+        "detection": companion.protection.summary(),
+        "goal_enu_m": goal.tolist(),
+        "world": referee.pop("world", None),
+        "referee": referee or None,
         "versions": installed_versions(),
         "host": host,
-        **(
-            {"plan_failures": dict(companion.plan_failures)}
-            if companion and companion.plan_failures
-            else {}
-        ),
-        **({"files": {name: file_digest(name) for name in config.files}} if config.files else {}),
+        **({"plan_failures": failures} if failures else {}),
+        **({"files": files} if files else {}),
     }
     write_parquet(folder.trace, flight.trace.table(truth))
-    write_plans(folder.plans, companion.plans if companion else [])
-    timetable, told = Timetable(), [crash]
-    if companion is not None:
-        ran = companion.executor.timetable
-        timetable = Timetable(invocations=ran, reactions=companion.reactions)
-        told = [*(loss.traceback for loss in companion.executor.losses), crash]
-    write_timetable(folder.kernels, timetable)
+    folder.write_plans(companion.plans)
+    executor = companion.executor
+    folder.write_timetable(executor.timetable, companion.reactions)
+    told = [*(loss.traceback for loss in executor.losses), crash]
     if errors := [text for text in told if text]:
         write_text(folder.crash, "\n".join(errors))
     write_json(folder.result, result)
 
 
-def _statistics(companion: Companion | None, images: ImageReceiver) -> dict[str, Any]:
-    """Return the counters of pilot, kernels, nodes and camera link; empty without a flight."""
-    if companion is None:
-        return {"pilot": None, "kernels": {}, "nodes": {}, "images": {}}
+def _nodes(companion: Companion) -> dict[str, Any]:
+    """Return the counters of the kernels, and the ends of their processes."""
     nodes = companion.executor.nodes
     return {
-        "pilot": asdict(companion.pilot.counters),
         "kernels": {
             name: {
                 "invocations": node.invocations,
@@ -331,7 +256,6 @@ def _statistics(companion: Companion | None, images: ImageReceiver) -> dict[str,
             }
             for name, node in nodes.items()
         },
-        "images": {"received": images.received, "lost": images.lost},
     }
 
 
@@ -346,3 +270,98 @@ def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
         "p95": round(float(np.percentile(times, 95.0)), 9),
         "count": len(times),
     }
+
+
+# Again --------------------------------------------------------------------------------------------
+
+
+def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
+    """Fly a mission that is of no use unless it is flown to its end.
+
+    Args:
+        options: As for `fly_mission`.
+
+    Raises:
+        Interrupted: The user ended it. Nothing of it is kept.
+        MavfiError: As for `fly_mission`.
+    """
+    flown = load_run(fly_mission(config, out, Watcher(), **options).path)
+    if flown.record.interrupted:
+        shutil.rmtree(flown.folder.path)
+        raise Interrupted("interrupted: the mission was not flown to its end")
+    return flown
+
+
+def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
+    """Fly a golden run, from which faults or inputs are drawn.
+
+    Raises:
+        Interrupted, MavfiError: As for `fly_to_end`.
+        VehicleProcessError: The vehicle died, so there is nothing to draw from.
+    """
+    flown = fly_to_end(config, out, recorder=recorder)
+    if flown.record.referee is None:
+        raise VehicleProcessError("the vehicle process of the golden flight died")
+    return flown
+
+
+def fly_again(run: Run, out: Path, *, with_fault: bool = True, **options: Any) -> Run:
+    """Repeat a run, or fly its golden run if `with_fault` is False.
+
+    Args:
+        out: Parent of the new run folder.
+        options: As for `fly_mission`.
+
+    Raises:
+        RecordError: The run is not repeatable.
+        Interrupted, MavfiError: As for `fly_to_end`.
+    """
+    from mavfi_cli.fi.tracer.record import read
+
+    config = run.mission(with_fault=with_fault)
+    repeat = read(run.folder.fault) if config.instruction is not None else None
+    return fly_to_end(config, out, repeat=repeat, **options)
+
+
+def watch_again(run: Run) -> tuple[Recorder, bool]:
+    """Repeat a run to see what its nodes received. Nothing of the repetition is kept.
+
+    Returns:
+        Inputs of all nodes, and whether the repetition has the same trace, as it has unless the
+        software or the machine differs.
+
+    Raises:
+        RecordError, Interrupted, MavfiError: As for `fly_again`.
+    """
+    recorder = Recorder()
+    with tempfile.TemporaryDirectory(prefix="mavfi-again-") as scratch:
+        again = fly_again(run, Path(scratch), recorder=recorder)
+        same = file_digest(again.folder.trace) == file_digest(run.folder.trace)
+    return recorder, same
+
+
+def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
+    """Return the golden run of a run. It is flown once and kept in the run's folder.
+
+    Args:
+        run: Run with a fault.
+        note: Callback with a message before the golden run is flown.
+
+    Raises:
+        RecordError: The run is not repeatable, or its folder cannot be written.
+        Interrupted: The user ended the golden run. Nothing of it is kept.
+    """
+    config = run.mission(with_fault=False)
+    if (golden := run.golden) is not None:
+        return golden
+    kept = run.folder.golden
+    note(f"flying the golden pair: {config.world}, seed {config.seed}")
+    with (
+        writing(kept),
+        tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent,
+    ):
+        flown = fly_to_end(config, Path(parent))
+        if kept.is_dir():
+            shutil.rmtree(kept)
+        shutil.move(flown.folder.path, kept)
+    return load_run(kept)

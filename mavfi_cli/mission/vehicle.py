@@ -1,14 +1,14 @@
 """The simulated vehicle of a mission: in the mission's own process, or beside it in another.
 
 Either way companion and vehicle share the bytes of a MAVLink link, and the folder in which the
-vehicle leaves its briefing and, at the end, the referee's truth. This is the only module of the
-companion's side that imports the vehicle's, and only to start it.
+vehicle leaves its briefing before its first message and, at the end, the referee's truth. This is
+the only module of the companion's side that imports the vehicle's, and only to start it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
+import json
 import select
 import shutil
 import signal
@@ -17,24 +17,76 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from mavfi_cli.core.errors import ConfigError, MavfiError, VehicleProcessError, described
+import numpy as np
+
+from mavfi_cli.core.errors import MavfiError, VehicleProcessError, described
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
-from mavfi_cli.spec.mission import FIRMWARE, OWN_AUTOPILOT, MissionConfig
+from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
 
 START_LIMIT_S = 120.0  # of a camera; its first start compiles
 
 
-class VehicleInProcess:
+class Vehicle:
+    """A simulated vehicle: the link to it, and the folder in which it leaves its files."""
+
+    link: Transport
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @staticmethod
+    def start(config: MissionConfig, folder: Path) -> Vehicle:
+        """Start the vehicle in this process, or beside it where both run by the wall clock."""
+        return (VehicleProcess if config.realtime else VehicleInProcess)(config, folder)
+
+    def end(self) -> VehicleProcessError | None:
+        """Close the link and save the truth; return why the vehicle ended before that, if it did.
+
+        Raises:
+            RecordError: the truth cannot be saved.
+        """
+        raise NotImplementedError
+
+    def briefing(self) -> Briefing:
+        """Read start, goal, bounds and camera, which only the vehicle knows, as it has the world.
+
+        Raises:
+            VehicleProcessError: There is no briefing.
+        """
+        try:
+            data = json.loads((self._folder / "briefing.json").read_text())
+            data["bounds_enu_m"][2::3] = LOWEST_M, HIGHEST_M
+            told: Any = {name: np.array(values, np.float64) for name, values in data.items()}
+            return Briefing(**told)
+        except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+            raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
+
+    def report(self, name: str) -> dict[str, Any] | None:
+        """Read a JSON file that the vehicle has left; None if it has not."""
+        path = self._folder / f"{name}.json"
+        told: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
+        return told
+
+    def truth(self) -> dict[str, FloatArray] | None:
+        """Read the referee's log by column; None if the vehicle died before it was saved."""
+        if self.report("truth") is None:
+            return None
+        with np.load(self._folder / "truth.npz") as data:
+            return {name: data[name] for name in data.files}
+
+
+class VehicleInProcess(Vehicle):
     """The vehicle in this process; it flies while the companion waits for it.
 
     Args:
-        folder: where the vehicle leaves briefing and truth.
+        folder: where the vehicle leaves its files.
 
     Raises:
         MavfiError: the world, the vehicle, the start or the goal cannot be used.
@@ -43,16 +95,19 @@ class VehicleInProcess:
     def __init__(self, config: MissionConfig, folder: Path) -> None:
         from sitl.server.main import embedded
 
-        self.folder = folder
+        super().__init__(folder)
         self._vehicle = embedded(_arguments(config), folder)
-        self.link: Transport = self._vehicle.link
+        self.link = self._vehicle.link
+
+    @staticmethod
+    def warm_up() -> None:
+        """Load and compile all that a vehicle in this process needs."""
+        from sitl.server.main import warm_up
+
+        warm_up()
 
     def end(self) -> VehicleProcessError | None:
-        """Close the link and save the truth; return why the vehicle ended before that, if it did.
-
-        Raises:
-            RecordError: the truth cannot be saved.
-        """
+        """See `Vehicle`."""
         self._vehicle.end()
         error = self._vehicle.error
         if error is None:
@@ -63,14 +118,7 @@ class VehicleInProcess:
         )
 
 
-def warm_up() -> None:
-    """Load and compile all that a vehicle in this process needs."""
-    from sitl.server.main import warm_up
-
-    warm_up()
-
-
-class VehicleProcess:
+class VehicleProcess(Vehicle):
     """`python -m sitl` in lockstep, as `VehicleInProcess`. Closing the socket ends it.
 
     Raises:
@@ -80,7 +128,7 @@ class VehicleProcess:
     _name = "vehicle"
 
     def __init__(self, config: MissionConfig, folder: Path) -> None:
-        self.folder = folder
+        super().__init__(folder)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         line = [*PYTHON, "-m", *self._line(config, theirs.fileno())]
@@ -98,7 +146,7 @@ class VehicleProcess:
                 ours.close()
                 self._errors.close()
                 raise VehicleProcessError(f"cannot start the {self._name}: {error}") from None
-        self.link: Transport = open_transport(f"fd:{ours.detach()}")
+        self.link = open_transport(f"fd:{ours.detach()}")
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -109,7 +157,7 @@ class VehicleProcess:
         return [*line, "--speed", "1"] if config.realtime else line
 
     def end(self, timeout_s: float = 20.0) -> VehicleProcessError | None:
-        """See `VehicleInProcess`; a vehicle that does not end is killed."""
+        """See `Vehicle`; a vehicle that does not end is killed."""
         self.link.close()
         try:
             self._process.wait(timeout_s)
@@ -178,38 +226,12 @@ def _firmware_arguments(config: MissionConfig) -> list[str]:
     option = "--hil" if config.autopilot == "px4" else "--json"
     seed = derive(config.seed, Stream.SENSOR, "firmware")
     return [
-        option, config.autopilot, "--firmware", str(with_firmware(config).firmware),
+        option, config.autopilot, "--firmware", str(config.with_firmware().firmware),
         "--firmware-seed", str(seed),
     ]  # fmt: skip
 
 
-def with_firmware(config: MissionConfig) -> MissionConfig:
-    """Return the mission with the SITL binary of its real autopilot, so that a record names it.
-
-    Raises:
-        ConfigError: Neither the mission nor the environment names one.
-    """
-    if config.autopilot == OWN_AUTOPILOT:
-        return config
-    variable = FIRMWARE[config.autopilot]
-    path = config.firmware or os.environ.get(variable)
-    if not path:
-        raise ConfigError(
-            f"{config.autopilot} needs its SITL binary: --firmware PATH, or {variable} in the "
-            "environment",
-            key="firmware",
-        )
-    return replace(config, firmware=path)
-
-
-Vehicle = VehicleInProcess | VehicleProcess
 StartVehicle = Callable[[MissionConfig, Path], Vehicle]
-
-
-def start_vehicle(config: MissionConfig, folder: Path) -> Vehicle:
-    """Start the vehicle in this process, or beside it where both run by the wall clock."""
-    start = VehicleProcess if config.realtime else VehicleInProcess
-    return start(config, folder)
 
 
 def signing_of(config: MissionConfig) -> Signing | None:
@@ -223,15 +245,9 @@ def signing_of(config: MissionConfig) -> Signing | None:
     return Signing(key_from_file(Path(config.key_file)), clock=time.time)
 
 
-def _foreign_link(url: str, signing: Signing | None) -> Transport:
-    if signing is None:
-        return open_transport(url)
-    return open_transport(url, signed=True, admits=signing.vouches)
-
-
 @contextlib.contextmanager
 def other_end(
-    config: MissionConfig, launch: StartVehicle = start_vehicle
+    config: MissionConfig, launch: StartVehicle = Vehicle.start
 ) -> Iterator[tuple[Transport, Vehicle | None]]:
     """Connect to a mission's foreign autopilot, or else to a simulated vehicle that starts.
 
@@ -239,7 +255,9 @@ def other_end(
         MavfiError: the link cannot be opened, or the vehicle cannot start.
     """
     if config.link is not None and not config.eyes:
-        with contextlib.closing(_foreign_link(config.link, signing_of(config))) as link:
+        signing = signing_of(config)
+        signed: Any = {"signed": True, "admits": signing.vouches} if signing is not None else {}
+        with contextlib.closing(open_transport(config.link, **signed)) as link:
             yield link, None
         return
     folder = Path(tempfile.mkdtemp(prefix="mavfi-"))

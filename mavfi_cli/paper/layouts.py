@@ -19,7 +19,7 @@ from mavfi_cli.analysis.flights import chosen, known, numbers
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.mission.record.run_folder import TRACE
+from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.flights import (
     EVERY_STAGE,
     STAGES,

@@ -16,7 +16,7 @@ from mavfi_cli.campaigns.missions import label_text, label_value, ordered
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
+from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.columns import blocks, number, percent, spread
 from mavfi_cli.stats.paired import McNemar
 

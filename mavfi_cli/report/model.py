@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.mission.record.detection_cost import HOST_CHECKS
+from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.columns import columns, csv_text, wrapped
 from mavfi_cli.report.drawing import INK, NOTE, SCHEMES, new_figure, open_frame
 from mavfi_cli.vpm.report import RATIOS

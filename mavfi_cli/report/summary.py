@@ -9,10 +9,8 @@ from typing import Any
 
 from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.tracer.image import short_name
-from mavfi_cli.mission.record.detection_cost import DetectionCost, detection_cost
-from mavfi_cli.mission.record.measures import FlightRecord, record_of
-from mavfi_cli.mission.record.run_folder import Run
-from mavfi_cli.mission.replay import first_difference, largest_deviation_m
+from mavfi_cli.mission.measures import DetectionCost, FlightRecord, detection_cost, record_of
+from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.report.columns import WIDTH
 
 Section = Mapping[str, Any]
@@ -296,17 +294,17 @@ def _formatted(change: dict[str, Any], when: str) -> str:
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
     """Compare a run with its golden run: first difference, deviation and outcome."""
-    parting = first_difference(run, golden)
+    parting = run.first_difference(golden)
     ours, theirs = run.record, golden.record
     fault = ours.fault
-    if parting is None or first_difference(run, golden, leave_out=fault.get("states", ())) is None:
+    if parting is None or run.first_difference(golden, leave_out=fault.get("states", ())) is None:
         why = _no_effect(fault) if fault else "none"
         return [f"Effect      {why}: nothing else ever differs from the golden flight"]
     sides = ["inf or nan" if v is None else v for v in (parting.this, parting.other)]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
         f"{' instead of '.join(told_apart(*sides))}",
-        f"            at most {largest_deviation_m(run, golden):.2f} m from the golden vehicle",
+        f"            at most {run.largest_deviation_m(golden):.2f} m from the golden vehicle",
     ]
     our_s, their_s = (each.quality_of_flight["flight_time_s"] for each in (ours, theirs))
     if our_s and their_s:

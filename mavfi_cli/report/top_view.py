@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.mission.record.measures import FlightRecord
-from mavfi_cli.mission.record.run_folder import Run, load_run
+from mavfi_cli.mission.measures import FlightRecord
+from mavfi_cli.mission.run_folder import Run, load_run
 from mavfi_cli.report.drawing import (
     ALARM,
     DETECTORS,

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.platform import KERNELS, measured_factor
@@ -25,6 +29,11 @@ OF_THE_WORLD = (
     "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
 )  # fmt: skip
 """Settings of the world and of what is simulated in it."""
+
+LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
+FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
+MARGIN_M = 30.0  # flight bounds round home and goal without a known world
+_MOUNT_FLU_M = (0.1, 0.0, 0.0)  # of the stand-alone camera, unless it is told another one
 
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
@@ -244,3 +253,55 @@ class MissionConfig:
         """Return the stack of the mission with its goal tolerance. Raises as `load_stack`."""
         stack, own_m = load_stack(self.stack), self.goal_tolerance_m
         return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
+
+    def with_firmware(self) -> MissionConfig:
+        """Return the mission with the SITL binary of its real autopilot, for the record.
+
+        Raises:
+            ConfigError: Neither the mission nor the environment names one.
+        """
+        if self.autopilot == OWN_AUTOPILOT:
+            return self
+        variable = FIRMWARE[self.autopilot]
+        path = self.firmware or os.environ.get(variable)
+        if not path:
+            raise ConfigError(
+                f"{self.autopilot} needs its SITL binary: --firmware PATH, or {variable} in the "
+                "environment",
+                key="firmware",
+            )
+        return replace(self, firmware=path)
+
+    def briefing(self, start_enu_m: FloatArray) -> Briefing:
+        """Build the briefing for a foreign autopilot without a known world, from its place (3,)."""
+        goal = np.array(self.goal)
+        low, high = np.minimum(goal, start_enu_m), np.maximum(goal, start_enu_m)
+        bounds = np.concatenate([low - MARGIN_M, high + MARGIN_M])
+        bounds[[2, 5]] = LOWEST_M, HIGHEST_M
+        return Briefing(
+            start_enu_m=start_enu_m,
+            goal_enu_m=goal,
+            bounds_enu_m=bounds,
+            camera_offset_flu_m=np.array(_MOUNT_FLU_M),
+        )
+
+    def require_flyable(self, briefing: Briefing, tolerance_m: float) -> None:
+        """Reject a goal that is too near, too far, or outside the flight levels.
+
+        Args:
+            tolerance_m: Distance from the goal that counts as reached.
+
+        Raises:
+            ConfigError: The goal is invalid. Says why.
+        """
+        start, goal = briefing.start_enu_m, briefing.goal_enu_m
+        takeoff = np.add(start, (0.0, 0.0, self.takeoff_height_m))
+        problem = ""
+        if float(np.linalg.norm(goal - takeoff)) <= tolerance_m:
+            problem = f"is within {tolerance_m:g} m of the take-off point"
+        elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
+            problem = f"is {goal[2]:g} m high; flight levels are {LOWEST_M:g} to {HIGHEST_M:g} m"
+        elif float(np.linalg.norm(goal[:2] - start[:2])) > FARTHEST_M:
+            problem = f"is farther than {FARTHEST_M:g} m away"
+        if problem:
+            raise ConfigError(f"the goal {problem}", key="goal")

@@ -14,7 +14,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import read_parquet
-from mavfi_cli.mission.record.measures import measures_of, record_of
+from mavfi_cli.mission.measures import measures_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 _COMPARED = frozenset(measures_of({})) | {"outcome"}

@@ -21,7 +21,7 @@ from mavfi_cli.campaigns.specification import Keep, Setting, Spec
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.studies.flying import fly, require_named

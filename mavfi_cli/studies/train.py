@@ -13,7 +13,6 @@ from mavfi_cli.detect.dataset import Dataset
 from mavfi_cli.detect.fit import check, fit
 from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.mission.vehicle import with_firmware
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
 from mavfi_cli.studies.training_flights import TrainingPlan, collect_flown, fly_training
@@ -50,7 +49,7 @@ def train(
     stack = load_stack(plan.base.stack).mark
     if plan.flown is None:
         check(plan.kinds, len(plan.missions()), plan.n_sigma)
-        plan = replace(plan, base=with_firmware(plan.base))
+        plan = replace(plan, base=plan.base.with_firmware())
         flights, failed = fly_training(plan, folder, options, spectator)
         autopilots = {plan.base.autopilot}
     else:

@@ -19,8 +19,7 @@ from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.fit import KINDS
 from mavfi_cli.detect.offline import columns_of, flight_of
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.mission.record.run_folder import RESULT, Run, load_run
-from mavfi_cli.mission.record.tables import read_plans
+from mavfi_cli.mission.run_folder import RESULT, Run, load_run
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
@@ -85,7 +84,7 @@ def fly_training(
 
 def _samples(run: Run, name: str) -> FlightSamples:
     assert run.trace is not None
-    columns, plans = columns_of(run.trace), read_plans(run.folder.plans)
+    columns, plans = columns_of(run.trace), run.folder.read_plans()
     return flight_of(columns, name, run.record.config["seed"], PreprocessParams(), plans)
 
 

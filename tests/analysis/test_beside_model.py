@@ -10,7 +10,7 @@ import pytest
 from mavfi_cli.analysis.beside_model import Beside, side_by_side
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
-from mavfi_cli.mission.record.measures import measures_of
+from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model import draw_flight_plot, model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform

@@ -5,7 +5,7 @@ from evaluation_flights import flown, labelled, pair, paired, struck
 
 from mavfi_cli.analysis.detector_pairs import WANTED, Harm
 from mavfi_cli.campaigns.missions import Injected
-from mavfi_cli.mission.record.measures import measures_of
+from mavfi_cli.mission.measures import measures_of
 
 GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}
 FAULT = {

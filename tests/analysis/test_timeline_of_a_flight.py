@@ -5,8 +5,7 @@ import pytest
 from mavfi_cli.analysis.timeline import chain_of, timelines, typical
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Invocation, Reaction
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.record.tables import Timetable, read_timetable, write_timetable
+from mavfi_cli.mission.run_folder import RunFolder, load_run
 
 
 def ran(node, start_s, end_s):
@@ -18,23 +17,22 @@ def reaction(frame_s, setpoint_s):
 
 
 def test_a_time_table_is_read_as_it_was_written(tmp_path):
-    table = Timetable(
-        invocations=(ran("octomap", 1.0, 1.3), ran("control", 1.02, 1.0205)),
-        reactions=(reaction(1.0, 1.4),),
-    )
-    write_timetable(tmp_path / "a.parquet", table)
-    write_timetable(tmp_path / "b.parquet", table)
-    assert read_timetable(tmp_path / "a.parquet") == table
-    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    table = [ran("octomap", 1.0, 1.3), ran("control", 1.02, 1.0205)], [reaction(1.0, 1.4)]
+    folder = RunFolder(tmp_path)
+    folder.write_timetable(*table)
+    assert folder.read_timetable() == table
+    first = folder.kernels.read_bytes()
+    folder.write_timetable(*table)
+    assert folder.kernels.read_bytes() == first
 
 
 @pytest.mark.parametrize("bad", [None, b"", b"PAR1 and nothing more"])
 def test_a_damaged_time_table_is_one_line(tmp_path, bad):
-    path = tmp_path / "kernels.parquet"
+    folder = RunFolder(tmp_path)
     if bad is not None:
-        path.write_bytes(bad)
+        folder.kernels.write_bytes(bad)
     with pytest.raises(RecordError, match="no time table can be read"):
-        read_timetable(path)
+        folder.read_timetable()
 
 
 def test_the_chain_takes_the_newest_output_that_was_there():
@@ -85,9 +83,9 @@ def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_f
 
 def test_latencies_of_the_table_are_those_that_the_nodes_were_busy_for(troubled_flight):
     run = load_run(troubled_flight.path)
-    table = read_timetable(run.folder.kernels)
+    invocations, reactions = run.folder.read_timetable()
     for kernel, work in run.result["kernels"].items():
-        spans = [each for each in table.invocations if each.node == kernel]
+        spans = [each for each in invocations if each.node == kernel]
         assert len(spans) == work["invocations"]
         assert sum(s.end_s - s.start_s for s in spans) == pytest.approx(work["busy_s"], abs=1e-6)
-    assert len(table.reactions) == run.result["response_time_s"]["count"]
+    assert len(reactions) == run.result["response_time_s"]["count"]

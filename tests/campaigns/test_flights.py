@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.campaigns.missions import Injected, PlannedMission
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.mission.record.run_folder import RunFolder
+from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 

@@ -7,7 +7,7 @@ from missions import RECORD, SHORT_LINE
 
 from mavfi_cli.autonomy import warm
 from mavfi_cli.mission import run
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.run_folder import load_run
 
 
 @pytest.fixture

@@ -13,9 +13,8 @@ from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.repetition import paired_golden
-from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run import paired_golden
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 CUT_OFF = "interrupted: the mission was not flown to its end"
@@ -54,7 +53,7 @@ def sideways(fly_short):
 
 def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once):
     before = {path.name for path in sideways.path.iterdir()}
-    cut_once("mavfi_cli.mission.repetition")
+    cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, out) == (130, "")
     assert err.splitlines() == [
@@ -83,7 +82,7 @@ def test_an_interrupted_golden_pair_of_an_older_version_is_flown_anew(sideways):
 def test_an_interrupted_repetition_is_neither_equal_nor_different(
     command_line, sideways, cut_once, tmp_path, options
 ):
-    cut_once("mavfi_cli.mission.repetition")
+    cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("replay", sideways.path, "--out", "again", *options)
     assert (code, out) == (130, "")
     again = "without its fault" if "--without-fault" in options else "again"
@@ -97,10 +96,10 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
 def test_an_interrupted_mission_of_a_campaign_leaves_nothing(
     command_line, short_flight, cut_once, tmp_path
 ):
-    changes = canonical(changes_of(config_of(load_run(short_flight.path))))
+    changes = canonical(changes_of(load_run(short_flight.path).mission()))
     columns = {"number": [0], "outcome": ["success"], "changes": [changes]}
     write_parquet(tmp_path / "campaign.parquet", pa.table(columns))
-    cut_once("mavfi_cli.mission.repetition")
+    cut_once("mavfi_cli.mission.run")
     asked = ("replay", "campaign.parquet", "--mission", "0", "--out", "again")
     code, out, err = command_line(*asked)
     assert (code, out, err.splitlines()[-1]) == (130, "", CUT_OFF)
@@ -111,7 +110,7 @@ def test_an_interrupted_mission_of_a_campaign_leaves_nothing(
 
 def test_an_interrupted_repetition_is_not_looked_at(command_line, short_flight, cut_once, tmp_path):
     pytest.importorskip("mcap_protobuf")
-    cut_once("mavfi_cli.mission.repetition")
+    cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("view", short_flight.path, "--save", "flight.mcap")
     assert (code, out) == (130, "")
     assert err.splitlines()[-1] == CUT_OFF

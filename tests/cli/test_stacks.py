@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.cli.stacks import _GROUPS
+from mavfi_cli.cli.inventory import _GROUPS
 from mavfi_cli.spec.stack import KEYS, STACKS, load_stack
 
 

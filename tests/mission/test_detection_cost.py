@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.mission.record.detection_cost import detection_cost
+from mavfi_cli.mission.measures import detection_cost
 from mavfi_cli.spec.detector import DetectorConfig
 
 RECORD = {

@@ -7,8 +7,8 @@ from record_digest import record_digest
 
 from mavfi_cli.campaigns.begin import ask_vehicle
 from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.vehicle import VehicleProcess, start_vehicle
+from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.vehicle import Vehicle, VehicleProcess
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from sitl.server.simulation import Simulation
@@ -36,7 +36,7 @@ def test_the_record_is_that_of_two_processes_with_a_socket_between(fly_short, ch
 def test_only_a_flight_by_the_wall_clock_has_a_vehicle_in_another_process(short_config, tmp_path):
     paced = replace(short_config, realtime=True)
     for config, expected in ((short_config, False), (paced, True)):
-        vehicle = start_vehicle(config, tmp_path)
+        vehicle = Vehicle.start(config, tmp_path)
         assert isinstance(vehicle, VehicleProcess) == expected
         assert vehicle.end() is None
 

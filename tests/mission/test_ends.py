@@ -11,8 +11,7 @@ from live_processes import await_end
 from missions import RECORD
 
 from mavfi_cli.autonomy import collision
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import first_difference
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.mission.vehicle import VehicleProcess
 
 MAVLOGDUMP = Path(sys.executable).parent / "mavlogdump.py"
@@ -90,7 +89,7 @@ def test_a_vehicle_that_is_killed_is_a_lost_link(fly_short, at_event, kill_vehic
     assert run.trace.num_rows > 0
     assert "truth_x_m" not in run.trace.column_names
     assert "BAD_DATA" not in dumped(folder.tlog)
-    parting = first_difference(load_run(short_flight.path), run, truth=True)
+    parting = load_run(short_flight.path).first_difference(run, truth=True)
     assert (parting.column, parting.other) == ("outcome", "link_lost")
 
 

@@ -6,7 +6,7 @@ import pytest
 from mavfi_cli.companion.kernels import _next_int32
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Briefing
-from mavfi_cli.mission.briefing import FARTHEST_M, require_flyable
+from mavfi_cli.spec.mission import FARTHEST_M, MissionConfig
 
 
 def briefing(*goal: float) -> Briefing:
@@ -29,13 +29,13 @@ def briefing(*goal: float) -> Briefing:
 )
 def test_a_goal_that_cannot_be_flown_is_refused(goal, said):
     with pytest.raises(ConfigError, match=said) as error:
-        require_flyable(briefing(*goal), 5.0, 1.0)
+        MissionConfig().require_flyable(briefing(*goal), 1.0)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("goal", [(0.0, 1.1, 5.0), (FARTHEST_M, 0.0, 5.0), (30.0, 40.0, 10.0)])
 def test_a_goal_at_the_edge_is_flown(goal):
-    require_flyable(briefing(*goal), 5.0, 1.0)
+    MissionConfig().require_flyable(briefing(*goal), 1.0)
 
 
 def test_a_sequence_number_at_its_end_wraps_as_an_int32_does():

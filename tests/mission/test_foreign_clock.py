@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.mission.foreign_clock import ForeignClock
+from mavfi_cli.mission.flight import ForeignClock
 
 
 class Wall:

@@ -16,8 +16,8 @@ from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 

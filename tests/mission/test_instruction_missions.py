@@ -15,20 +15,18 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.autonomy import tracking
-from mavfi_cli.cli.replay import replay
+from mavfi_cli.cli.runs import replay
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.fault import Rule
-from mavfi_cli.mission.briefing import of_config
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -56,7 +54,7 @@ def attacked(fly_short):
 def repeat(attacked, tmp_path):
     """Flies the attacked mission again from its record, which may be changed."""
     recorded = records.read(attacked.fault)
-    config = config_of(load_run(attacked.path))
+    config = load_run(attacked.path).mission()
 
     def fly(change=lambda recorded: recorded, restart_s=config.node_restart_s, **options):
         changed = change(json.loads(json.dumps(recorded)))
@@ -180,7 +178,7 @@ def test_a_replay_under_a_debugger_is_compared_without_what_it_cannot_follow(
         waited.append(pid)
         os.kill(pid, signal.SIGCONT)
 
-    monkeypatch.setattr("mavfi_cli.cli.replay._say_where", go_on)
+    monkeypatch.setattr("mavfi_cli.cli.runs._say_where", go_on)
     line = [str(attacked.path), "--gdb", "--json", "--out", str(tmp_path)]
     shown = CliRunner().invoke(replay, line)
     assert len(waited) == 1
@@ -255,7 +253,7 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
 
 def test_the_nodes_of_a_pair_get_the_same_bytes(short_config):
     """The memory of a node depends on them: also on which objects of a message are identical."""
-    briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
+    briefing = replace(short_config, goal=(20.0, 0.0, 5.0)).briefing(np.zeros(3))
     protected = replace(
         short_config,
         detector=DetectorConfig(name="gad"),
@@ -273,7 +271,7 @@ def test_the_nodes_of_a_pair_get_the_same_bytes(short_config):
 
 def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
     """A program that compiles its modules has another memory than one that finds bytecode."""
-    briefing = of_config(replace(short_config, goal=(20.0, 0.0, 5.0)), np.zeros(3))
+    briefing = replace(short_config, goal=(20.0, 0.0, 5.0)).briefing(np.zeros(3))
     setup = Setup.of(short_config, briefing, "control")
     restarted = []
     for compiles in (True, False, False, False):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from missions import SOUND_PLATFORM
 
-from mavfi_cli.companion.latency import LatencyModel
-from mavfi_cli.mission.record.tables import read_timetable
+from mavfi_cli.companion.executor import LatencyModel
 from mavfi_cli.spec.platform import KERNELS, load_platform
 
 
@@ -75,11 +74,11 @@ def test_a_flight_responds_as_late_as_its_platform_s_kernels(fly_short, short_fl
 def test_a_frame_is_answered_by_a_command_that_knew_of_it(fly_short):
     """Control that takes most of a tick: what goes out next was computed before the verdict."""
     folder = fly_short(platform="tx2-2c-0.81")
-    table = read_timetable(folder.kernels)
-    control = [each for each in table.invocations if each.node == "control"]
-    checks = [each.end_s for each in table.invocations if each.node == "collision_check"]
-    assert table.reactions
-    for reaction in table.reactions:
+    invocations, reactions = folder.read_timetable()
+    control = [each for each in invocations if each.node == "control"]
+    checks = [each.end_s for each in invocations if each.node == "collision_check"]
+    assert reactions
+    for reaction in reactions:
         out_s = reaction.setpoint_stamp_s
         verdict_s = max(end_s for end_s in checks if end_s <= out_s)
         assert any(c.start_s >= verdict_s - 1e-9 and c.end_s <= out_s + 1e-9 for c in control)

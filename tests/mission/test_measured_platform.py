@@ -5,12 +5,10 @@ import re
 
 import pytest
 
-from mavfi_cli.companion.executor import Executor, Node
-from mavfi_cli.companion.latency import LatencyModel
+from mavfi_cli.companion.executor import Executor, LatencyModel, Node
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import KERNELS, load_platform
@@ -114,4 +112,4 @@ def test_a_flight_on_this_host_ten_times_as_slow(fly_short):
     assert re.search(r"Measured .*octomap .* ms \(medians on this host\)", text)
     assert "x 10 in the flight" in text
     with pytest.raises(RecordError, match="measured kernel times does not repeat"):
-        config_of(run)
+        run.mission()

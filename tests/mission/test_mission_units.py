@@ -26,12 +26,11 @@ from mavfi_cli.core.types import (
     Trajectory,
     VehicleState,
 )
-from mavfi_cli.mission import briefing
-from mavfi_cli.mission.record import quality
-from mavfi_cli.mission.record.run_folder import RunFolder, load_run
-from mavfi_cli.mission.record.tables import Trace
+from mavfi_cli.mission.measures import QUALITY, quality_of
 from mavfi_cli.mission.run import response_times
-from mavfi_cli.spec.mission import OF_THE_WORLD, MissionConfig
+from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
+from mavfi_cli.mission.vehicle import Vehicle
+from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, MARGIN_M, OF_THE_WORLD, MissionConfig
 from mavfi_cli.spec.platform import KERNELS
 
 # Configuration -------------------------------------------------------------------------------
@@ -110,21 +109,21 @@ PLACES = st.tuples(*[st.floats(-500.0, 500.0)] * 2, st.floats(2.0, 10.0))
 @given(PLACES, PLACES)
 def test_a_foreign_mission_may_fly_between_start_and_goal_with_a_margin(start, goal):
     config = MissionConfig(link="udpin:127.0.0.1:1", goal=goal)
-    told = briefing.of_config(config, np.array(start))
+    told = config.briefing(np.array(start))
     low, high = told.bounds_enu_m[:3], told.bounds_enu_m[3:]
     for place in (np.array(goal), np.array(start)):
-        assert (place[:2] - low[:2] >= briefing.MARGIN_M - 1e-9).all()
-        assert (high[:2] - place[:2] >= briefing.MARGIN_M - 1e-9).all()
-    assert (low[2], high[2]) == (briefing.LOWEST_M, briefing.HIGHEST_M)
+        assert (place[:2] - low[:2] >= MARGIN_M - 1e-9).all()
+        assert (high[:2] - place[:2] >= MARGIN_M - 1e-9).all()
+    assert (low[2], high[2]) == (LOWEST_M, HIGHEST_M)
     np.testing.assert_array_equal(told.goal_enu_m, goal)
 
 
 @pytest.mark.parametrize("text", [None, "", "{", "{}", '{"goal_enu_m": "x"}'])
 def test_a_vehicle_that_left_no_briefing(tmp_path, text):
     if text is not None:
-        (tmp_path / briefing.FILE).write_text(text)
+        (tmp_path / "briefing.json").write_text(text)
     with pytest.raises(VehicleProcessError, match="no briefing"):
-        briefing.of_simulation(tmp_path)
+        Vehicle(tmp_path).briefing()
 
 
 # Files ---------------------------------------------------------------------------------------
@@ -173,12 +172,12 @@ def test_arrays_and_numpy_scalars_become_plain():
 
 
 def test_run_folders_count_up_and_are_never_taken_twice(tmp_path):
-    names = [RunFolder.new(tmp_path / "runs", "dense-1").path.name for _ in range(3)]
+    names = [RunFolder.new(tmp_path / "runs", "dense", 1).path.name for _ in range(3)]
     assert names == ["dense-1-001", "dense-1-002", "dense-1-003"]
     (tmp_path / "runs/dense-1-1000").mkdir()
     (tmp_path / "runs/dense-1-old").mkdir()
-    assert RunFolder.new(tmp_path / "runs", "dense-1").path.name == "dense-1-1001"
-    assert RunFolder.new(tmp_path / "runs", "dense-11").path.name == "dense-11-001"
+    assert RunFolder.new(tmp_path / "runs", "a/dense.toml", 1).path.name == "dense-1-1001"
+    assert RunFolder.new(tmp_path / "runs", "dense", 11).path.name == "dense-11-001"
 
 
 def test_a_run_that_is_not_there(tmp_path):
@@ -295,7 +294,7 @@ def circle(count=2001, radius_m=3.0, time_s=10.0):
 
 
 def test_quality_of_a_circle_against_its_closed_form():
-    found = quality.from_truth(circle(), 0.0, 99.0, np.array([3.0, 4.0, 0.0]))
+    found = quality_of(circle(), 0.0, 99.0, np.array([3.0, 4.0, 0.0]))
     assert found["flight_time_s"] == pytest.approx(10.0)
     assert found["distance_m"] == pytest.approx(math.tau * 3.0, rel=1e-5)
     assert found["mean_speed_mps"] == pytest.approx(0.6 * math.pi, rel=1e-5)
@@ -307,7 +306,7 @@ def test_quality_of_a_circle_against_its_closed_form():
 
 
 def test_only_the_flight_itself_counts():
-    half = quality.from_truth(circle(), 5.0, 10.0, np.zeros(3))
+    half = quality_of(circle(), 5.0, 10.0, np.zeros(3))
     assert half["flight_time_s"] == pytest.approx(5.0)
     assert half["distance_m"] == pytest.approx(math.pi * 3.0, rel=1e-5)
     assert half["energy_regression_j"] == pytest.approx(25.0)
@@ -315,22 +314,21 @@ def test_only_the_flight_itself_counts():
 
 @pytest.mark.parametrize("window", [(math.inf, 12.0), (99.0, 100.0), (7.0, 7.0)])
 def test_a_flight_that_never_was_has_no_quality(window):
-    assert quality.from_truth(circle(), *window, np.zeros(3)) == dict.fromkeys(quality.QUALITY)
+    assert quality_of(circle(), *window, np.zeros(3)) == dict.fromkeys(QUALITY)
 
 
 def test_what_the_companion_knows_by_itself():
     data = circle()
-    found = quality.from_states(
-        data["stamp_s"], data["position_enu_m"], data["velocity_enu_mps"], np.zeros(3)
-    )
-    true = quality.from_truth(data, 0.0, 99.0, np.zeros(3))
+    received = {name: data[name] for name in ("stamp_s", "position_enu_m", "velocity_enu_mps")}
+    found = quality_of(received, 0.0, 99.0, np.zeros(3))
+    true = quality_of(data, 0.0, 99.0, np.zeros(3))
     unknown = dict.fromkeys(("min_clearance_m", "energy_regression_j", "energy_propeller_j"))
     assert found == {**true, **unknown}
 
 
 def test_a_world_without_boxes_has_no_clearance():
     data = {**circle(), "clearance_m": np.full(2001, math.inf)}
-    assert quality.from_truth(data, 0.0, 99.0, np.zeros(3))["min_clearance_m"] is None
+    assert quality_of(data, 0.0, 99.0, np.zeros(3))["min_clearance_m"] is None
 
 
 # Response time -------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from mavfi_cli.autonomy import planners, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap
 from mavfi_cli.companion import node_process
 from mavfi_cli.companion.executor import Executor, Node
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.run_folder import load_run
 
 
 def record(folder):

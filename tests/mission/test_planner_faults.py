@@ -14,14 +14,16 @@ from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.arch import SUPPORTED
-from mavfi_cli.mission.instruction.injection import draw_invocation
-from mavfi_cli.mission.instruction.rehearsal import Rehearsal, profile_invocation
+from mavfi_cli.mission.instruction.injection import (
+    Rehearsal,
+    draw_invocation,
+    profile_invocation,
+)
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -57,7 +59,7 @@ def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed)
 @traced
 def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(fly_short, tmp_path):
     first = fly_short(instruction=InstructionConfig(target="planner", seed=1))
-    config, recorded = config_of(load_run(first.path)), records.read(first.fault)
+    config, recorded = load_run(first.path).mission(), records.read(first.fault)
     assert flown(fly_mission(config, tmp_path, Watcher(), repeat=recorded)) == flown(first)
 
 

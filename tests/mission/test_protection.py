@@ -16,9 +16,8 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect import model
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of, differing_results
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.stack import load_stack
@@ -257,9 +256,9 @@ def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
     text = b"limit alarm in control"
     assert text in run.folder.tlog.read_bytes()
     assert any(e["kind"] == "alarm" for e in run.result["events"])
-    again = load_run(fly_mission(config_of(run), tmp_path, Watcher()).path)
+    again = load_run(fly_mission(run.mission(), tmp_path, Watcher()).path)
     assert again.folder.trace.read_bytes() == run.folder.trace.read_bytes()
-    assert not differing_results(again.result, run.result)
+    assert not again.differing_sections(run)
 
 
 def test_a_wild_waypoint_far_ahead_is_dropped_before_the_collision_check_sees_it(guarded):
@@ -311,7 +310,7 @@ def test_a_flip_in_a_number_of_a_plan_is_seen_by_the_extended_watch_alone(
     assert result["pilot"]["plans_rejected"] == 1
     assert result["outcome"] == "success"
     assert result["config"]["detector"]["watch"] == "extended"
-    again = load_run(fly_mission(config_of(runs["extended"]), tmp_path, Watcher()).path)
+    again = load_run(fly_mission(runs["extended"].mission(), tmp_path, Watcher()).path)
     assert again.folder.trace.read_bytes() == runs["extended"].folder.trace.read_bytes()
 
 
@@ -381,5 +380,5 @@ def test_a_fault_in_no_detector_is_refused(fly_short):
 def test_the_record_of_a_guarded_run_can_be_read_back(guarded):
     run = guarded()
     asked = json.loads(run.folder.result.read_text())["config"]["detector"]
-    assert config_of(run).detector == DetectorConfig(name="limit", alarms_max=3)
+    assert run.mission().detector == DetectorConfig(name="limit", alarms_max=3)
     assert asked["protect"] == [stage.value for stage in Stage]

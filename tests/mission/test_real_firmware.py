@@ -11,8 +11,8 @@ from missions import SHORT
 
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import FIRMWARE

@@ -8,8 +8,7 @@ import pytest
 from missions import RECORD
 
 from mavfi_cli.core.types import STATES
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.record.tables import read_plans
+from mavfi_cli.mission.run_folder import load_run
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +175,7 @@ def test_a_collision_is_an_outcome_with_place_and_obstacle(tmp_path, fly_short):
 
 
 def test_the_plans_are_kept_whole(run):
-    plans = read_plans(run.folder.plans)
+    plans = run.folder.read_plans()
     assert [plan.stamp_s for plan in plans] == [plan["stamp_s"] for plan in run.result["plans"]]
     for plan, line in zip(plans, run.result["plans"], strict=True):
         np.testing.assert_allclose(plan.waypoints[:, 0:3], line["points_enu_m"], atol=5e-4)

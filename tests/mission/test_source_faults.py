@@ -10,15 +10,8 @@ import pytest
 
 from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.repetition import paired_golden
-from mavfi_cli.mission.replay import (
-    config_of,
-    differing_results,
-    first_difference,
-    largest_deviation_m,
-)
-from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run import fly_mission, paired_golden
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import difference_lines
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -41,7 +34,7 @@ def sideways(struck):
 @pytest.fixture(scope="module")
 def troubled(troubled_flight):
     """A mission that foresees collisions."""
-    return config_of(load_run(troubled_flight.path))
+    return load_run(troubled_flight.path).mission()
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +50,7 @@ def test_golden_and_faulty_flight_part_at_the_strike(sideways):
     (strike,) = fault["strikes"]
     (change,) = strike["changes"]
     assert change["after"] == -change["before"] != 0.0
-    parting = first_difference(sideways, paired_golden(sideways))
+    parting = sideways.first_difference(paired_golden(sideways))
     assert (parting.column, parting.stamp_s) == ("command_vx", strike["stamp_s"])
     assert (parting.this, parting.other) == (change["after"], change["before"])
     assert fault["activation"]["activation"] == "read"
@@ -74,16 +67,16 @@ def test_a_vehicle_whose_flight_has_ended_stays_where_it_is(sideways):
     flown = [sideways.trace[name].to_numpy()[rows - 1 :] for name in ("x_m", "y_m", "z_m")]
     farthest_m = max(math.dist(place, [p[0] for p in flown]) for place in zip(*flown, strict=True))
     assert farthest_m > 1.0
-    assert largest_deviation_m(sideways, cut) == pytest.approx(farthest_m)
-    assert largest_deviation_m(cut, sideways) == pytest.approx(farthest_m)
-    assert math.isnan(largest_deviation_m(sideways, replace(cut, trace=None)))
+    assert sideways.largest_deviation_m(cut) == pytest.approx(farthest_m)
+    assert cut.largest_deviation_m(sideways) == pytest.approx(farthest_m)
+    assert math.isnan(sideways.largest_deviation_m(replace(cut, trace=None)))
 
 
 def test_a_fault_repeats_to_the_byte(sideways, tmp_path):
-    again = load_run(fly_mission(config_of(sideways), tmp_path, Watcher()).path)
+    again = load_run(fly_mission(sideways.mission(), tmp_path, Watcher()).path)
     assert again.folder.trace.read_bytes() == sideways.folder.trace.read_bytes()
     assert again.folder.tlog.read_bytes() == sideways.folder.tlog.read_bytes()
-    assert not differing_results(again.result, sideways.result)
+    assert not again.differing_sections(sideways)
 
 
 def test_a_flip_that_is_read_and_moves_nothing_is_masked(struck):

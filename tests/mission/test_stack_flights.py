@@ -8,9 +8,8 @@ from record_digest import record_digest
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.replay import config_of
 from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -108,17 +107,17 @@ def test_a_record_of_before_there_were_stacks_replays_as_hardened(golden, tmp_pa
     result = json.loads(golden.folder.result.read_text())
     del result["config"]["stack"], result["config"]["world_seed"]
     (folder / "result.json").write_text(json.dumps(result))
-    assert config_of(load_run(folder)).stack == "hardened"
+    assert load_run(folder).mission().stack == "hardened"
 
 
 def test_a_stack_file_that_changes_is_noticed(fly_short, tmp_path):
     stack = tmp_path / "mine.toml"
     stack.write_text('base = "mavbench"\n')
     run = load_run(fly_short(stack=str(stack)).path)
-    assert config_of(run).stack == str(stack)
+    assert run.mission().stack == str(stack)
     stack.write_text('base = "mavbench"\nguards_tracking = true\n')
     with pytest.raises(RecordError, match="has changed since this flight"):
-        config_of(run)
+        run.mission()
     stack.unlink()
     with pytest.raises(RecordError, match="does not exist"):
-        config_of(run)
+        run.mission()

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.top_view import draw_top_view
 

@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex, to_rgba
 from matplotlib.patches import Rectangle
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.record.run_folder import load_run
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.drawing import DETECTORS, write_figure
 from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
 

@@ -3,7 +3,6 @@
 import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.mission.vehicle import with_firmware
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -44,13 +43,13 @@ def test_an_autopilot_whose_flights_repeat_takes_instruction_level_faults():
 
 def test_the_binary_is_the_missions_or_the_environments(monkeypatch):
     monkeypatch.setenv("PX4_SITL", "/env/px4")
-    assert with_firmware(MissionConfig(autopilot="px4")).firmware == "/env/px4"
+    assert MissionConfig(autopilot="px4").with_firmware().firmware == "/env/px4"
     named = MissionConfig(autopilot="px4", firmware="/own/px4")
-    assert with_firmware(named).firmware == "/own/px4"
-    assert with_firmware(MissionConfig()) == MissionConfig()
+    assert named.with_firmware().firmware == "/own/px4"
+    assert MissionConfig().with_firmware() == MissionConfig()
     monkeypatch.delenv("PX4_SITL")
     with pytest.raises(ConfigError, match="--firmware PATH, or PX4_SITL"):
-        with_firmware(MissionConfig(autopilot="px4"))
+        MissionConfig(autopilot="px4").with_firmware()
 
 
 def test_the_binary_is_a_file_that_the_mission_depends_on():

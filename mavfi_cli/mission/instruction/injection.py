@@ -1,12 +1,15 @@
 """Plans one exact instruction-level fault of a mission, and injects it beside the flight.
 
-A tracer thread injects it. The orders that the golden run gave to each node, the number of entries
-of each kernel, and each profile are kept below the output folder, under a hash of everything that
-they depend on.
+A node is a function of its orders. In a rehearsal a separate node gets the orders of the golden run
+again, without a flight, at the speed of the machine. It forks for the last of them as often as it
+is asked: each fork works on the order and ends instead of answering. The orders, the number of
+entries of each kernel, and each profile are kept below the output folder, under a hash of
+everything that they depend on. In the flight a tracer thread injects the fault.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import pickle
@@ -19,29 +22,41 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mavfi_cli.attack.attacker import LiveAttack, TracerThread, attack_live
+from mavfi_cli.attack.attacker import EntryCounter, LiveAttack, TracerThread, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
+from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import ServedProcess, served_process
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
-from mavfi_cli.core.errors import FaultError, RecordError
-from mavfi_cli.core.files import own_digest, write_atomically, writing
+from mavfi_cli.core.errors import FaultError, RecordError, TargetError
+from mavfi_cli.core.files import file_digest, own_digest, write_atomically, writing
+from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import Briefing
-from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.fault import InstructionFault
-from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer import linux, record
+from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
+from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.sampling import WindowTooLong
+from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM
-from mavfi_cli.mission.instruction.rehearsal import Order, count_entries, profile_invocation
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
+from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
+_Order = tuple[Any, float]  # input, start stamp
 CACHE = ".profiles"
+_CONTEXT = (
+    "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
+    "windows", "profiled_instructions", "seed", "request",
+)  # fmt: skip
+_WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
+_WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
+_INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,20 +68,14 @@ class _PlannedFault:
     recorded: Mapping[str, Any] | None = None  # the repeated record; None for a drawn fault
 
 
-def _plan_fault(
-    config: MissionConfig,
-    asked: InstructionConfig,
-    out: Path,
-    versions: Mapping[str, str],
-    fly_golden: Callable[[MissionConfig, Path, Recorder], object],
-) -> _PlannedFault:
-    """Draw the fault of a mission and a seed; arguments as for `injection_of`."""
+def _plan_fault(config: MissionConfig, asked: InstructionConfig, out: Path) -> _PlannedFault:
+    """Draw the fault of a mission; what it is drawn from is kept below the folder `out`."""
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
-    folder = out / CACHE / _key(golden, versions)
+    folder = out / CACHE / _key(golden)
 
-    def fly() -> tuple[Briefing, dict[str, list[Order]]]:
+    def fly() -> tuple[Briefing, dict[str, list[_Order]]]:
         """The briefing of the golden run, and the orders that it gave, by node."""
         recorder = Recorder()
         fly_golden(golden, folder, recorder)
@@ -76,7 +85,7 @@ def _plan_fault(
     briefing, all_orders = _kept(folder / "orders.pickle", fly)
     setup = Setup.of(config, briefing, node)
     orders = all_orders.get(node, [])
-    counts = _kept(folder / f"entries-{kernel}.pickle", lambda: count_entries(setup, orders))
+    counts = _kept(folder / f"entries-{kernel}.pickle", lambda: _count_entries(setup, orders))
     if not counts or not counts[-1]:
         raise FaultError(
             f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
@@ -155,12 +164,6 @@ def _planned_of(recorded: Mapping[str, Any]) -> _PlannedFault:
     return _PlannedFault(fault=fault, context=context, recorded=recorded)
 
 
-_CONTEXT = (
-    "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
-    "windows", "profiled_instructions", "seed", "request",
-)  # fmt: skip
-
-
 def _kept(path: Path, make: Callable[[], T]) -> T:
     """Read a value from its file, or make it and keep it there."""
     if path.is_file():
@@ -173,17 +176,154 @@ def _kept(path: Path, make: Callable[[], T]) -> T:
     return value
 
 
-def _key(golden: MissionConfig, versions: Mapping[str, str]) -> str:
+def _key(golden: MissionConfig) -> str:
     """A hash of everything that the golden run depends on."""
-    values = golden.to_dict()
-    files = [Path(name) for name in golden.files]
     parts = [
-        json.dumps(values, sort_keys=True),
-        json.dumps(dict(versions), sort_keys=True),
+        json.dumps(golden.to_dict(), sort_keys=True),
+        json.dumps(installed_versions(), sort_keys=True),
         own_digest(),
-        *(hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()),
+        *(digest for name in golden.files if (digest := file_digest(name))),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+# Rehearsal ----------------------------------------------------------------------------------------
+
+
+class Rehearsal:
+    """The `AttackPlace` in which one invocation of a node's kernel runs.
+
+    Args:
+        orders: inputs and start stamps, up to the order with the invocation.
+        entry: number of the kernel's entry in that order with which it begins, from 1.
+    """
+
+    kind = "node"
+
+    def __init__(self, setup: Setup, orders: Sequence[_Order], entry: int = 1) -> None:
+        self._setup, self._entry = setup, entry
+        self._last = orders[-1]
+        self._spawned = served_process(PROGRAM)
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
+            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
+            self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
+            for value, start_s in orders[:-1]:
+                self._process.take(self._process.order(setup.node, value, start_s))
+            self._image = Image(self._spawned.pid, self.scope_of_node.regions)
+            undo.pop_all()
+
+    @property
+    def name(self) -> str:
+        """Name of the kernel."""
+        return self.scope_of_node.kernel
+
+    def start(self) -> Tracee:
+        """Start a fork of the node, stopped where it begins the invocation."""
+        tracee = Tracee.attach(self._process.rehearse())
+        self._process.order(self._setup.node, *self._last)
+        if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
+            raise TargetError(f"node {self._setup.node}", "does not begin its invocation again")
+        return tracee
+
+    def image(self, _: Tracee) -> Image:
+        """The memory image of the node and of each fork."""
+        return self._image
+
+    def scope(self, image: Image) -> Scope:
+        """The code that may be hit."""
+        return scope_of(image, self.scope_of_node.objects)
+
+    def profile(self, rng: np.random.Generator) -> TargetProfile:
+        """Step the invocation, or a sample of it.
+
+        It runs on the node's own processor: switching between two doubles the time.
+        """
+        linux.share_processor(self._spawned.pid)
+        node, inner = self._setup.node, self.scope_of_node.inner
+        if node == "planner":
+            return self._profile_request(rng)
+        if node in _INNER_CALLS:
+            return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
+        return profile_call(self, limit=_WHOLE_LIMIT)
+
+    def _profile_request(self, rng: np.random.Generator) -> TargetProfile:
+        """Step a whole request if it needs no search, else a sample of it.
+
+        No native function encloses a request: Python calls several compiled functions, with or
+        without a search. So the request ends with the run.
+        """
+        if not self._searches():
+            try:
+                return profile_run(self, rng, limit=_WHOLE_LIMIT)
+            except WindowTooLong:  # smoothing repeats its attempts
+                pass
+        return profile_run(
+            self,
+            rng,
+            markers=self.scope_of_node.inner,
+            windows=_WINDOWS,
+            enough=_ENOUGH,
+            limit=_WHOLE_LIMIT,
+        )
+
+    def _searches(self) -> bool:
+        tracee = self.start()
+        try:
+            search = self.scope_of_node.inner[0]
+            return tracee.count_to_end(self._image.address(search)) > 0
+        finally:
+            tracee.kill()
+
+    def close(self) -> None:
+        """End the node."""
+        self._spawned.kill()
+
+
+def profile_invocation(
+    setup: Setup, orders: Sequence[_Order], entry: int, earlier: int, rng: np.random.Generator
+) -> TargetProfile:
+    """Profile one invocation of a node's kernel in the last of the orders.
+
+    Args:
+        orders: the orders up to the one with the invocation.
+        entry: number of the kernel's entries when it begins, itself included.
+        earlier: number of them in the earlier orders.
+        rng: draws the sample, if only a sample is stepped.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        WindowTooLong: the invocation is too long to be stepped.
+        TargetError: nothing in scope executes.
+    """
+    place = Rehearsal(setup, orders, entry - earlier)
+    try:
+        found = TracerThread(lambda _armed: place.profile(rng)).result()
+    finally:
+        place.close()
+    return found.after(CountedStop(place.scope_of_node.entry, entry))
+
+
+def _count_entries(setup: Setup, orders: Sequence[_Order]) -> list[int]:
+    """Count the kernel's entries up to the end of each order.
+
+    Raises:
+        TracingForbidden: the operating system neither counts nor lets us trace.
+    """
+    spawned, counts = served_process(PROGRAM), []
+    with contextlib.ExitStack() as leaving:
+        leaving.callback(spawned.kill)
+        scope = spawned.begin(setup, f"node {setup.node}")
+        address = Image(spawned.pid, scope.regions).address(scope.entry)
+        counter = leaving.enter_context(contextlib.closing(EntryCounter(spawned.pid, address)))
+        process = NodeProcess(spawned.connection, spawned.pid)
+        for value, start_s in orders:
+            process.take(process.order(setup.node, value, start_s))
+            counts.append(counter.read())
+    return counts
+
+
+# Flight -------------------------------------------------------------------------------------------
 
 
 class _InstructionInjection(NoInjection):
@@ -324,17 +464,13 @@ def _attack_text(written: Mapping[str, Any]) -> str:
 def injection_of(
     config: MissionConfig,
     out: Path,
-    versions: Mapping[str, str],
-    fly_golden: Callable[[MissionConfig, Path, Recorder], object],
-    *,
-    repeat: Mapping[str, Any] | None = None,
-    for_debugger: Callable[[int], None] | None = None,
+    repeat: Mapping[str, Any] | None,
+    for_debugger: Callable[[int], None] | None,
 ) -> _InstructionInjection:
     """Plan the instruction-level fault of a mission, and start its node's process.
 
     Args:
         out: the folder below which golden runs and profiles are kept.
-        fly_golden: function that flies a mission into a folder and records it.
         repeat: the record of a fault to repeat; None draws one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
 
@@ -347,8 +483,5 @@ def injection_of(
             "an instruction-level fault needs flights that repeat, and those of a foreign "
             "autopilot do not: leave out --link"
         )
-    if repeat is not None:
-        planned = _planned_of(repeat)
-    else:
-        planned = _plan_fault(config, config.instruction, out, versions, fly_golden)
+    planned = _planned_of(repeat) if repeat else _plan_fault(config, config.instruction, out)
     return _InstructionInjection(planned, served_process(PROGRAM), for_debugger)

@@ -25,9 +25,9 @@ from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.core.types import DepthFrame, FloatArray
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.progress import Recorder
-from mavfi_cli.mission.record.measures import FlightRecord
-from mavfi_cli.mission.record.run_folder import Run
+from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.report.drawing import ALARM, FAULT, FLIGHTS, GOAL, OBSTACLE, PLAN
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ import pytest
 
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.mission.progress import Recorder, Watcher
-from mavfi_cli.mission.record.run_folder import load_run
-from mavfi_cli.mission.repetition import watch_again
-from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.run import fly_mission, watch_again
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.view import (
     Boxes,
     Depth,

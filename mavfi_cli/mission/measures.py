@@ -1,9 +1,9 @@
-"""The sections and the measures of a flight: the one place where a result.json is read.
+"""What a flight was: its quality, and the sections and measures of its result.json.
 
-Each measure is a column of a table of flights. A mission that crashed or hung before it could write
-its record has few fields; a measure that its record does not have is None. A source-level fault
-that struck several components has them joined by ";", in one order in all measures; of several
-strikes the measures have the first.
+This is the one place where a result.json is read. Each measure is a column of a table of flights. A
+mission that crashed or hung before it could write its record has few fields; a measure that its
+record does not have is None. A source-level fault that struck several components has them joined by
+";", in one order in all measures; of several strikes the measures have the first.
 """
 
 from __future__ import annotations
@@ -13,34 +13,59 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from mavfi_cli.core.types import Outcome
+import numpy as np
+
+from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.record.quality import QUALITY
+from mavfi_cli.spec.platform import KERNELS
 
 Record = Mapping[str, Any]
-_PLACES = {
-    **{name: ("quality_of_flight", name) for name in QUALITY},
-    "replans": ("pilot", "replans"),
-    "simulated_s": ("simulated_s",),
-    "response_median_s": ("response_time_s", "median"),
-    "response_p95_s": ("response_time_s", "p95"),
-    "alarm_count": ("detection", "alarm_count"),
-    "hover_shaft_w": ("referee", "physics", "hover_shaft_w"),
-}
-_BOTH = (
-    "strikes", "strike_s", "strike_invocation", "struck_bits", "struck_before_hex",
-    "struck_after_hex", "activation",
+QUALITY = (
+    "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
+    "goal_distance_m",  # at the end of the mission
+    "energy_regression_j",  # MAVBench's regression, see docs/reference/records.md
+    "energy_propeller_j",  # from JSBSim's propeller shaft power, all rotors
 )  # fmt: skip
-_SOURCE = (
-    "strike_phase", "strike_tick", "struck_state", "struck_index", "struck_before",
-    "struck_after", "first_reader", "first_read_state", "first_read_s",
-)  # fmt: skip
-_INSTRUCTION = (
-    "struck_node", "struck_kernel", "struck_function", "struck_address", "struck_instruction",
-    "struck_execution", "struck_role", "struck_register", "reading_instruction", "node_ended",
-)  # fmt: skip
-STRUCK = (*_BOTH, *_SOURCE, *_INSTRUCTION)
-_FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
+
+
+def quality_of(
+    log: Mapping[str, FloatArray], start_s: float, end_s: float, goal_enu_m: FloatArray
+) -> dict[str, float | None]:
+    """Compute QUALITY, the quality of flight (QoF): time, distance, energy and clearance.
+
+    Flight time runs from the companion's take-over at take-off height to the end of the mission, as
+    in the paper (section IV), where take-off precedes the measurement. Unknown values are None.
+
+    Args:
+        log: Columns with one row per control tick: those of `sitl.referee`, or its stamp, position
+            and velocity only, because a foreign autopilot has no referee.
+        start_s, end_s: Stamps of the companion's take-over and of the end.
+        goal_enu_m: Goal (3,), m.
+    """
+    inside = (log["stamp_s"] >= start_s - 1e-9) & (log["stamp_s"] <= end_s + 1e-9)
+    flown = {name: column[inside] for name, column in log.items()}
+    stamps, positions = flown["stamp_s"], flown["position_enu_m"]
+    if len(stamps) < 2:
+        return dict.fromkeys(QUALITY)
+    distance_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    flight_time_s = float(stamps[-1] - stamps[0])
+    found = {
+        "flight_time_s": flight_time_s,
+        "distance_m": distance_m,
+        "mean_speed_mps": distance_m / flight_time_s,
+        "max_speed_mps": float(np.linalg.norm(flown["velocity_enu_mps"], axis=1).max()),
+        "goal_distance_m": float(np.linalg.norm(positions[-1] - goal_enu_m)),
+    }
+    if "clearance_m" in flown:
+        found["min_clearance_m"] = float(flown["clearance_m"].min())
+        for kind in ("regression", "propeller"):
+            energy_j = np.trapezoid(flown[f"power_{kind}_w"], stamps)
+            found[f"energy_{kind}_j"] = float(energy_j)
+    # Without obstacles the clearance is infinite; what the referee could not measure is NaN.
+    return {name: found[name] if np.isfinite(found.get(name, np.nan)) else None for name in QUALITY}
+
+
+# Sections -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +124,19 @@ def record_of(result: Record) -> FlightRecord:
     )
 
 
+# Measures -----------------------------------------------------------------------------------------
+
+_PLACES = {
+    **{name: ("quality_of_flight", name) for name in QUALITY},
+    "replans": ("pilot", "replans"),
+    "simulated_s": ("simulated_s",),
+    "response_median_s": ("response_time_s", "median"),
+    "response_p95_s": ("response_time_s", "p95"),
+    "alarm_count": ("detection", "alarm_count"),
+    "hover_shaft_w": ("referee", "physics", "hover_shaft_w"),
+}
+
+
 def measures_of(record: Record) -> dict[str, Any]:
     """All measures of a mission.
 
@@ -114,7 +152,7 @@ def measures_of(record: Record) -> dict[str, Any]:
         "crashed": any(node.get("crashes") for node in nodes.values()),
         **_alarms(record.get("detection") or {}),
         **_applied(record.get("fault") or {}),
-        **struck(record),
+        **_struck(record),
     }
 
 
@@ -170,9 +208,20 @@ def _applied(fault: Record) -> dict[str, Any]:
 
 # What a fault did -----------------------------------------------------------------------------
 
+STRUCK = (
+    "strikes", "strike_s", "strike_invocation", "struck_bits", "struck_before_hex",
+    "struck_after_hex", "activation",
+    # at source level
+    "strike_phase", "strike_tick", "struck_state", "struck_index", "struck_before",
+    "struck_after", "first_reader", "first_read_state", "first_read_s",
+    # at instruction level
+    "struck_node", "struck_kernel", "struck_function", "struck_address", "struck_instruction",
+    "struck_execution", "struck_role", "struck_register", "reading_instruction", "node_ended",
+)  # fmt: skip
+_FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
 
-def struck(record: Record) -> dict[str, Any]:
-    """STRUCK of a mission."""
+
+def _struck(record: Record) -> dict[str, Any]:
     fault: Record = record.get("fault") or {}
     found = _instruction(fault, record) if fault.get("level") == "instruction" else _source(fault)
     return {name: found.get(name) for name in STRUCK}
@@ -250,3 +299,115 @@ def _value(change: Record, when: str) -> Any:
     if value is not None:
         return value
     return bits.value_of(int(pattern, 16), bits.NUMPY_TYPES[_FLOATS[len(pattern)]])
+
+
+# Cost of detection and recovery -------------------------------------------------------------------
+
+# Kernels that are recomputed after an alarm of a stage, from first to last.
+RECOMPUTED = {
+    Stage.PERCEPTION.value: ("point_cloud", "octomap", "collision_check"),
+    Stage.PLANNING.value: ("planner",),
+    Stage.CONTROL.value: ("control",),
+}
+# Note for every comparison of checks with simulated time, as no factor between hosts is known.
+HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
+_AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionCost:
+    """Cost of a detector in one flight.
+
+    It is "the total detection and recomputation time for each mission" (paper, Table V). Checks
+    count with their time on the host of the flight. Recomputations count with their latency on the
+    flight's platform, in simulated time.
+
+    Attributes:
+        flight_s: Flight time, or simulated time of the whole mission if that is unknown, s.
+        recomputations: Number of recomputations per stage. The record lists the first alarms and
+            only counts the others, which are distributed over the stages in the same ratio.
+            Numbers may therefore be fractions.
+        recovery_s: Simulated time of the recomputations per stage, each at the mean latency of its
+            kernels in this flight, s.
+    """
+
+    detector: str
+    checks: int
+    checks_host_s: float
+    flight_s: float
+    recomputations: Mapping[str, float]
+    recovery_s: Mapping[str, float]
+    compute_s: float
+    host_compute_s: float
+    platform: str
+    faulty: bool
+
+    @property
+    def check_host_s(self) -> float:
+        """Mean host time of a check, s."""
+        return self.checks_host_s / self.checks
+
+    @property
+    def detection_share(self) -> float:
+        """Ratio of the checks' host time to the flight time."""
+        return self.checks_host_s / self.flight_s
+
+    @property
+    def recovered_s(self) -> float:
+        """Simulated time of all recomputations, s."""
+        return math.fsum(self.recovery_s.values())
+
+    @property
+    def recovery_share(self) -> float:
+        """Ratio of the recomputations' simulated time to the flight time."""
+        return self.recovered_s / self.flight_s
+
+
+def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
+    """Compute the cost of detection and recovery in a flight.
+
+    Returns:
+        Cost; None without a detector or without any check.
+    """
+    flight = record_of(result)
+    detection, kernels = flight.detection, flight.kernels
+    walls = flight.host.get("stage_wall_s") or {}
+    checks_host_s = walls.get("gate")
+    if not detection or not checks_host_s:
+        return None
+    checks = sum(detection["checks"].values())
+    flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
+    if not checks or not flight_s:
+        return None
+    again = _recomputations(detection)
+
+    def mean_s(kernel: Mapping[str, Any] | None) -> float:
+        """Return the mean latency of an invocation, s."""
+        if not kernel or not kernel["invocations"]:
+            return 0.0
+        return float(kernel["busy_s"] / kernel["invocations"])
+
+    return DetectionCost(
+        detector=detection["detector"],
+        checks=checks,
+        checks_host_s=checks_host_s,
+        flight_s=flight_s,
+        recomputations=again,
+        recovery_s={
+            stage: math.fsum(again[stage] * mean_s(kernels.get(name)) for name in names)
+            for stage, names in RECOMPUTED.items()
+        },
+        compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
+        host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
+        platform=str(flight.config.get("platform", "an unknown platform")),
+        faulty=bool(flight.fault),
+    )
+
+
+def _recomputations(detection: Record) -> dict[str, float]:
+    """Return the recomputations per stage; unlisted alarms are distributed in the same ratio."""
+    listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
+    total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
+    return {
+        stage: listed.count(stage) * total / len(listed) if listed else 0.0 for stage in RECOMPUTED
+    }

@@ -1,0 +1,250 @@
+"""`mavfi doctor`, `platforms`, `stacks`, `states`: what this machine can do, and what to choose."""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mavfi_cli.report.columns import WIDTH, columns
+
+if TYPE_CHECKING:
+    from mavfi_cli.spec.platform import PlatformProfile
+    from mavfi_cli.spec.stack import Stack
+
+_names = click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
+
+
+def _print_json(rows: Iterable[Any]) -> None:
+    click.echo(json.dumps([asdict(row) for row in rows], indent=2))
+
+
+def _title(chosen: PlatformProfile | Stack) -> str:
+    return f"{chosen.name}: {chosen.description}" if chosen.description else chosen.name
+
+
+# Doctor -------------------------------------------------------------------------------------------
+
+_FOUND = 29  # column of a check's finding
+_MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Print the checks as JSON.")
+def doctor(as_json: bool) -> None:
+    """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
+
+    Exits with code 1 if mavfi cannot fly here. Limitations do not count.
+    """
+    from mavfi_cli.mission.machine import FAILED, check_machine
+
+    checks = []
+    for check in check_machine():
+        checks.append(check)
+        if not as_json:
+            colour, mark = _MARKS[check.verdict]
+            first, *rest = textwrap.wrap(check.found, WIDTH - _FOUND) or [""]
+            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {first}")
+            for line in [*rest, *([f"-> {check.remedy}"] if check.remedy else [])]:
+                click.echo(f"{'':<{_FOUND}}{line}")
+    if as_json:
+        _print_json(checks)
+    if any(check.verdict == FAILED for check in checks):
+        raise click.exceptions.Exit(1)
+
+
+# Platforms ----------------------------------------------------------------------------------------
+
+_P95 = 1.6449  # standard normal: 90 % lie within
+_MORE_PLATFORMS = """\
+measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for `mavfi fly \
+--realtime` only
+
+`mavfi platforms NAME` shows every kernel; docs/how-to/platform.md says how to add one."""
+_MEASURED = """\
+{cores} cores, stays on the ground
+Every invocation of {kernels} is
+measured on this host, and its output takes effect {factor:g} times as much later.
+result.json has the medians. Such a flight does not repeat: `mavfi fly --realtime`
+only, neither in campaigns nor with `mavfi replay`."""
+
+
+@click.command()
+@_names
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+def platforms(names: tuple[str, ...], as_json: bool) -> None:
+    """List the compute platforms, or show the named ones kernel by kernel."""
+    from mavfi_cli.spec.platform import PLATFORMS, load_platform
+
+    profiles = [load_platform(name) for name in names or PLATFORMS.names]
+    if as_json:
+        _print_json(profiles)
+    elif names:
+        click.echo("\n\n".join("\n".join(_kernel_lines(profile)) for profile in profiles))
+    else:
+        for profile in profiles:
+            click.echo(
+                f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W  "
+                f"board {1000 * profile.mass_kg:>3.0f} g  all kernels {_all_s(profile):>6.3f} s  "
+                f"{profile.description}"
+            )
+        click.echo(_MORE_PLATFORMS)
+
+
+def _all_s(profile: PlatformProfile) -> float:
+    return float(sum(latency.latency_s for latency in profile.kernels.values()))
+
+
+def _kernel_lines(profile: PlatformProfile) -> Iterator[str]:
+    """The computer and each kernel, with the source of each number."""
+    if profile.measured_factor is not None:
+        yield _title(profile)
+        yield _MEASURED.format(
+            cores=profile.cores, kernels=", ".join(profile.kernels), factor=profile.measured_factor
+        )
+        return
+    based = f"; latencies from {profile.base}" if profile.base else ""
+    yield f"{_title(profile)}; {'carried' if profile.carried else 'stays on the ground'}{based}"
+    rows = [("cores", f"{profile.cores}", "cores"), ("power", f"{profile.power_w:g} W", "power_w")]
+    if profile.carried:
+        rows += [
+            ("board", f"{1000 * profile.mass_kg:g} g", "mass_kg"),
+            ("heat sink", f"{1000 * profile.heatsink_kgpw:g} g/W", "heatsink_kgpw"),
+        ]
+    for title, value, key in rows:
+        yield f"{title:<16} {value:>10}  {profile.sources.get(key, 'not given')}"
+    yield ""
+    yield f"{'kernel':<16} {'median':>10}  {'5 % to 95 %':>22}  source"
+    for name, latency in profile.kernels.items():
+        factor = math.exp(_P95 * latency.spread)
+        low, high = (1000 * latency.latency_s * f for f in (1.0 / factor, factor))
+        yield (
+            f"{name:<16} {1000 * latency.latency_s:>7.2f} ms  {low:>8.2f} to {high:>8.2f} ms  "
+            f"{latency.source or 'not given'}"
+        )
+    yield f"{'all of them':<16} {1000 * _all_s(profile):>7.2f} ms"
+    if "spread" in profile.sources:
+        yield f"{'their spread':<53} {profile.sources['spread']}"
+
+
+# Stacks -------------------------------------------------------------------------------------------
+
+_GROUPS = {  # all keys, in the order of the output
+    "Follower": (
+        "stretches_clock", "skips_endless_slices", "guards_tracking", "tracking_guard_m",
+        "position_gain_per_s", "climb_gain_per_s", "integral_gain_per_s2", "damping_gain",
+        "feeds_acceleration_forward", "control_owns_queue",
+    ),
+    "Collision check": (
+        "check_radius_m", "refuses_far_waypoints", "farthest_waypoint_m", "shifts_path_to_vehicle",
+    ),
+    "What a foreseen collision does": (
+        "stops_on_report", "uses_time_to_collision", "acts_on_report_once",
+    ),
+    "Planning": (
+        "planner_radius_m", "plans_in_motion", "rejected_plan_pause_s", "slows_where_blind",
+    ),
+    "Mission": ("goal_tolerance_m", "arrives_at_rest", "turns_before_departure"),
+    "Nodes": ("owns_sequence_numbers", "processes"),
+}  # fmt: skip
+_KEY = max(len(key) for keys in _GROUPS.values() for key in keys) + 2
+_VALUE = 7  # columns of a truth value or a number
+_MORE_STACKS = """
+`mavfi stacks NAME` explains every key, `mavfi stacks NAME NAME` shows where stacks differ.
+NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true."""
+
+
+@click.command()
+@_names
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+def stacks(names: tuple[str, ...], as_json: bool) -> None:
+    """List the stacks, explain the keys of one, or show the keys in which several differ.
+
+    NAME:KEY=VALUE,KEY=VALUE names a variant: that stack with other values of some keys, such as
+    mavbench:guards_tracking=true. FILE:KEY=VALUE works in the same way.
+    """
+    from mavfi_cli.spec.stack import STACKS, load_stack
+
+    found = [load_stack(name) for name in names or STACKS.names]
+    if as_json:
+        _print_json(found)
+    elif not names:
+        click.echo("\n".join(f"{stack.name:<19}{stack.description}" for stack in found))
+        click.echo(_MORE_STACKS)
+    else:
+        click.echo("\n".join(_explained(found[0]) if len(found) == 1 else _compared(found)))
+
+
+def _explained(stack: Stack) -> Iterator[str]:
+    """All keys with value and source."""
+    base = f"; the other values from {stack.base}" if stack.base else ""
+    yield from textwrap.wrap(_title(stack) + base, WIDTH)
+    start = 2 + _KEY + _VALUE
+    for group, keys in _GROUPS.items():
+        yield group
+        for key in keys:
+            head = f"  {key:<{_KEY}}{_told(getattr(stack, key)):<{_VALUE}}"
+            source = textwrap.wrap(stack.sources.get(key, "not given"), WIDTH - start)
+            yield head + source.pop(0) if len(head) == start else head  # else its source is below
+            yield from (" " * start + line for line in source)
+
+
+def _compared(found: Sequence[Stack]) -> Iterator[str]:
+    """The keys in which stacks differ, one column per stack."""
+    for number, stack in enumerate(found, start=1):
+        yield from textwrap.wrap(f"{number}  {_title(stack)}", WIDTH, subsequent_indent="   ",
+                                 break_long_words=True)  # fmt: skip
+    keys = [key for keys in _GROUPS.values() for key in keys
+            if len({getattr(stack, key) for stack in found}) > 1]  # fmt: skip
+    yield ""
+    if not keys:
+        yield "no key differs"
+        return
+    width = max(8, (WIDTH - _KEY) // len(found))
+    rows = [("", [[str(number)] for number in range(1, len(found) + 1)])]
+    rows += [
+        (key, [textwrap.wrap(_told(getattr(stack, key)), width - 2) for stack in found])
+        for key in keys
+    ]
+    for key, cells in rows:  # several lines if a value is wider than its column
+        for line in range(max(map(len, cells))):
+            told = [f"{cell[line] if line < len(cell) else '':<{width}}" for cell in cells]
+            yield f"{'' if line else key:<{_KEY}}{''.join(told)}".rstrip()
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(" + ".join(nodes) for nodes in value) or "none"
+    return f"{value:g}"
+
+
+# States -------------------------------------------------------------------------------------------
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+def states(as_json: bool) -> None:
+    """List the monitored states, which are the injection sites of source-level faults."""
+    from mavfi_cli.core.types import STATES
+
+    rows = [
+        {
+            "name": state.name,
+            "stage": state.stage.value,
+            "group": state.group,
+            "type": state.dtype.value,
+            "unit": state.unit,
+        }
+        for state in STATES
+    ]
+    if as_json:
+        click.echo(json.dumps(rows, indent=2))
+        return
+    click.echo("\n".join(columns([[*rows[0]], *([*row.values()] for row in rows)])))

@@ -1,0 +1,158 @@
+"""`mavfi show` and `mavfi replay`: summarise a recorded run, or fly it again and compare."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+_TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
+
+
+def _note(text: str) -> None:
+    click.echo(text, err=True)
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print result.json unchanged.")
+@click.option("--pair", is_flag=True,
+              help="Fly the golden run of the pair, keep it, and report what the fault "
+                   "changed.")  # fmt: skip
+@click.option("--events", is_flag=True, help="Add a list of all events of the flight.")
+@click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+              help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
+def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
+    """Summarise RUN, a run folder."""
+    from mavfi_cli.mission.run import paired_golden
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
+
+    if as_json and (pair or events):
+        raise click.UsageError("--json prints the record alone: leave out --pair and --events")
+    recorded = load_run(run)
+    if picture is not None:
+        from mavfi_cli.report.drawing import write_figure
+        from mavfi_cli.report.top_view import draw_top_view
+
+        write_figure(draw_top_view(recorded), picture)
+    if as_json:
+        click.echo(json.dumps(recorded.result, indent=2, sort_keys=True))
+        return
+    lines = summary_lines(recorded.result)
+    if recorded.record.fault:
+        golden = paired_golden(recorded, _note) if pair else recorded.golden
+        if golden is None:
+            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
+        else:
+            lines += difference_lines(recorded, golden)
+    if events:
+        lines += ["", "Events", *event_lines(recorded.result)]
+    click.echo("\n".join([*lines, *folder_lines(recorded, picture)]))
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--mission", "number", type=click.IntRange(min=0), metavar="NUMBER",
+              help="RUN is a campaign's folder or exported .parquet: repeat its mission of this "
+                   "number.")  # fmt: skip
+@click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
+              show_default=True, help="Parent of the new run folder.")  # fmt: skip
+@click.option("--gdb", is_flag=True,
+              help="Instruction level: stop the node at the injected instruction and wait for a "
+                   "debugger. The activation is then neither followed nor compared.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
+def replay(
+    run: Path, number: int | None, without_fault: bool, out: Path, gdb: bool, as_json: bool
+) -> None:
+    """Repeat RUN, a run folder, and compare the records byte for byte.
+
+    Exits with code 1 if the repetition differs. With --without-fault the difference shows the
+    effect of the fault. An interrupted replay leaves no files. With --mission, the measures of the
+    repetition are compared with those that the campaign recorded.
+    """
+    if number is None:
+        comparison, lines = _repeat_run(run, out, with_fault=not without_fault, gdb=gdb)
+    elif gdb:
+        raise click.UsageError("--gdb needs a run folder, which --mission does not")
+    else:
+        comparison, lines = _repeat_mission(run, number, out, with_fault=not without_fault)
+    click.echo(json.dumps(comparison, indent=2) if as_json else "\n".join(lines))
+    if not comparison["identical"] and not without_fault:
+        raise click.exceptions.Exit(1)
+
+
+_Comparison = tuple[dict[str, Any], list[str]]  # as JSON, and as lines
+
+
+def _repeat_run(path: Path, out: Path, *, with_fault: bool, gdb: bool) -> _Comparison:
+    from mavfi_cli.core.files import file_digest
+    from mavfi_cli.core.installed import installed_versions, version_differences
+    from mavfi_cli.mission.run import fly_again
+    from mavfi_cli.mission.run_folder import load_run
+    from mavfi_cli.report.summary import difference_lines, outcome_line
+
+    run = load_run(path)
+    if gdb and not (with_fault and run.record.config.get("instruction")):
+        raise click.UsageError("--gdb needs an instruction-level fault to stop at")
+    for text in version_differences(run.record.versions, installed_versions()):
+        _note(f"warning: another build: {text}")
+    config = run.mission(with_fault=with_fault)
+    what = "again" if with_fault else "without its fault"
+    _note(f"flying {config.world}, seed {config.seed}, {what}")
+    again = fly_again(run, out, with_fault=with_fault, for_debugger=_say_where if gdb else None)
+    ignored = _TELL_ACTIVATION if gdb else ()
+    differing = [name for name in run.differing_sections(again) if name not in ignored]
+    identical = not differing and (file_digest(run.folder.trace) == file_digest(again.folder.trace))
+    parting = run.first_difference(again, truth=True)
+    comparison = {
+        "run": str(run.folder.path),
+        "again": str(again.folder.path),
+        "identical": identical,
+        "outcomes": [run.record.outcome, again.record.outcome],
+        "differing_sections": differing,
+        "first_difference": parting and {"stamp_s": parting.stamp_s, "column": parting.column},
+    }
+    if not with_fault:
+        lines = [
+            f"with the fault     {outcome_line(run.result)}",
+            f"without            {outcome_line(again.result)}",
+            *difference_lines(run, again),
+            "",
+        ]
+    else:
+        lines = ["identical"] if identical else ["DIFFERENT", *difference_lines(run, again)]
+    return comparison, [*lines, f"Run folder  {again.folder.path}"]
+
+
+def _repeat_mission(campaign: Path, number: int, out: Path, *, with_fault: bool) -> _Comparison:
+    from mavfi_cli.mission.run import fly_to_end
+    from mavfi_cli.report.summary import outcome_line
+    from mavfi_cli.studies.again import mission_of
+
+    mission = mission_of(campaign, number)
+    config = mission.config if with_fault else mission.config.golden
+    _note(f"flying mission {number}: {config.world}, seed {config.seed}")
+    again = fly_to_end(config, out)
+    differing = mission.differing(again.result)
+    comparison = {
+        "campaign": str(campaign),
+        "mission": number,
+        "again": str(again.folder.path),
+        "identical": not differing,
+        "outcomes": [mission.row["outcome"], again.record.outcome],
+        "differing_measures": differing,
+    }
+    same = "identical in every measure"
+    told = f"DIFFERENT in {', '.join(differing)}" if differing else same
+    return comparison, [outcome_line(again.result), told, f"Run folder  {again.folder.path}"]
+
+
+def _say_where(pid: int) -> None:
+    _note(
+        f"the node waits at the injected instruction, the fault in place: gdb -p {pid}  "
+        f"(or let it go on: kill -CONT {pid})"
+    )

@@ -1,1 +1,0 @@
-"""Record of a flight: run folder, tables, events and statistics."""

@@ -1,0 +1,417 @@
+"""The folder of one run: its tables, and the run that is read from it and compared."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import file_digest, read_parquet, write_parquet, writing
+from mavfi_cli.core.types import (
+    BY_NAME,
+    STATES,
+    WAYPOINT_FIELDS,
+    CollisionReport,
+    Command,
+    DType,
+    FloatArray,
+    Invocation,
+    Message,
+    Reaction,
+    Trajectory,
+    VehicleState,
+)
+from mavfi_cli.mission.measures import FlightRecord, record_of
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.platform import measured_factor
+from mavfi_cli.spec.stack import FIRST
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RESULT, FAULT, TRACE = "result.json", "fault.json", "trace.parquet"
+_NEEDED = (
+    "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
+)  # fmt: skip
+_PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_seq": np.int32}
+_RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
+
+
+class RunFolder:
+    """Paths in a run folder, and the tables of plans and kernels."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.result = path / RESULT  # outcome, quality of flight, seeds, versions, configuration
+        self.trace = path / TRACE  # states at every control tick
+        self.plans = path / "plans.parquet"  # every waypoint of every plan
+        self.kernels = path / "kernels.parquet"  # start and end of every invocation
+        self.tlog = path / "flight.tlog"  # every MAVLink frame of both directions
+        self.picture = path / "flight.svg"  # the flight from above, and its height
+        self.fault = path / FAULT  # fault record, on disk before the fault strikes
+        self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
+        self.golden = path / "golden"  # run folder of the golden run of the pair
+
+    @classmethod
+    def new(cls, parent: Path, world: str, seed: int) -> RunFolder:
+        """Create an empty folder `<world>-<seed>-<number>`; safe for parallel missions.
+
+        Characters of the world's name that are unfit for paths are replaced.
+
+        Raises:
+            RecordError: The folder cannot be created.
+        """
+        name = world.removesuffix(".toml").rpartition("/")[2]
+        name = "".join(c if c.isalnum() or c in "-_." else "-" for c in name) or "world"
+        stem = f"{name}-{seed}"
+        with writing(parent):
+            parent.mkdir(parents=True, exist_ok=True)
+            ends = (path.name.rpartition("-")[2] for path in parent.glob(f"{stem}-[0-9]*"))
+            number = max((int(end) for end in ends if end.isdigit()), default=0) + 1
+            while True:
+                path = parent / f"{stem}-{number:03d}"
+                try:
+                    path.mkdir()
+                    return cls(path)
+                except FileExistsError:
+                    number += 1
+        raise AssertionError("unreachable")
+
+    def write_plans(self, plans: Sequence[Trajectory]) -> None:
+        """Write all plans, as received by the mission logic: one row per waypoint."""
+        import pyarrow as pa
+
+        lengths = [len(plan.waypoints) for plan in plans]
+        columns = {"plan": np.repeat(np.arange(len(plans), dtype=np.int32), lengths)}
+        for name, kind in _PLAN.items():
+            values = np.array([getattr(plan, name) for plan in plans], kind)
+            columns[name] = np.repeat(values, lengths)
+        rows = np.vstack([np.zeros((0, len(WAYPOINT_FIELDS))), *(plan.waypoints for plan in plans)])
+        columns.update(zip(WAYPOINT_FIELDS, rows.T.copy(), strict=True))
+        durations = [plan.durations_s for plan in plans]
+        columns["duration_s"] = np.concatenate([np.zeros(0), *durations])
+        write_parquet(self.plans, pa.table(columns))
+
+    def read_plans(self) -> list[Trajectory]:
+        """Read plans. The file does not contain plans without waypoints.
+
+        Raises:
+            RecordError: The file is missing, damaged, or of another format.
+        """
+        names = ("plan", *_PLAN, *WAYPOINT_FIELDS, "duration_s")
+        columns = _columns(self.plans, "plans", names)
+        plans = []
+        for number in np.unique(columns["plan"]):
+            rows = columns["plan"] == number
+            plans.append(
+                Trajectory(
+                    waypoints=np.column_stack([columns[name][rows] for name in WAYPOINT_FIELDS]),
+                    durations_s=columns["duration_s"][rows],
+                    **{name: columns[name][rows][0].item() for name in _PLAN},
+                )
+            )
+        return plans
+
+    def write_timetable(
+        self, invocations: Sequence[Invocation], reactions: Sequence[Reaction]
+    ) -> None:
+        """Write the timetable: kernel, start and end of each invocation, then the reactions."""
+        import pyarrow as pa
+
+        rows = [(each.node, each.start_s, each.end_s) for each in invocations]
+        rows += [(_RESPONSE, each.frame_stamp_s, each.setpoint_stamp_s) for each in reactions]
+        kinds = {"kernel": pa.string(), "start_s": pa.float64(), "end_s": pa.float64()}
+        columns = {
+            name: pa.array([row[place] for row in rows], kind)
+            for place, (name, kind) in enumerate(kinds.items())
+        }
+        write_parquet(self.kernels, pa.table(columns))
+
+    def read_timetable(self) -> tuple[list[Invocation], list[Reaction]]:
+        """Read the timetable: invocations in the order of their starts, and reactions.
+
+        An output takes effect at the invocation's end, unless the node died or was killed.
+
+        Raises:
+            RecordError: The file is missing, damaged, or of another format.
+        """
+        columns = _columns(self.kernels, "time table", ("kernel", "start_s", "end_s"))
+        invocations, reactions = [], []
+        for kernel, begun_s, end_s in zip(*(c.tolist() for c in columns.values()), strict=True):
+            if kernel == _RESPONSE:
+                reactions.append(Reaction(frame_stamp_s=begun_s, setpoint_stamp_s=end_s))
+            else:
+                invocations.append(Invocation(node=kernel, start_s=begun_s, end_s=end_s))
+        return invocations, reactions
+
+
+def _columns(path: Path, what: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    table = read_parquet(path, what)
+    try:
+        return {name: table[name].to_numpy() for name in names}
+    except KeyError as error:
+        raise RecordError(f"{path}: no {what} can be read ({error})") from None
+
+
+# Trace --------------------------------------------------------------------------------------------
+
+_STATE_COLUMNS = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps", "yaw_rad")
+_TRUTH_COLUMNS = {
+    "position_enu_m": ("truth_x_m", "truth_y_m", "truth_z_m"),
+    "velocity_enu_mps": ("truth_vx_mps", "truth_vy_mps", "truth_vz_mps"),
+    "clearance_m": ("truth_clearance_m",),
+    "power_regression_w": ("power_regression_w",),
+    "power_propeller_w": ("power_propeller_w",),
+}
+_GAP_MS = 100.0  # longest interpolated interval of rows; its error is 6 mm at 5 m/s^2
+_KINDS: tuple[type[Message], ...] = (CollisionReport, Trajectory, Command)
+
+
+class Trace:
+    """Collects rows in memory, about 200 bytes per tick or 36 MB per hour of flight."""
+
+    def __init__(self) -> None:
+        self._stamps: list[float] = []
+        self._phases: list[str] = []
+        self._vehicle: list[tuple[float, ...]] = []
+        self._messages: dict[type, list[tuple[Message, int] | None]] = {k: [] for k in _KINDS}
+
+    def add(
+        self,
+        stamp_s: float,
+        phase: str,
+        state: VehicleState,
+        report: CollisionReport | None,
+        trajectory: tuple[Trajectory, int] | None,
+        command: Command | None,
+    ) -> None:
+        """Add a tick: the companion's inputs and decisions."""
+        self._stamps.append(stamp_s)
+        self._phases.append(phase)
+        self._vehicle.append(
+            (*state.position_enu_m.tolist(), *state.velocity_enu_mps.tolist(), state.yaw_rad)
+        )
+        self._messages[CollisionReport].append(None if report is None else (report, 0))
+        self._messages[Trajectory].append(trajectory)
+        self._messages[Command].append(None if command is None else (command, 0))
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def motion(self) -> dict[str, FloatArray]:
+        """Return received stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s, ENU."""
+        vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
+        return {
+            "stamp_s": np.array(self._stamps),
+            "position_enu_m": vehicle[:, 0:3],
+            "velocity_enu_mps": vehicle[:, 3:6],
+        }
+
+    def table(self, truth: dict[str, np.ndarray] | None) -> pa.Table:
+        """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
+
+        The stamps of report and trajectory and the index of the waypoint identify the messages of
+        the states. A state is null before its first message. Truth is joined by stamp; between the
+        referee's rows, where only foreign autopilots have stamps, it is interpolated.
+        """
+        import pyarrow as pa
+
+        columns: dict[str, pa.Array] = {
+            "stamp_s": pa.array(self._stamps, pa.float64()),
+            "phase": pa.array(self._phases, pa.string()),
+        }
+        vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
+        for column, name in enumerate(_STATE_COLUMNS):
+            columns[name] = pa.array(vehicle[:, column])
+        kinds = {DType.FLOAT64: pa.float64(), DType.INT32: pa.int32(), DType.BOOL: pa.bool_()}
+        for state in STATES:
+            values = [entry and state.read(*entry) for entry in self._messages[state.message]]
+            columns[state.name] = pa.array(values, kinds[state.dtype])
+        for name, kind in (("report", CollisionReport), ("trajectory", Trajectory)):
+            stamps = [entry and entry[0].stamp_s for entry in self._messages[kind]]
+            columns[f"{name}_stamp_s"] = pa.array(stamps, pa.float64())
+        places = [entry and entry[1] for entry in self._messages[Trajectory]]
+        columns["waypoint_index"] = pa.array(places, pa.int32())
+        if truth is not None:
+            columns.update(self._truth_columns(truth))
+        return pa.table(columns)
+
+    def _truth_columns(self, truth: dict[str, np.ndarray]) -> dict[str, pa.Array]:
+        import pyarrow as pa
+
+        stamps_ms = np.round(np.array(self._stamps) * 1e3)
+        logged_ms = np.round(truth["stamp_s"] * 1e3)
+        after = np.searchsorted(logged_ms, stamps_ms)
+        known = (after < len(logged_ms)) & (stamps_ms >= logged_ms[0])
+        after = np.minimum(after, len(logged_ms) - 1)
+        before = np.maximum(np.where(logged_ms[after] == stamps_ms, after, after - 1), 0)
+        spans_ms = logged_ms[after] - logged_ms[before]
+        known &= spans_ms <= _GAP_MS
+        shares = (stamps_ms - logged_ms[before]) / np.maximum(spans_ms, 1.0)
+        columns = {}
+        for source, names in _TRUTH_COLUMNS.items():
+            values = truth[source].reshape(len(logged_ms), -1)
+            for column, name in enumerate(names):
+                taken = _between(values[before, column], values[after, column], shares)
+                columns[name] = pa.array(np.where(known, taken, np.nan), mask=~known)
+        return columns
+
+
+def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> FloatArray:
+    """Interpolate linearly; a value at share 0 stays as it is, also if it is infinite."""
+    with np.errstate(invalid="ignore"):
+        mixed: FloatArray = np.where(shares == 0.0, before, before + shares * (after - before))
+    return mixed
+
+
+# A run that is read -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Parting:
+    """First value in which two runs differ."""
+
+    stamp_s: float
+    column: str
+    this: Any
+    other: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run read from its folder."""
+
+    folder: RunFolder
+    result: dict[str, Any]
+    trace: pa.Table | None
+
+    @property
+    def record(self) -> FlightRecord:
+        """The sections of the result."""
+        return record_of(self.result)
+
+    @property
+    def golden(self) -> Run | None:
+        """The golden run that is kept in the folder; None if none was flown to its end."""
+        path = self.folder.golden
+        golden = load_run(path) if path.is_dir() else None
+        return None if golden is None or golden.record.interrupted else golden
+
+    def mission(self, *, with_fault: bool = True) -> MissionConfig:
+        """Return the configuration of the run, or of its golden run if `with_fault` is False.
+
+        The golden run has no detector either, because it is the reference for fault and detection.
+
+        Raises:
+            RecordError: The run is not repeatable, because it flew a foreign autopilot, used
+                measured times, was interrupted by the user, or named a file that has changed since.
+        """
+        record, path, why = self.record, self.folder.path, ""
+        if record.interrupted:
+            why = "an interrupted flight does not repeat"
+        elif record.config.get("link") is not None:
+            why = "a flight of a foreign autopilot does not repeat"
+        elif measured_factor(record.config.get("platform", "")) is not None:
+            why = "a flight on measured kernel times does not repeat"
+        for name, digest in record.files.items():
+            if not why and file_digest(name) != digest:
+                how = "has changed since this flight" if Path(name).exists() else "does not exist"
+                why = f"{name} {how}, so the flight does not repeat"
+        if why:
+            raise RecordError(f"{path}: {why}")
+        config = structure(dict(record.config), MissionConfig, path=self.folder.result)
+        return config if with_fault else config.golden
+
+    def differing_sections(self, other: Run) -> list[str]:
+        """Return the sections in which two results differ, except the host's."""
+        keys = sorted({*self.result, *other.result} - {"host"})
+        return [key for key in keys if self.result.get(key) != other.result.get(key)]
+
+    def first_difference(
+        self, other: Run, *, truth: bool = False, leave_out: Collection[str] = ()
+    ) -> _Parting | None:
+        """Find the first difference between the traces of two runs; None if they are equal.
+
+        Within a tick the columns are compared in the order of the pipeline: perception, planning,
+        control, then the vehicle. The referee's truth is ignored by default. Columns in `leave_out`
+        are ignored, too, and those that one run lacks.
+
+        Raises:
+            RecordError: A run has no trace.
+        """
+        if self.trace is None or other.trace is None:
+            raise RecordError(f"{(self if self.trace is None else other).folder.path}: no trace")
+        names = [name for name in self.trace.column_names if name in other.trace.column_names]
+        columns = [name for name in BY_NAME if name in names]
+        columns += [name for name in names if name not in BY_NAME and name != "stamp_s"]
+        if not truth:
+            columns = [c for c in columns if not c.startswith(("truth_", "power_"))]
+        stamps = self.trace["stamp_s"]
+        rows = limit = min(self.trace.num_rows, other.trace.num_rows)
+        found: _Parting | None = None
+        traces = (self.trace, other.trace)
+        for column in (c for c in columns if c not in leave_out):
+            pair = (trace.slice(0, limit)[column].to_pylist() for trace in traces)
+            for row, (a, b) in enumerate(zip(*pair, strict=True)):
+                if a != b and not (a != a and b != b):  # NaN equals NaN
+                    found = _Parting(stamp_s=stamps[row].as_py(), column=column, this=a, other=b)
+                    limit = row
+                    break
+        if found is not None:
+            return found
+        stamp_s = stamps[rows - 1].as_py() if rows else 0.0
+        ends = {
+            "outcome": (self.record.outcome, other.record.outcome),
+            "ticks": (self.trace.num_rows, other.trace.num_rows),
+        }
+        for column, (a, b) in ends.items():
+            if a != b:
+                return _Parting(stamp_s=stamp_s, column=column, this=a, other=b)
+        return None
+
+    def largest_deviation_m(self, other: Run) -> float:
+        """Return the largest distance between two vehicles at equal stamps, m; NaN without a trace.
+
+        A vehicle whose flight has ended stays where it is.
+        """
+        if not (self.trace and other.trace):
+            return float("nan")
+        rows = max(self.trace.num_rows, other.trace.num_rows)
+        places = []
+        for trace in (self.trace, other.trace):
+            place = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
+            places.append(np.pad(place, ((0, rows - len(place)), (0, 0)), mode="edge"))
+        return float(np.linalg.norm(places[0] - places[1], axis=1).max(initial=0.0))
+
+
+def load_run(path: str | Path) -> Run:
+    """Read a run from its folder or from the path of its result.json.
+
+    Raises:
+        RecordError: There is no run, or it was cut off before its end or is damaged.
+    """
+    path = Path(path)
+    folder = RunFolder(path.parent if path.name == RESULT else path)
+    if not folder.path.is_dir():
+        raise RecordError(f"{path}: no such run folder")
+    if not folder.result.is_file():
+        hint = "cut off before its end" if folder.tlog.exists() else "not a run folder"
+        raise RecordError(f"{folder.path}: no {RESULT} ({hint})")
+    try:
+        result = json.loads(folder.result.read_text())
+        trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{folder.path}: damaged ({error})") from None
+    if not isinstance(result, dict) or result.get("schema") != 1:
+        raise RecordError(f"{folder.result}: written by another version of mavfi")
+    if missing := [key for key in _NEEDED if key not in result]:
+        raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
+    # Records from before the introduction of stacks flew the stack FIRST.
+    result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
+    return Run(folder, result, trace)
