@@ -90,5 +90,5 @@ def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
         click.echo(f"note: {problem}", err=True)
     page = render(document(evidence, upsets))
     write_text(output, page)
-    missions = evidence.flights().num_rows
+    missions = len(evidence.flights())
     click.echo(f"{missions:,} missions in {output} ({len(page.encode()) / 1e6:.1f} MB)")

@@ -8,91 +8,41 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-
-from mavfi_cli.analysis.flights import chosen, flags
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
-from mavfi_cli.paper.flights import (
-    by_value,
-    comparable,
-    golden,
-    share,
-    struck,
-    with_columns,
-)
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.stats.paired import holm, mcnemar
 from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour, wilson
 
 Row = Mapping[str, Any]  # one flight
 
-
-class Fate(Enum):
-    """What a struck kernel did, as far as the flight shows it."""
-
-    UNREAD = "never read"
-    SAME = "same flight"  # it was read, and every measure of the flight is that of the golden one
-    CHANGED = "changed flight"
-    CRASH = "crashed"
-    HANG = "hung"
-
-
+# What a struck kernel did, as far as the flight shows it. After `same flight`, the fault was read,
+# and every measure of the flight is that of the golden one.
+FATES = ("never read", "same flight", "changed flight", "crashed", "hung")
+_UNREAD, _SAME, _CHANGED, _CRASH, _HANG = FATES
 _MEASURES = (
     "outcome", "flight_time_s", "distance_m", "min_clearance_m", "goal_distance_m",
     "energy_regression_j", "energy_propeller_j", "replans",
 )  # fmt: skip
 
 
-def _fate_of(flight: Row, own: Row) -> Fate:
-    """What a kernel did after an instruction-level fault struck it.
+def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list[dict[str, Any]]:
+    """The flow from kernel to mission, a row for each kernel that instruction-level faults struck.
 
-    Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
-    """
-    ended = set((flight["node_ended"] or "").split(";")) - {""}
-    if ended:
-        return Fate.HANG if ended == {"hang"} else Fate.CRASH
-    if any(own[name] != flight[name] for name in _MEASURES):
-        return Fate.CHANGED
-    return Fate.SAME if flight["activation"] == "read" else Fate.UNREAD
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _KernelFlow:
-    """Faults in one kernel: what it did, and what became of the missions.
-
-    Attributes:
-        fates: lost missions among those of each fate.
-        lost, harmed: of all.
-        silent: share of silent corruption of the isolated kernel; None without its runs.
-        given_silent: probability that a mission is lost given silent corruption of the kernel, with
-            the ends of its interval; None where it cannot be told.
-    """
-
-    kernel: str
-    fates: Mapping[Fate, Share]
-    lost: Share
-    harmed: Share
-    silent: Share | None = None
-    given_silent: tuple[float, float, float] | None = None
-
-
-def kernel_flows(flights: pa.Table, alone: Mapping[str, tuple[int, int]]) -> list[_KernelFlow]:
-    """The flow from kernel to mission, for each kernel that instruction-level faults struck.
+    A row has the kernel, the lost missions among those of each fate, the lost and the harmed of
+    all, the share of silent corruption of the isolated kernel, and the probability that a mission
+    is lost given such corruption, with the ends of its interval. The last two are None where they
+    are not known.
 
     Args:
-        flights: of `paper.flights.beside_golden`.
         alone: silent corruptions and faults of each isolated kernel.
     """
-    own = {row["pair"]: row for row in golden(flights).select(["pair", *_MEASURES]).to_pylist()}
-    hit = by_value(struck(flights, level="instruction", own_lost=False), "struck_kernel")
+    own = {row["pair"]: row for row in flights.golden.rows("pair", *_MEASURES)}
+    hit = flights.struck(level="instruction", own_lost=False).by("struck_kernel")
     kernels = {name: those for (name,), those in hit.items() if name}
     return [
         _flow(name, kernels[name], own, alone.get(name))
@@ -104,20 +54,33 @@ _ORDER = {"point_cloud": 0, "octomap": 1, "collision_check": 2, "rrtstar": 3, "c
 
 
 def _flow(
-    name: str, flights: pa.Table, own: Mapping[str, Row], alone: tuple[int, int] | None
-) -> _KernelFlow:
-    fates = [_fate_of(each, own[each["pair"]]) for each in flights.to_pylist()]
-    lost = {fate: flags(flights, "lost")[np.array(fates) == fate] for fate in Fate}
-    lived = int(lost[Fate.SAME].sum() + lost[Fate.CHANGED].sum())
-    layers = None if alone is None else cross_layer(*alone, lived, flights.num_rows)
-    return _KernelFlow(
-        kernel=name,
-        fates={fate: wilson(int(each.sum()), len(each)) for fate, each in lost.items()},
-        lost=share(flights),
-        harmed=share(flights, "harmed"),
-        silent=None if layers is None else Share(**layers["corruption"]),
-        given_silent=None if layers is None else layers["failure_given_corruption"],
-    )
+    name: str, flights: Flights, own: Mapping[str, Row], alone: tuple[int, int] | None
+) -> dict[str, Any]:
+    of_fate = flights.grouped(_fate_of(each, own[each["pair"]]) for each in flights.rows())
+    fates = {fate: of_fate[fate].share() if fate in of_fate else wilson(0, 0) for fate in FATES}
+    lived = fates[_SAME].count + fates[_CHANGED].count
+    layers = None if alone is None else cross_layer(*alone, lived, len(flights))
+    return {
+        "kernel": name,
+        "fates": fates,
+        "lost": flights.share(),
+        "harmed": flights.share("harmed"),
+        "silent": layers and Share(**layers["corruption"]),
+        "given_silent": layers and layers["failure_given_corruption"],
+    }
+
+
+def _fate_of(flight: Row, own: Row) -> str:
+    """What a kernel did after an instruction-level fault struck it.
+
+    Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
+    """
+    ended = set((flight["node_ended"] or "").split(";")) - {""}
+    if ended:
+        return _HANG if ended == {"hang"} else _CRASH
+    if any(own[name] != flight[name] for name in _MEASURES):
+        return _CHANGED
+    return _SAME if flight["activation"] == "read" else _UNREAD
 
 
 # State by bit by phase of flight ------------------------------------------------------------------
@@ -132,41 +95,19 @@ _BITS = {  # lowest bit of each class, highest class first
 BIT_CLASSES = tuple(tuple(name for name, _ in kinds) for kinds in _BITS.values())
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StateCell:
-    """Faults in one class of bits of a state, in one phase of flight."""
-
-    harmed: Share
-    lost: Share
-
-
-def state_map(flights: pa.Table) -> dict[tuple[str, str, str], StateCell]:
-    """The map by state, class of bits and phase.
+def state_map(flights: Flights) -> dict[tuple[str, str, str], dict[str, Share]]:
+    """The harmed and the lost missions by state, class of bits and phase.
 
     It counts source-level faults without a detector whose golden flights succeed.
 
     A fault in several components is told by its group, and by the highest bit that it flips.
-
-    Args:
-        flights: of `paper.flights.beside_golden`.
     """
-    hit = struck(flights, level="source", own_lost=False)
-    hit = hit.filter(
-        pc.and_(pc.not_equal(hit["struck_state"], ""), pc.is_valid(hit["struck_bits"]))
-    )
-    rows = hit.to_pylist()
-    cells = by_value(
-        with_columns(
-            hit,
-            name=pa.array(map(_state, rows), pa.string()),
-            bits=pa.array(map(_class, rows), pa.string()),
-            phase=pc.fill_null(hit["strike_phase"], ""),
-        ),
-        "name", "bits", "phase",
-    )  # fmt: skip
+    hit = flights.struck(level="source", own_lost=False)
+    hit = hit.where([bool(x["struck_state"] and x["struck_bits"]) for x in hit.rows()])
+    places = ((_state(x), _class(x), x["strike_phase"] or "") for x in hit.rows())
     return {
-        place: StateCell(harmed=share(cells[place], "harmed"), lost=share(cells[place]))
-        for place in sorted(cells)
+        place: {"harmed": those.share("harmed"), "lost": those.share()}
+        for place, those in sorted(hit.grouped(places).items())
     }
 
 
@@ -185,36 +126,22 @@ def _class(flight: Row) -> str:
 # Failures a flight hour ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _HourlyFailures:
-    """Failures of missions a flight hour, for one kind of fault in one world.
+def hourly_failures(flights: Flights, upsets_per_hour: float) -> Iterator[dict[str, Any]]:
+    """Failures of missions a flight hour, a row for each kind of fault in one world.
 
-    Attributes:
-        where: what is struck, how, and in which world.
-        lost: share of faults that lose a mission whose golden flight succeeds, by detector; the
-            empty name is no detector.
-        per_hour: point, low and high, by detector.
-    """
-
-    where: str
-    lost: Mapping[str, Share]
-    per_hour: Mapping[str, tuple[float, float, float]]
-
-
-def hourly_failures(flights: pa.Table, upsets_per_hour: float) -> Iterator[_HourlyFailures]:
-    """Failures an hour of every kind of fault, by world and detector.
+    A row says where a fault strikes, and for each detector the share of faults that lose a mission
+    whose golden flight succeeds, and the rate: point, low and high. The empty name is no detector.
 
     Args:
-        flights: of `paper.flights.beside_golden`.
         upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
     """
-    hit = chosen(comparable(flights), struck=True, own_lost=False)
-    hit = with_columns(hit, kind=pa.array(map(_kind, hit.to_pylist()), pa.string()))
-    for (place,), those in sorted(by_value(hit, "kind").items()):
-        by_detector = by_value(those, "detector").items()
-        lost = dict(sorted((name or "", share(each)) for (name,), each in by_detector))
+    hit = flights.comparable.chosen(struck=True, own_lost=False)
+    for place, those in sorted(hit.grouped(map(_kind, hit.rows())).items()):
+        lost = dict(
+            sorted((name or "", each.share()) for (name,), each in those.by("detector").items())
+        )
         hourly = {name: failures_per_hour(upsets_per_hour, each) for name, each in lost.items()}
-        yield _HourlyFailures(where=place, lost=lost, per_hour=hourly)
+        yield {"where": place, "lost": lost, "per_hour": hourly}
 
 
 _COMPONENTS = Counter(state.group for state in BY_NAME.values())
@@ -243,37 +170,18 @@ _WORDS, _ = read_toml(Path(__file__).parent / "arms.toml")
 PLAIN = _WORDS["stacks"][""]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Arm:
-    """One row of the table.
-
-    Attributes:
-        golden: lost golden flights.
-        by_site: lost missions of each injection site.
-        lost: lost missions of all sites.
-        p_value: McNemar's exact test against the unprotected arm; None of that arm itself.
-        corrected_p: by Holm, over all arms.
-    """
-
-    name: str
-    golden: Share
-    by_site: Mapping[str, Share]
-    lost: Share
-    p_value: float | None
-    corrected_p: float | None
-
-
-def arms(flights: pa.Table) -> list[Arm]:
+def arms(flights: Flights) -> list[dict[str, Any]]:
     """The arms of a campaign, the unprotected one first; none unless it flew several stacks.
 
-    Args:
-        flights: of `paper.flights.flown_missions`.
+    A row has the arm's name, its lost golden flights, its lost missions of each injection site and
+    of all, and the p-value of McNemar's exact test against the unprotected arm, None of that arm
+    itself, also as corrected by Holm over all arms.
     """
-    if pc.count_distinct(flights["stack"]).as_py() < 2:
+    if len(set(flights["stack"])) < 2:
         return []
     golden: dict[str, list[Row]] = {}
     trials: dict[str, dict[str, Row]] = {}
-    for flight in flights.select(_READ).to_pylist():
+    for flight in flights.rows(*_READ):
         name = _arm_of(flight)
         if flight["level"] is None:
             golden.setdefault(name, []).append(flight)
@@ -289,19 +197,19 @@ def arms(flights: pa.Table) -> list[Arm]:
     tests = {name: mcnemar(won[PLAIN], won[name]).p_value for name in order if name != PLAIN}
     corrected = dict(zip(tests, holm([*tests.values()]), strict=True))
     return [
-        Arm(
-            name=name,
-            golden=_lost(golden.get(name, [])),
-            by_site=_by_site(those),
-            lost=_lost(those),
-            p_value=tests.get(name),
-            corrected_p=corrected.get(name),
-        )
+        {
+            "name": name,
+            "golden": _lost(golden.get(name, [])),
+            "by_site": _by_site(those),
+            "lost": _lost(those),
+            "p_value": tests.get(name),
+            "corrected_p": corrected.get(name),
+        }
         for name, those in kept.items()
     ]
 
 
-_READ = ["stack", "detector", "level", "fault", "fault_target", "activation", "lost", "changes"]
+_READ = ("stack", "detector", "level", "fault", "fault_target", "activation", "lost", "changes")
 
 
 def _arm_of(flight: Row) -> str:

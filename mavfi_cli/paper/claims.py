@@ -2,7 +2,7 @@
 
 claims.toml has the claims. A claim is decided by one number, its effect, and by the range that the
 claim gives for it; `stats.effects.judge` does the rest. A measure finds the effect: it takes a
-stack's flights, as `paper.flights.pooled`, and the values of columns that choose some of
+stack's flights, and the values of columns that choose some of
 them. Of faults without a detector it counts those that flipped a bit.
 """
 
@@ -16,24 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import COSTS, chosen, flags, numbers
+from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.analysis.kernel_runs import outcome_share
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.paper.flights import (
-    EVERY_STAGE,
-    STAGES,
-    by_value,
-    faults_of,
-    golden,
-    ratios,
-    share,
-    struck,
-)
+from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
 from mavfi_cli.report.paper import count_of
 from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.effects import (
@@ -117,21 +106,20 @@ def _difference(shares: Sequence[Share], told: str) -> Finding:
 # Faults without a detector ------------------------------------------------------------------------
 
 
-def _success_lost(flights: pa.Table, **where: Any) -> Finding:
+def _success_lost(flights: Flights, **where: Any) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
-    hit = struck(flights, **where)
-    both = hit.filter(pc.is_valid(hit["own_lost"]))
-    if not both.num_rows:
+    both = flights.struck(**where).chosen(own_lost=(True, False))
+    if not len(both):
         return Finding()
-    found = paired_difference(mcnemar(~flags(both, "lost"), ~flags(both, "own_lost")))
-    told = f"{count_of(share(both))} lost; golden {count_of(share(both, 'own_lost'))}"
+    found = paired_difference(mcnemar(~both.flags("lost"), ~both.flags("own_lost")))
+    told = f"{count_of(both.share())} lost; golden {count_of(both.share('own_lost'))}"
     return Finding(effect=found, told=told)
 
 
-def _most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
+def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
     """Success lost by faults in the kernel that loses most."""
-    hit = by_value(struck(flights, **where), "struck_kernel")
-    kernels = {name: share(those).share for (name,), those in hit.items() if name}
+    hit = flights.struck(**where).by("struck_kernel")
+    kernels = {name: those.share().share for (name,), those in hit.items() if name}
     if not kernels:
         return Finding()
     most = max(kernels, key=lambda name: kernels[name])
@@ -139,42 +127,42 @@ def _most_lost_kernel(flights: pa.Table, **where: Any) -> Finding:
     return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
 
 
-def _harm_difference(flights: pa.Table, groups: Mapping[str, Where]) -> Finding:
+def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
-    shares = [share(struck(flights, **where), "harmed") for where in groups.values()]
+    shares = [flights.struck(**where).share("harmed") for where in groups.values()]
     told = (f"{name} {count_of(each)}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(told)}")
 
 
-def _harmful(flights: pa.Table, **where: Any) -> Finding:
+def _harmful(flights: Flights, **where: Any) -> Finding:
     """The share of harmful faults."""
-    return _of_share(share(struck(flights, **where), "harmed"), "harmful")
+    return _of_share(flights.struck(**where).share("harmed"), "harmful")
 
 
 def _loss_difference(
-    flights: pa.Table, first: Where, second: Where, told: str, **where: Any
+    flights: Flights, first: Where, second: Where, told: str, **where: Any
 ) -> Finding:
     """Share of lost missions in one group of faults minus that in another.
 
     Args:
         told: the counts, as a format of two texts.
     """
-    shares = [share(struck(flights, **where, **each)) for each in (first, second)]
+    shares = [flights.struck(**where, **each).share() for each in (first, second)]
     return _difference(shares, f"lost: {told.format(*map(count_of, shares))}")
 
 
-def _as_long(flights: pa.Table, ratio: float, **where: Any) -> Finding:
+def _as_long(flights: Flights, ratio: float, **where: Any) -> Finding:
     """The share of flights that take at least so many times as long as their golden flights."""
-    return _of_share(_at_least(ratio, ratios(struck(flights, **where))), "as long")
+    return _of_share(_at_least(ratio, flights.struck(**where).ratios), "as long")
 
 
 def _at_least(ratio: float, found: FloatArray) -> Share:
     return wilson(int((found >= ratio).sum()), len(found))
 
 
-def _worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any) -> Finding:
+def _worst_as_long(flights: Flights, ratio: float, missions: int, **where: Any) -> Finding:
     """The probability that the longest of so many flights reaches a ratio to its golden flight."""
-    found = ratios(struck(flights, **where))
+    found = flights.struck(**where).ratios
     if not len(found):
         return Finding()
     beyond = _at_least(ratio, found)
@@ -185,10 +173,10 @@ def _worst_as_long(flights: pa.Table, ratio: float, missions: int, **where: Any)
     )
 
 
-def _energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
+def _energy_follows_time(flights: Flights, **where: Any) -> Finding:
     """Correlation of energy with flight time over successful golden flights."""
-    won = chosen(golden(flights), lost=False, **where)
-    pairs = np.stack([numbers(won, name) for name in ("flight_time_s", "energy_regression_j")], 1)
+    won = flights.golden.chosen(lost=False, **where)
+    pairs = np.stack([won.numbers(name) for name in ("flight_time_s", "energy_regression_j")], 1)
     pairs = pairs[(pairs > 0.0).all(axis=1)]
     if len(pairs) < _FEWEST:
         return Finding()
@@ -198,45 +186,37 @@ def _energy_follows_time(flights: pa.Table, **where: Any) -> Finding:
 # The same faults without and with a detector ------------------------------------------------------
 
 
-def protected(
-    flights: pa.Table, detector: str, protect: str = EVERY_STAGE, **where: Any
-) -> pa.Table:
-    """The flights with a detector of these stages, whose fault struck without it as well."""
-    seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
-    return chosen(flights, **seen, **where)
-
-
-def _recovered(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
     """The share of lost missions that a detector saves."""
-    seen = protected(flights, detector, **where)
-    lost = chosen(seen, bare_lost=True)
+    seen = flights.protected(detector, **where)
+    lost = seen.chosen(bare_lost=True)
     return _of_some(lost, "lost", "lost missions saved") or _none_of(seen, "lost")
 
 
-def _shortened(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
     """The share of longer flights that a detector brings back within 5 %."""
-    seen = protected(flights, detector, **where)
-    longer = chosen(seen, bare_lost=False, bare_harmed=True)
+    seen = flights.protected(detector, **where)
+    longer = seen.chosen(bare_lost=False, bare_harmed=True)
     told = "longer flights brought back"
     return _of_some(longer, "harmed", told) or _none_of(seen, "over 5 % longer")
 
 
-def _of_some(flights: pa.Table, column: str, told: str) -> Finding | None:
-    return _of_share(share(flights, column, value=False), told) if flights.num_rows else None
+def _of_some(flights: Flights, column: str, told: str) -> Finding | None:
+    return _of_share(flights.share(column, value=False), told) if len(flights) else None
 
 
-def _none_of(seen: pa.Table, what: str) -> Finding:
+def _none_of(seen: Flights, what: str) -> Finding:
     """What is told if none of the faults, flown without the detector, had an effect."""
-    return Finding(told=f"without it 0 of {seen.num_rows:,} {what}") if seen.num_rows else Finding()
+    return Finding(told=f"without it 0 of {len(seen):,} {what}") if len(seen) else Finding()
 
 
-def _undone(flights: pa.Table, detector: str, protect: str, where: Where) -> Share:
+def _undone(flights: Flights, detector: str, protect: str, where: Where) -> Share:
     """The share of harmful faults that do no harm with a detector of these stages."""
-    seen = protected(flights, detector, protect, **where)
-    return share(chosen(seen, bare_harmed=True), "harmed", value=False)
+    seen = flights.protected(detector, protect, **where)
+    return seen.chosen(bare_harmed=True).share("harmed", value=False)
 
 
-def _control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _control_recovers_most(flights: Flights, detector: str, **where: Any) -> Finding:
     """Harm undone by watching control minus that by the better single other stage."""
     shares = {stage: _undone(flights, detector, stage, where) for stage in STAGES}
     if not all(each.total for each in shares.values()):
@@ -247,17 +227,17 @@ def _control_recovers_most(flights: pa.Table, detector: str, **where: Any) -> Fi
     return _difference((control, best), f"harm undone: {told}")
 
 
-def _all_stages_best(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _all_stages_best(flights: Flights, detector: str, **where: Any) -> Finding:
     """Harm undone by watching all stages minus that by watching control."""
     shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
     told = "harm undone: all stages {}, control {}".format(*map(count_of, shares))
     return _difference(shares, told)
 
 
-def _autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
+def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
     """Success with the autoencoder minus success with the Gaussian detector."""
-    seen = [protected(flights, name, **where) for name in ("gad", "aad")]
-    gad, aad = (dict(zip(faults_of(x), ~flags(x, "lost"), strict=True)) for x in seen)
+    seen = [flights.protected(name, **where) for name in ("gad", "aad")]
+    gad, aad = (dict(zip(x.faults, ~x.flags("lost"), strict=True)) for x in seen)
     both = sorted(gad.keys() & aad.keys())
     if not both:
         return Finding()
@@ -271,14 +251,14 @@ def _autoencoder_better(flights: pa.Table, **where: Any) -> Finding:
 _NO_COSTS = Finding(told="flown, but this export does not hold these times; a new one does")
 
 
-def _overhead_of(flights: pa.Table, detector: str, **where: Any) -> Finding:
+def _overhead_of(flights: Flights, detector: str, **where: Any) -> Finding:
     """The mean share of the flight time that detection and recovery take."""
     seen, shares = _overheads(flights, detector, where)
     told = "time of the computer that flew, and simulated recovery"
     return _mean_cost(seen, shares, told)
 
 
-def _gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
+def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
     """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
     gad, aad = (
         dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
@@ -289,11 +269,11 @@ def _gaussian_dearer(flights: pa.Table, **where: Any) -> Finding:
 
 
 def _overheads(
-    flights: pa.Table, detector: str, where: Where
+    flights: Flights, detector: str, where: Where
 ) -> tuple[list[tuple[str, str]], list[float]]:
     """The faults with a detector, and its share of each flight time; NaN if unknown."""
-    seen = struck(flights, detector=detector, protect=EVERY_STAGE, **where)
-    return faults_of(seen), np.sum([numbers(seen, name) for name in COSTS], axis=0).tolist()
+    seen = flights.struck(detector=detector, protect=EVERY_STAGE, **where)
+    return seen.faults, np.sum([seen.numbers(name) for name in COSTS], axis=0).tolist()
 
 
 def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Finding:
@@ -303,7 +283,7 @@ def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Find
     return Finding(effect=interval(known, resamples=RESAMPLES), told=told)
 
 
-def _calibrated(_: pa.Table) -> Finding:
+def _calibrated(_: Flights) -> Finding:
     """No finding: the model takes this number from the paper."""
     return Finding(told="our model is calibrated with this number, so it tells nothing")
 

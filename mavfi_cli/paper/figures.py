@@ -6,21 +6,15 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
-from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.paper.flights import STAGES, by_value, comparable, faulty, golden
+from mavfi_cli.paper.flights import PERCENT, STAGES, Flights
 from mavfi_cli.paper.items import printed
 from mavfi_cli.paper.layouts import (
     KERNELS_FLOWN,
-    PERCENT,
     PROTECTED,
-    increases,
     values_and_deltas,
-    worlds_of,
 )
 from mavfi_cli.report.paper import (
     DETECTOR_TITLES,
@@ -39,23 +33,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
-_Row = tuple[str, str | None, pa.Table]  # of a panel: label, detector, flights
+_Row = tuple[str, str | None, Flights]  # of a panel: label, detector, flights
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
 _NOTHING = "nothing to draw: no mission of the figure has flown yet"
 
 
-def draw(table: PaperTable, flights: pa.Table | None, columns: str) -> Figure:
+def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
     """Draw the figure of an item from its flights, or the dots of its table.
 
     Args:
-        flights: as `paper.flights.beside_golden`; None of what was not flown. `fig13` needs
+        flights: None of what was not flown. `fig13` needs
             their kept run folders, of one campaign.
         columns: width, `one` or `two`.
 
     Raises:
         RecordError: nothing was flown that it could show, or these folders are not there.
     """
-    if not table.rows or (flights is not None and not flights.num_rows):
+    if not table.rows or (flights is not None and not len(flights)):
         raise RecordError(_NOTHING)
     if flights is None or table.name not in DRAWN:
         return (draw_stack if table.name == "fig6" else draw_dots)(table, columns)
@@ -71,7 +65,7 @@ def panel(rows: Iterable[_Row], paper: float | None = None) -> list[Strip]:
     return [
         Strip(
             label=label,
-            values=increases(flights),
+            values=flights.increases,
             style=_STYLES[detector],
             paper=None if detector else paper,
         )
@@ -84,17 +78,17 @@ def _number(name: str, *keys: object) -> float | None:
     return found if isinstance(found, float) else None
 
 
-def _fig7(flights: pa.Table, columns: str) -> Figure:
+def _fig7(flights: Flights, columns: str) -> Figure:
     rows = (
-        (title, None, faulty(flights, fault_target=node, planner=planner, level="instruction"))
+        (title, None, flights.faulty(fault_target=node, planner=planner, level="instruction"))
         for title, (node, planner) in KERNELS_FLOWN.items()
     )
     return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
 
 
-def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
-    def draw_values(flights: pa.Table, columns: str) -> Figure:
-        groups = by_value(faulty(flights), column)
+def _by_value(column: str) -> Callable[[Flights, str], Figure]:
+    def draw_values(flights: Flights, columns: str) -> Figure:
+        groups = flights.faulty().by(column)
         if not groups:
             raise RecordError(_NOTHING)
         rows = ((str(value), None, those) for (value,), those in groups.items())
@@ -103,31 +97,31 @@ def _by_value(column: str) -> Callable[[pa.Table, str], Figure]:
     return draw_values
 
 
-def _beside_detectors(flights: pa.Table, paper: float | None) -> list[Strip]:
+def _beside_detectors(flights: Flights, paper: float | None) -> list[Strip]:
     """A row for the flights with faults, and one for those with each detector."""
-    rows: list[_Row] = [("fault", None, faulty(flights))]
-    rows += [(f"fault, {name.upper()}", name, faulty(flights, name)) for name in DETECTOR_TITLES]
+    rows: list[_Row] = [("fault", None, flights.faulty())]
+    rows += [(f"fault, {name.upper()}", name, flights.faulty(name)) for name in DETECTOR_TITLES]
     return panel(rows, paper)
 
 
-def _fig12(flights: pa.Table, columns: str) -> Figure:
-    flights = comparable(flights)
+def _fig12(flights: Flights, columns: str) -> Figure:
+    flights = flights.comparable
     panels = {
         world: _beside_detectors(
-            chosen(flights, world=world), _number("fig12", "worst_increase_percent", world)
+            flights.chosen(world=world), _number("fig12", "worst_increase_percent", world)
         )
-        for world in worlds_of(flights)
+        for world in flights.worlds
     }
     return draw_strips(panels, OVER_GOLDEN, columns)
 
 
-def _fig14(flights: pa.Table, columns: str) -> Figure:
+def _fig14(flights: Flights, columns: str) -> Figure:
     panels = {}
-    for world in worlds_of(flights):
-        here = chosen(flights, world=world)
-        rows: list[_Row] = [("no protection", None, faulty(here))]
+    for world in flights.worlds:
+        here = flights.chosen(world=world)
+        rows: list[_Row] = [("no protection", None, here.faulty())]
         rows += [
-            (f"{name.upper()} {_short(stages)}", name, faulty(here, name, protect=stages))
+            (f"{name.upper()} {_short(stages)}", name, here.faulty(name, protect=stages))
             for name in DETECTOR_TITLES
             for stages in PROTECTED
         ]
@@ -142,27 +136,27 @@ def _short(stages: str) -> str:
     return "".join(stage[0].upper() for stage in stages.split("+"))
 
 
-def _fig16(flights: pa.Table, columns: str) -> Figure:
+def _fig16(flights: Flights, columns: str) -> Figure:
     panels = {}
-    for (platform,), here in by_value(flights, "platform").items():
+    for (platform,), here in flights.by("platform").items():
         ratio = _number("fig16", "worst_ratio", platform)
         worst = None if ratio is None else PERCENT * (ratio - 1.0)
         panels[platform] = _beside_detectors(here, worst)
     return draw_strips(panels, OVER_GOLDEN, columns)
 
 
-def _fig11(table: pa.Table, columns: str) -> Figure:
-    found = values_and_deltas(golden(table))
+def _fig11(flights: Flights, columns: str) -> Figure:
+    found = values_and_deltas(flights.golden)
     return draw_histograms([(name, *both) for name, both in found.items()], columns)
 
 
-def _fig13(table: pa.Table, columns: str) -> Figure:
+def _fig13(flights: Flights, columns: str) -> Figure:
     """The pair of missions that a fault prolongs most, from above."""
-    kept = [Path(path) for path in table["path"].to_pylist() if path]
+    kept = [Path(path) for path in flights["path"] if path]
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
     with Ledger(kept[0].parents[1]) as ledger:
-        panels = panels_of(pair(ledger, among=frozenset(table["number"].to_pylist())))
+        panels = panels_of(pair(ledger, among=frozenset(flights["number"])))
     figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
     for axes in figure.axes:  # room for the legend below the smaller panel
         axes.tick_params(labelsize=SMALLEST, pad=1)
@@ -173,7 +167,7 @@ def _fig13(table: pa.Table, columns: str) -> Figure:
     return figure
 
 
-DRAWN: Mapping[str, Callable[[pa.Table, str], Figure]] = {
+DRAWN: Mapping[str, Callable[[Flights, str], Figure]] = {
     "fig7": _fig7,
     "fig8": _by_value("fault_target"),
     "fig9": _by_value("fault_field"),

@@ -1,19 +1,21 @@
 """Flown missions as one table, each beside its golden flight and its flight without detector.
 
-Items and claims choose rows of this table (`analysis.flights.chosen`) and count its columns.
+Items and claims choose rows of this table and count its columns.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import COSTS, chosen, flown, known, numbers
+from mavfi_cli.analysis import flights as tables
+from mavfi_cli.analysis.flights import COSTS, BoolArray
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
@@ -21,6 +23,8 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.stats.shares import Share, wilson
 
 STAGES = tuple(stage.value for stage in Stage)
+WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
+PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
 LONGER = 1.05  # a flight is longer if it takes more than this times its own golden flight
 _COLUMNS: Mapping[str, pa.DataType] = {
@@ -50,10 +54,11 @@ _NO_FAULT = canonical([None] * len(_FAULTS))
 _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
 
-def flown_missions(table: pa.Table) -> pa.Table:
-    """The missions that flew, in the columns that items and claims read.
+@dataclass(frozen=True, slots=True)
+class Flights:
+    """Missions that flew, a row each, in the columns that items and claims read.
 
-    Beside columns of the argument, which are empty if it lacks them:
+    Beside those of an export, which are empty if it lacks them:
         fault: the fault that was asked for, as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
         at: when a source-level fault strikes; empty without one.
@@ -61,15 +66,144 @@ def flown_missions(table: pa.Table) -> pa.Table:
             vehicle, speed, sensors, one flip of drawn bits, and 13 watched states.
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
-
-    Args:
-        table: of `analysis.flights.flights`, or of an export.
+    Of its golden flight:
+        own_lost: whether that is lost; empty if it is not there.
+        own_flight_time_s: its flight time.
+        over_own: flight time over it; empty if one of the two is lost.
+        harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
+            the golden flight succeeds.
+    Of the flight with the same fault and no detector, empty if that is not there: bare_struck,
+    bare_lost, bare_over_own, bare_harmed.
     """
-    there = set(table.column_names)
-    table = flown(pa.table({
-        name: table[name].cast(kind) if name in there else pa.nulls(table.num_rows, kind)
-        for name, kind in _COLUMNS.items()
-    }))  # fmt: skip
+
+    table: pa.Table
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Flights:
+        """The flights of `analysis.flights.flights`, or of an export."""
+        there = set(table.column_names)
+        return cls(_beside_golden(_flown(pa.table({
+            name: table[name].cast(kind) if name in there else pa.nulls(table.num_rows, kind)
+            for name, kind in _COLUMNS.items()
+        }))))  # fmt: skip
+
+    @classmethod
+    def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
+        """The missions of several, each once; None means all stacks."""
+        own = [each.table.select(_NOTHING_FLOWN.column_names) for each in several]
+        whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
+        whole = whole if stack is None else whole.chosen(stack=stack)
+        first: dict[str, int] = {}
+        for place, changes in enumerate(whole["changes"]):
+            first.setdefault(changes, place)
+        return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    def __getitem__(self, name: str) -> list[Any]:
+        """A column; None where it is empty."""
+        return list(self.table[name].to_pylist())
+
+    def rows(self, *names: str) -> list[dict[str, Any]]:
+        """The flights as rows of these columns; none mean all."""
+        return list((self.table.select(names) if names else self.table).to_pylist())
+
+    def numbers(self, name: str) -> FloatArray:
+        """A column, (n,); NaN where it is empty."""
+        return tables.numbers(self.table, name)
+
+    def known(self, *names: str) -> FloatArray:
+        """The sum of columns in each flight that has them all."""
+        return tables.known(np.sum([self.numbers(name) for name in names], axis=0))
+
+    def flags(self, name: str) -> BoolArray:
+        """A column of truth values, (n,)."""
+        return tables.flags(self.table, name)
+
+    # Rows
+
+    def where(self, chosen: Iterable[bool]) -> Flights:
+        """The flights that are chosen, (n,)."""
+        return Flights(self.table.filter(pa.array(chosen, pa.bool_())))
+
+    def chosen(self, **values: Any) -> Flights:
+        """The flights with these values; None means empty, and a tuple allows several."""
+        return Flights(tables.chosen(self.table, **values))
+
+    def faulty(self, detector: str | None = None, **values: object) -> Flights:
+        """The flights with a fault, without a detector or with this one."""
+        struck = Flights(self.table.filter(pc.is_valid(self.table["level"])))
+        return struck.chosen(detector=detector, **values)
+
+    def struck(self, **values: object) -> Flights:
+        """The flights with a flipped bit, and no detector unless one is named."""
+        return self.chosen(**{"struck": True, "detector": None, **values})
+
+    def protected(self, detector: str, protect: str = EVERY_STAGE, **values: object) -> Flights:
+        """The flights with a detector of these stages, whose fault struck without it as well."""
+        seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
+        return self.chosen(**seen, **values)
+
+    @property
+    def golden(self) -> Flights:
+        """The flights without fault and detector."""
+        return self.chosen(level=None, detector=None)
+
+    @property
+    def timed(self) -> Flights:
+        """The flights with a fault that succeed as their golden flights do."""
+        faulty, known = (pc.is_valid(self.table[name]) for name in ("level", "over_own"))
+        return Flights(self.table.filter(pc.and_(faulty, known)))
+
+    @property
+    def comparable(self) -> Flights:
+        """The flights without a detector, or with one that watches all stages."""
+        return self.chosen(protect=(None, EVERY_STAGE))
+
+    def by(self, *names: str) -> dict[tuple[Any, ...], Flights]:
+        """The flights of each combination of values, in the order of their first flights."""
+        return self.grouped(zip(*map(self.__getitem__, names), strict=True))
+
+    def grouped(self, keys: Iterable[Any]) -> dict[Any, Flights]:
+        """The flights of each key, in the order of their first flights; a key for each flight."""
+        places: dict[Any, list[int]] = {}
+        for place, key in enumerate(keys):
+            places.setdefault(key, []).append(place)
+        return {key: Flights(self.table.take(pa.array(each))) for key, each in places.items()}
+
+    # Numbers
+
+    def share(self, column: str = "lost", *, value: bool = True) -> Share:
+        """The share in which a column has a value, among those in which it is not empty."""
+        values = self.table[column].drop_null()
+        return wilson(pc.sum(pc.equal(values, value)).as_py() or 0, len(values))
+
+    @property
+    def ratios(self) -> FloatArray:
+        """Times over those of the golden flights of the same missions, where both succeed."""
+        return self.known("over_own")
+
+    @property
+    def increases(self) -> FloatArray:
+        """Flight times beyond those of the own golden flights, in per cent, where both succeed."""
+        return PERCENT * (self.ratios - 1.0)
+
+    @property
+    def faults(self) -> list[tuple[str, str]]:
+        """Mission and fault of each flight; two flights of one fault differ in their detector."""
+        return list(zip(self["pair"], self["fault"], strict=True))
+
+    @property
+    def worlds(self) -> list[str]:
+        """The worlds that were flown, the paper's first."""
+        found = set(self["world"])
+        return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
+
+
+def _flown(table: pa.Table) -> pa.Table:
+    """The missions that flew, with the columns that follow from their own configuration."""
+    table = tables.flown(table)
     configs = [json.loads(each) for each in table["changes"].to_pylist()]
     flips = pc.is_in(table["injected"], pa.array([each.value for each in _STRUCK]))
     kills = pc.fill_null(pc.starts_with(table["fault_target"], "process."), _NO)
@@ -77,7 +211,7 @@ def flown_missions(table: pa.Table) -> pa.Table:
     faults = (canonical([each.get(name) for name in _FAULTS]) for each in configs)
     at = ((each.get("fault") or {}).get("at") for each in configs)
     together = (bool((each.get("fault") or {}).get("together")) for each in configs)
-    return with_columns(
+    return _with_columns(
         table,
         fault=pa.array(faults, pa.string()),
         together=pa.array(together, pa.bool_()),
@@ -88,8 +222,7 @@ def flown_missions(table: pa.Table) -> pa.Table:
     )
 
 
-def with_columns(table: pa.Table, **columns: Any) -> pa.Table:
-    """The table with more columns."""
+def _with_columns(table: pa.Table, **columns: Any) -> pa.Table:
     for name, column in columns.items():
         table = table.append_column(name, column)
     return table
@@ -106,26 +239,10 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
     return config.keys() <= _PAPER and changed <= _DRAWN and watch == PAPER
 
 
-_NOTHING_FLOWN = flown_missions(pa.table({}))
-
-
-def beside_golden(table: pa.Table) -> pa.Table:
-    """The flights with what each is compared with.
-
-    Of its golden flight:
-        own_lost: whether that is lost; empty if it is not there.
-        own_flight_time_s: its flight time.
-        over_own: flight time over it; empty if one of the two is lost.
-        harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
-            the golden flight succeeds.
-    Of the flight with the same fault and no detector, empty if that is not there: bare_struck,
-    bare_lost, bare_over_own, bare_harmed.
-
-    Args:
-        table: of `flown_missions`.
-    """
+def _beside_golden(table: pa.Table) -> pa.Table:
+    """The table with what each flight is compared with."""
     unprotected = pc.is_null(table["detector"]).to_pylist()
-    faults = faults_of(table)
+    faults = Flights(table).faults
     place_of = {fault: place for place, fault in enumerate(faults) if unprotected[place]}
     own = pa.array([place_of.get((pair, _NO_FAULT)) for pair, _ in faults], pa.int64())
     bare = pa.array([place_of.get(fault) for fault in faults], pa.int64())
@@ -135,74 +252,11 @@ def beside_golden(table: pa.Table) -> pa.Table:
     over_own = pc.if_else(pc.and_not(succeeds, table["lost"]), ratio, pa.scalar(None, ratio.type))
     harmed = pc.or_(table["lost"], pc.fill_null(pc.greater(over_own, LONGER), _NO))
     harmed = pc.if_else(succeeds, harmed, pa.scalar(None, pa.bool_()))
-    table = with_columns(
+    table = _with_columns(
         table, own_lost=own_lost, own_flight_time_s=own_time, over_own=over_own, harmed=harmed
     )
     names = ("struck", "lost", "over_own", "harmed")
-    return with_columns(table, **{f"bare_{name}": table[name].take(bare) for name in names})
+    return _with_columns(table, **{f"bare_{name}": table[name].take(bare) for name in names})
 
 
-def pooled(tables: Iterable[pa.Table], stack: str | None = None) -> pa.Table:
-    """The missions of several tables, each once; None means all stacks.
-
-    Args:
-        tables: of `flown_missions`.
-    """
-    whole = pa.concat_tables([_NOTHING_FLOWN, *tables]).combine_chunks()
-    whole = whole if stack is None else chosen(whole, stack=stack)
-    first: dict[str, int] = {}
-    for place, changes in enumerate(whole["changes"].to_pylist()):
-        first.setdefault(changes, place)
-    return beside_golden(whole.take(pa.array(first.values(), pa.int64())))
-
-
-# Rows and numbers ---------------------------------------------------------------------------------
-
-
-def golden(flights: pa.Table) -> pa.Table:
-    """The flights without fault and detector."""
-    return chosen(flights, level=None, detector=None)
-
-
-def faulty(flights: pa.Table, detector: str | None = None, **values: object) -> pa.Table:
-    """The flights with a fault, without a detector or with this one."""
-    return chosen(flights.filter(pc.is_valid(flights["level"])), detector=detector, **values)
-
-
-def struck(flights: pa.Table, **values: object) -> pa.Table:
-    """The flights with a flipped bit, and no detector unless one is named."""
-    return chosen(flights, **{"struck": True, "detector": None, **values})
-
-
-def timed(flights: pa.Table) -> pa.Table:
-    """The flights with a fault that succeed as their golden flights do."""
-    return flights.filter(pc.and_(pc.is_valid(flights["level"]), pc.is_valid(flights["over_own"])))
-
-
-def comparable(flights: pa.Table) -> pa.Table:
-    """The flights without a detector, or with one that watches all stages."""
-    return chosen(flights, protect=(None, EVERY_STAGE))
-
-
-def by_value(flights: pa.Table, *names: str) -> dict[tuple[Any, ...], pa.Table]:
-    """The flights of each combination of values, in the order of their first flights."""
-    places: dict[tuple[Any, ...], list[int]] = {}
-    for place, values in enumerate(zip(*(flights[n].to_pylist() for n in names), strict=True)):
-        places.setdefault(values, []).append(place)
-    return {values: flights.take(pa.array(each)) for values, each in places.items()}
-
-
-def share(flights: pa.Table, column: str = "lost", *, value: bool = True) -> Share:
-    """The share of flights in which a column has a value, among those in which it is not empty."""
-    values = flights[column].drop_null()
-    return wilson(pc.sum(pc.equal(values, value)).as_py() or 0, len(values))
-
-
-def ratios(flights: pa.Table) -> FloatArray:
-    """Times over those of the golden flights of the same missions, where both succeed."""
-    return known(numbers(flights, "over_own"))
-
-
-def faults_of(flights: pa.Table) -> list[tuple[str, str]]:
-    """Mission and fault of each flight; two flights of one fault differ in their detector."""
-    return list(zip(flights["pair"].to_pylist(), flights["fault"].to_pylist(), strict=True))
+_NOTHING_FLOWN = _flown(pa.table({name: pa.nulls(0, kind) for name, kind in _COLUMNS.items()}))

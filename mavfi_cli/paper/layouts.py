@@ -1,8 +1,8 @@
 """The layout of each item that is flown: from missions to the paper's table.
 
-A layout takes the item's missions as `paper.flights.beside_golden`. It reads
-configuration and record only, never labels, so that it serves any campaign with such missions. It
-gives the cells of each row; paper.toml has headings, columns and notes.
+A layout reads configuration and record of the item's missions only, never labels, so that it serves
+any campaign with such missions. It gives the cells of each row; paper.toml has headings, columns
+and notes.
 """
 
 from __future__ import annotations
@@ -13,23 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
-from mavfi_cli.analysis.flights import chosen, known, numbers
 from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
-from mavfi_cli.paper.flights import (
-    EVERY_STAGE,
-    STAGES,
-    by_value,
-    comparable,
-    faulty,
-    golden,
-    ratios,
-    share,
-)
+from mavfi_cli.paper.flights import EVERY_STAGE, PERCENT, STAGES, Flights
 from mavfi_cli.paper.items import BY_NAME, printed
 from mavfi_cli.report.paper import (
     DETECTOR_TITLES,
@@ -42,25 +31,23 @@ from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import OWN, worst_case
 from mavfi_cli.stats.shares import Share
 
-PERCENT = 100.0
-WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
 _JOULES = 1e-3  # kJ
 _NOTHING = "nothing flown yet"
 
 
-def of_flights(name: str, flights: pa.Table) -> PaperTable:
+def of_flights(name: str, flights: Flights) -> PaperTable:
     """The table of an item that is flown.
 
     Args:
-        flights: the item's missions, as `paper.flights.beside_golden`.
+        flights: the item's missions.
     """
     if name in _ONLY_COMPARABLE:
-        flights = comparable(flights)
+        flights = flights.comparable
     rows = [*OF_FLIGHTS[name](flights)]
     notes = _unknown_costs(flights) if name == "table5" else []
-    table = BY_NAME[name].table(rows, worlds_of(flights), notes)
+    table = BY_NAME[name].table(rows, flights.worlds, notes)
     return replace(table, result=_RESULTS[name](table))
 
 
@@ -69,12 +56,6 @@ _ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part 
 
 def _row(*labels: object, cells: Iterable[PaperCell]) -> PaperRow:
     return PaperRow(labels=tuple(map(str, labels)), cells=tuple(cells))
-
-
-def worlds_of(flights: pa.Table) -> list[str]:
-    """The worlds that were flown, the paper's first."""
-    found = set(flights["world"].to_pylist())
-    return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
 
 
 # Faults by place: Figs. 7, 8, 9, Table III ------------------------------------------------------
@@ -91,23 +72,23 @@ KERNELS_FLOWN = {  # node and planner
 _PLANNERS = {"rrtstar": "RRT*", "rrt": "RRT", "rrtconnect": "RRTConnect"}
 
 
-def _effects(flights: pa.Table) -> list[PaperCell]:
+def _effects(flights: Flights) -> list[PaperCell]:
     """Success, mean time, and the longest flight of those with a fault."""
-    longest = _maximum(increases(faulty(flights)))
+    longest = _maximum(flights.faulty().increases)
     return [_success(flights), _mean(flights, "flight_time_s"), longest]
 
 
-def _fig7(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig7(flights: Flights) -> Iterator[PaperRow]:
     """Faults in each kernel beside the golden flights with the same planner."""
     groups = {
-        f"{_GOLDEN}, {title}": chosen(golden(flights), planner=name)
+        f"{_GOLDEN}, {title}": flights.golden.chosen(planner=name)
         for name, title in _PLANNERS.items()
     } | {
-        title: faulty(flights, level="instruction", fault_target=node, planner=planner)
+        title: flights.faulty(level="instruction", fault_target=node, planner=planner)
         for title, (node, planner) in KERNELS_FLOWN.items()
     }
     for title, those in groups.items():
-        if those.num_rows:
+        if len(those):
             energy = _mean(those, "energy_regression_j", scale=_JOULES)
             yield _row(title, cells=[*_effects(those), energy])
 
@@ -118,12 +99,12 @@ def _fig7_told(table: PaperTable) -> str:
     return f"{_worst_told(table)}; paper: up to +{worst} % and -{lost} points"
 
 
-def _by_value(name: str, column: str) -> Callable[[pa.Table], Iterator[PaperRow]]:
+def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
     """Faults by the values of a column, and what the paper says of each."""
 
-    def rows(flights: pa.Table) -> Iterator[PaperRow]:
-        yield _row(_GOLDEN, "", cells=_effects(golden(flights)))
-        for (value,), those in by_value(faulty(flights), column).items():
+    def rows(flights: Flights) -> Iterator[PaperRow]:
+        yield _row(_GOLDEN, "", cells=_effects(flights.golden))
+        for (value,), those in flights.faulty().by(column).items():
             critical = printed(name, "critical", value) or "-"
             yield _row(value, critical, cells=_effects(those))
 
@@ -151,10 +132,10 @@ _QUALITY = {  # the paper's name of a measure, its column, and its scale
 }
 
 
-def _table3(flights: pa.Table) -> Iterator[PaperRow]:
+def _table3(flights: Flights) -> Iterator[PaperRow]:
     """Quality of flight by the number of flipped bits."""
-    groups = {0: golden(flights)}
-    faults = by_value(faulty(flights), "fault_bits")
+    groups = {0: flights.golden}
+    faults = flights.faulty().by("fault_bits")
     groups |= {bits: faults[bits,] for (bits,) in sorted(faults)}
     for bits, those in groups.items():
         means = [
@@ -174,14 +155,14 @@ def _table3_told(table: PaperTable) -> str:
 # Detection and recovery in four worlds: Table IV, Figs. 12 and 14, Table V -----------------------
 
 
-def _table4(flights: pa.Table) -> Iterator[PaperRow]:
+def _table4(flights: Flights) -> Iterator[PaperRow]:
     """Success in each world: golden, with faults, with each detector."""
-    settings = [(_GOLDEN, "golden", golden(flights)), ("injection", "none", faulty(flights))]
-    settings += [(f"{told}-based", x, faulty(flights, x)) for x, told in DETECTOR_TITLES.items()]
+    settings = [(_GOLDEN, "golden", flights.golden), ("injection", "none", flights.faulty())]
+    settings += [(f"{told}-based", x, flights.faulty(x)) for x, told in DETECTOR_TITLES.items()]
     for title, key, those in settings:
         cells = (
-            _success(chosen(those, world=world), printed("table4", "success_percent", key, world))
-            for world in worlds_of(flights)
+            _success(those.chosen(world=world), printed("table4", "success_percent", key, world))
+            for world in flights.worlds
         )
         yield _row(title, cells=cells)
 
@@ -192,25 +173,25 @@ def _table4_told(table: PaperTable) -> str:
     return f"{world}: {', '.join(told)}"
 
 
-def _fig12(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig12(flights: Flights) -> Iterator[PaperRow]:
     """Worst flight time with faults, and what each detector recovers of it, in points."""
-    for world in worlds_of(flights):
-        here = chosen(flights, world=world)
-        bare, struck = golden(here), faulty(here)
+    for world in flights.worlds:
+        here = flights.chosen(world=world)
+        bare, struck = here.golden, here.faulty()
         increase = printed("fig12", "worst_increase_percent", world)
         yield _row(world, cells=[
             _mean(bare, "flight_time_s"),
-            _maximum(increases(struck), increase),
+            _maximum(struck.increases, increase),
             _worst_mean(bare, struck, increase),
             *_recovered(here, "fig12", "recovered_points", world),
         ])  # fmt: skip
 
 
-def _recovered(flights: pa.Table, item: str, unit: str, place: str) -> Iterator[PaperCell]:
+def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[PaperCell]:
     """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
     for name in DETECTOR_TITLES:
-        yield _recovery(faulty(flights, name), measure, printed(item, unit, name, place))
+        yield _recovery(flights.faulty(name), measure, printed(item, unit, name, place))
 
 
 def _fig12_told(table: PaperTable) -> str:
@@ -221,18 +202,18 @@ def _fig12_told(table: PaperTable) -> str:
     return f"worst flight {longest} in {world}, GAD recovers {gad} and AAD {aad} points"
 
 
-def _fig14(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig14(flights: Flights) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
     for detector, told in DETECTOR_TITLES.items():
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
             cells = (
                 _recovery(
-                    faulty(flights, detector, protect=stages, world=world),
+                    flights.faulty(detector, protect=stages, world=world),
                     "recovered_share",
                     printed(*paper, world, stages),
                 )
-                for world in worlds_of(flights)
+                for world in flights.worlds
             )
             yield _row(told, stages, cells=cells)
 
@@ -245,16 +226,16 @@ def _fig14_told(table: PaperTable) -> str:
     )
 
 
-def _table5(flights: pa.Table) -> Iterator[PaperRow]:
+def _table5(flights: Flights) -> Iterator[PaperRow]:
     """Shares of the flight time that detection and recovery take."""
     for detector in DETECTOR_TITLES:
         for title, (columns, keys) in _parts(detector).items():
             cells = (
                 mean_cell(
-                    PERCENT * _summed(faulty(flights, detector, world=world), columns),
+                    PERCENT * flights.faulty(detector, world=world).known(*columns),
                     printed("table5", *keys, world),
                 )
-                for world in worlds_of(flights)
+                for world in flights.worlds
             )
             yield _row(detector.upper(), title, cells=cells)
 
@@ -266,10 +247,10 @@ def _table5_told(table: PaperTable) -> str:
     )
 
 
-def _unknown_costs(flights: pa.Table) -> list[str]:
+def _unknown_costs(flights: Flights) -> list[str]:
     """Why watched flights have no costs."""
-    watched = flights.num_rows > flights["detector"].null_count
-    if not watched or len(known(numbers(flights, "check_share"))):
+    watched = any(flights["detector"])
+    if not watched or len(flights.known("check_share")):
         return []
     return ["no numbers: this export does not hold these times; a new one does"]
 
@@ -290,26 +271,21 @@ def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
     }
 
 
-def _summed(table: pa.Table, columns: Sequence[str]) -> FloatArray:
-    """The sum of columns in each flight that has them."""
-    return known(np.sum([numbers(table, column) for column in columns], axis=0))
-
-
 # Paths and states: Figs. 11 and 13 ---------------------------------------------------------------
 
 SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
 
 
-def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArray]]:
+def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Values of SHOWN_STATES at all control ticks, and their changes from tick to tick.
 
     Reads the traces of the successful flights whose run folders are there.
     """
-    runs = [Path(each) for each in chosen(flights, lost=False)["path"].to_pylist() if each]
+    runs = [Path(each) for each in flights.chosen(lost=False)["path"] if each]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
     found = {}
     for state in SHOWN_STATES:
-        columns = [known(numbers(trace, state)) for trace in traces]
+        columns = [Flights(trace).known(state) for trace in traces]
         found[state] = (
             np.concatenate([np.zeros(0), *columns]),
             np.concatenate([np.zeros(0), *(np.diff(each) for each in columns)]),
@@ -317,9 +293,9 @@ def values_and_deltas(flights: pa.Table) -> dict[str, tuple[FloatArray, FloatArr
     return found
 
 
-def _fig11(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig11(flights: Flights) -> Iterator[PaperRow]:
     """Ranges of the values of three states, and of their changes."""
-    for state, (values, deltas) in values_and_deltas(golden(flights)).items():
+    for state, (values, deltas) in values_and_deltas(flights.golden).items():
         spans = [_span(values, 1.0), _span(deltas, 1.0)]
         middle = [_span(values, 0.99), _span(deltas, 0.99)]
         reduced = [_reduction(*spans), _reduction(*middle)]
@@ -345,13 +321,13 @@ def _reduction(values: float, deltas: float) -> float:
     return PERCENT * (1.0 - deltas / values) if values else math.nan
 
 
-def _fig13(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig13(flights: Flights) -> Iterator[PaperRow]:
     """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
-    for (stage,), struck in by_value(faulty(flights), "fault_target").items():
+    for (stage,), struck in flights.faulty().by("fault_target").items():
         yield _row(stage, cells=[
-            _maximum(increases(struck), printed("fig13", "increase_percent", stage)),
-            _maximum(_with(struck, faulty(flights, "aad", fault_target=stage))),
-            mean_cell(increases(struck)),
+            _maximum(struck.increases, printed("fig13", "increase_percent", stage)),
+            _maximum(_with(struck, flights.faulty("aad", fault_target=stage))),
+            mean_cell(struck.increases),
         ])  # fmt: skip
 
 
@@ -362,25 +338,25 @@ def _fig13_told(table: PaperTable) -> str:
     ) or _NOTHING  # fmt: skip
 
 
-def _with(struck: pa.Table, protected: pa.Table) -> FloatArray:
+def _with(struck: Flights, protected: Flights) -> FloatArray:
     """Increase of the flight with the fault that prolongs most, protected, (1,) or (0,)."""
-    if not len(ratios(struck)):
+    if not len(struck.ratios):
         return np.zeros(0)
-    worst = struck.slice(int(np.nanargmax(numbers(struck, "over_own"))), 1)
-    return increases(chosen(protected, pair=worst["pair"][0], fault=worst["fault"][0]))
+    pair, fault = struck.faults[int(np.nanargmax(struck.numbers("over_own")))]
+    return protected.chosen(pair=pair, fault=fault).increases
 
 
 # Platforms: Fig. 16 ------------------------------------------------------------------------------
 
 
-def _fig16(flights: pa.Table) -> Iterator[PaperRow]:
+def _fig16(flights: Flights) -> Iterator[PaperRow]:
     """Worst flight time on each platform, and what each detector recovers of it."""
-    for (platform,), here in by_value(flights, "platform").items():
-        struck = faulty(here)
+    for (platform,), here in flights.by("platform").items():
+        struck = here.faulty()
         yield _row(platform, cells=[
-            _mean(golden(here), "flight_time_s"),
+            _mean(here.golden, "flight_time_s"),
             _success(struck),
-            _maximum(ratios(struck), printed("fig16", "worst_ratio", platform)),
+            _maximum(struck.ratios, printed("fig16", "worst_ratio", platform)),
             *_recovered(here, "fig16", "recovered_percent", platform),
         ])  # fmt: skip
 
@@ -393,7 +369,7 @@ def _fig16_told(table: PaperTable) -> str:
     ) or _NOTHING  # fmt: skip
 
 
-OF_FLIGHTS: Mapping[str, Callable[[pa.Table], Iterator[PaperRow]]] = {
+OF_FLIGHTS: Mapping[str, Callable[[Flights], Iterator[PaperRow]]] = {
     "fig7": _fig7, "fig8": _by_value("fig8", "fault_target"),
     "fig9": _by_value("fig9", "fault_field"), "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
     "fig14": _fig14, "fig16": _fig16, "table3": _table3, "table4": _table4, "table5": _table5,
@@ -421,9 +397,9 @@ def share_cell(share: Share, paper: Printed = None) -> PaperCell:
     )
 
 
-def _success(flights: pa.Table, paper: Printed = None) -> PaperCell:
+def _success(flights: Flights, paper: Printed = None) -> PaperCell:
     """Success rate of all flown missions, in per cent, as the paper counts."""
-    return share_cell(share(flights, value=False), paper)
+    return share_cell(flights.share(value=False), paper)
 
 
 def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
@@ -434,14 +410,14 @@ def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> Pa
     )
 
 
-def _mean(flights: pa.Table, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
+def _mean(flights: Flights, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
     """Mean of a measure over the successful missions."""
     return mean_cell(scale * _of_successes(flights, name), paper)
 
 
-def _of_successes(flights: pa.Table, name: str) -> FloatArray:
+def _of_successes(flights: Flights, name: str) -> FloatArray:
     """A measure of the successful missions that have it."""
-    return known(numbers(chosen(flights, lost=False), name))
+    return flights.chosen(lost=False).known(name)
 
 
 def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
@@ -451,12 +427,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
     return PaperCell(value=float(np.max(values)), count=len(values), paper=paper)
 
 
-def increases(flights: pa.Table) -> FloatArray:
-    """Flight times beyond those of the own golden flights, in per cent, where both succeed."""
-    return PERCENT * (ratios(flights) - 1.0)
-
-
-def _worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> PaperCell:
+def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
     """The longest flight over the mean golden one, as increase in per cent."""
     golden_s, times_s = (_of_successes(each, "flight_time_s") for each in (bare, flights))
     if not (len(golden_s) and len(times_s)):
@@ -465,7 +436,7 @@ def _worst_mean(bare: pa.Table, flights: pa.Table, paper: Printed = None) -> Pap
     return PaperCell(value=PERCENT * increase, count=len(times_s), paper=paper)
 
 
-def _recovery(protected: pa.Table, measure: str, paper: Printed) -> PaperCell:
+def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     """What a protection recovers of the worst case, in per cent or in points.
 
     The worst case is that of the faults that were flown with the protection, too: of more flights
@@ -474,6 +445,6 @@ def _recovery(protected: pa.Table, measure: str, paper: Printed) -> PaperCell:
     Args:
         measure: field of `WorstCase`.
     """
-    bare, own = known(numbers(protected, "bare_over_own")), ratios(protected)
+    bare, own = protected.known("bare_over_own"), protected.ratios
     value = PERCENT * getattr(worst_case(OWN, bare.tolist(), own.tolist()), measure)
     return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import flights, provenance
 from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
@@ -21,7 +20,7 @@ from mavfi_cli.campaigns.specification_file import load_spec, presets
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.paper.flights import flown_missions, pooled
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import FlightsPlan
 from mavfi_cli.paper.status import of_kernels
 
@@ -39,7 +38,7 @@ class CampaignSource:
         path: the campaign's folder, or the exported file.
         spec: None if a program made the list, or if no specification lies beside an export.
         planned: missions on its list; None of an export that does not say.
-        flights: the missions that flew, as `paper.flights.flown_missions`.
+        flights: the missions that flew.
         errors: missions that could not begin.
         versions: of the programs that flew it; empty of an export that does not say.
         host: of the first record; empty of an export that does not say.
@@ -51,7 +50,7 @@ class CampaignSource:
     name: str
     spec: Spec | None
     planned: int | None
-    flights: pa.Table
+    flights: Flights
     errors: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
@@ -61,13 +60,13 @@ class CampaignSource:
     @property
     def stacks(self) -> list[str]:
         """The stacks that flew, sorted."""
-        return sorted(pc.unique(self.flights["stack"]).to_pylist())
+        return sorted(set(self.flights["stack"]))
 
     @property
     def seeds(self) -> tuple[int, int] | None:
         """The smallest and the largest seed of its flights; None without any."""
-        found = pc.min_max(self.flights["seed"]).as_py()
-        return None if found["min"] is None else (found["min"], found["max"])
+        found = [seed for seed in self.flights["seed"] if seed is not None]
+        return (min(found), max(found)) if found else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,12 +94,9 @@ class Evidence:
         """The summary of each attacked kernel; of several, that of the last source."""
         return {part["kernel"]: part for each in self.kernels for part in each.summary["kernels"]}
 
-    def flights(self, stack: str | None = None) -> pa.Table:
-        """The flights of a stack, each mission once and beside its golden flight; None means all.
-
-        They are those of `paper.flights.pooled`.
-        """
-        return pooled([each.flights for each in self.campaigns], stack)
+    def flights(self, stack: str | None = None) -> Flights:
+        """The flights of a stack, each mission once; None means all stacks."""
+        return Flights.pooled([each.flights for each in self.campaigns], stack)
 
 
 def gather(places: Sequence[Path]) -> Evidence:
@@ -129,7 +125,7 @@ def gather(places: Sequence[Path]) -> Evidence:
                 campaigns.append(each)
         if len(campaigns) + len(kernels) + len(problems) == before:
             problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
-    if not any(each.flights.num_rows for each in campaigns) and not kernels:
+    if not any(len(each.flights) for each in campaigns) and not kernels:
         raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
     problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
     return Evidence(campaigns=campaigns, kernels=kernels, problems=problems)
@@ -205,7 +201,7 @@ def _campaign(
         name=name,
         spec=spec,
         planned=origin.get("planned"),
-        flights=flown_missions(table),
+        flights=Flights.of(table),
         errors=table["state"].to_pylist().count(ResultState.ERROR.value),
         versions=origin.get("versions", {}),
         host=origin.get("host", {}),
@@ -231,7 +227,7 @@ def _nothing(campaigns: Sequence[CampaignSource]) -> str:
 
 def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in campaigns:
-        over = each.flights.num_rows + each.errors
+        over = len(each.flights) + each.errors
         if each.planned is not None and over < each.planned:
             rest = f"{each.again or 'The command that began it'} flies the rest."
             rest = "An export holds no list." if each.digest else rest

@@ -9,9 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.groups import METRICS, Group, groups
 from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, outcome_share
@@ -19,7 +16,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import presets
 from mavfi_cli.core.errors import RecordError, UnknownName
-from mavfi_cli.paper.flights import beside_golden, flown_missions
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import (
     BY_NAME,
     ITEMS,
@@ -43,7 +40,7 @@ _WIDE = 2  # columns of settings on one screen
 _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
-def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, pa.Table | None]:
+def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
     """The one table of a campaign, and the flights that its figure needs; None if it needs none.
 
     It is the table of the named item, or of the preset's item. Without one, a reproduction has the
@@ -59,7 +56,7 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, pa.Table
         return _settings_table(ledger) if plan is None else _progress_table(ledger, plan), None
     if item.source is not Source.FLIGHTS:
         return _unflown(item, ledger.folder.parent), None
-    table = beside_golden(flown_missions(flights(ledger)))
+    table = Flights.of(flights(ledger))
     mine = table if plan is None else _flights_of(item, plan, table)
     return of_flights(item.name, mine), mine
 
@@ -77,10 +74,10 @@ def _item_of(ledger: Ledger, name: str | None) -> Item | None:
     return found
 
 
-def _flights_of(item: Item, plan: FlightsPlan, table: pa.Table) -> pa.Table:
+def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
     """The flights of an item among those of a reproduction."""
-    keys = pa.array(plan.keys(item), pa.string())
-    return table.filter(pc.is_in(table["changes"], value_set=keys))
+    keys = set(plan.keys(item))
+    return flights.where([changes in keys for changes in flights["changes"]])
 
 
 def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
@@ -96,7 +93,7 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
             continue
         if table is None:
             with Ledger(plan.folder) as ledger:
-                table = beside_golden(flown_missions(flights(ledger)))
+                table = Flights.of(flights(ledger))
         yield of_flights(item.name, _flights_of(item, plan, table))
 
 

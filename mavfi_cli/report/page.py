@@ -118,10 +118,10 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
     stacks = told["stacks"]
     return {
         "items": {
-            (each.item.name, part.stack): _item_chart(each.item, part)
+            (each["item"].name, part["stack"]): _item_chart(each["item"], part)
             for each in told["items"]
-            for part in each.shown
-            if part.figure is not None
+            for part in each["shown"]
+            if part["figure"] is not None
         },
         "states": [
             _Chart(
@@ -138,13 +138,14 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _item_chart(item: Any, shown: Any) -> _Chart:
-    name = f"{item.name}-{shown.stack}".replace(" ", "-")
+def _item_chart(item: Any, shown: Mapping[str, Any]) -> _Chart:
+    name = f"{item.name}-{shown['stack']}".replace(" ", "-")
+    flights = shown["flights"]
     return _Chart(
-        name=f"{name}-flights" if shown.flights else name,
-        title=f"{item.paper}, {shown.stack}",
-        figure=shown.figure,
-        csv=csv_text(shown.flights) if shown.flights else as_csv(shown.table),
+        name=f"{name}-flights" if flights else name,
+        title=f"{item.paper}, {shown['stack']}",
+        figure=shown["figure"],
+        csv=csv_text(flights) if flights else as_csv(shown["table"]),
     )
 
 
@@ -153,20 +154,18 @@ def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
     figure = print_figure("one", 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()
     print_axes(axes)
+    rows = []
     for place, arm in enumerate(arms):
-        telling = arm.corrected_p is not None and arm.corrected_p < 0.05
-        colour = _LOST if arm.corrected_p is None else DETECTORS["gad"] if telling else NONE
-        axes.hlines(place, 100 * arm.lost.low, 100 * arm.lost.high, color=colour, linewidth=1.4)
-        axes.plot(100 * arm.lost.share, place, "o", color=colour, markersize=4)
-    axes.set_yticks(range(len(arms)), [each.name for each in arms], fontsize=SMALLEST)
+        lost, p = arm["lost"], arm["corrected_p"]
+        colour = _LOST if p is None else DETECTORS["gad"] if p < 0.05 else NONE
+        axes.hlines(place, 100 * lost.low, 100 * lost.high, color=colour, linewidth=1.4)
+        axes.plot(100 * lost.share, place, "o", color=colour, markersize=4)
+        rows.append({"arm": arm["name"], "lost": lost.count, "of": lost.total, "low": lost.low,
+                     "high": lost.high, "p": "" if p is None else p})  # fmt: skip
+    axes.set_yticks(range(len(arms)), [each["name"] for each in arms], fontsize=SMALLEST)
     axes.set_ylim(len(arms) - 0.4, -0.6)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
-    rows = [
-        {"arm": each.name, "lost": each.lost.count, "of": each.lost.total, "low": each.lost.low,
-         "high": each.lost.high, "p": "" if each.corrected_p is None else each.corrected_p}
-        for each in arms
-    ]  # fmt: skip
     title = f"Lost missions of each arm of {campaign}"
     return _Chart(name=f"arms-{campaign}", title=title, figure=figure, csv=csv_text(rows))
 
@@ -181,13 +180,13 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
     axes = figure.add_subplot()
     print_axes(axes)
     for place, flow in enumerate(flows):
-        total, left = sum(each.total for each in flow.fates.values()), 0.0
-        for fate, share in flow.fates.items():
+        total, left = sum(each.total for each in flow["fates"].values()), 0.0
+        for fate, share in flow["fates"].items():
             part = 100.0 * share.total / total
-            label = fate.value if not place else None
-            axes.barh(place, part, left=left, height=0.66, color=_FATES[fate.value], label=label)
+            label = fate if not place else None
+            axes.barh(place, part, left=left, height=0.66, color=_FATES[fate], label=label)
             left += part
-    names = [each.kernel.replace("_", " ") for each in flows]
+    names = [each["kernel"].replace("_", " ") for each in flows]
     axes.set_yticks(range(len(flows)), names, fontsize=SMALLEST)
     axes.set_ylim(len(flows) - 0.5, -0.5)
     axes.set_xlim(0.0, 100.0)
@@ -197,8 +196,8 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
         columnspacing=1.0, labelcolor=INK,
     )  # fmt: skip
     rows = [
-        {"kernel": each.kernel, "fate": fate.value, "missions": share.total, "lost": share.count}
-        for each in flows for fate, share in each.fates.items()
+        {"kernel": each["kernel"], "fate": fate, "missions": share.total, "lost": share.count}
+        for each in flows for fate, share in each["fates"].items()
     ]  # fmt: skip
     title = f"What struck kernels did, {stack}"
     return _Chart(name=f"kernels-{stack}", title=title, figure=figure, csv=csv_text(rows))

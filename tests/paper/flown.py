@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pyarrow as pa
 
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.paper.flights import beside_golden, flown_missions
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -59,4 +59,4 @@ def table(rows):
 
 def flights(rows):
     """The flights of these rows."""
-    return beside_golden(flown_missions(table(rows)))
+    return Flights.of(table(rows))

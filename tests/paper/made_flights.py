@@ -4,7 +4,7 @@ import json
 
 import pyarrow as pa
 
-from mavfi_cli.paper.flights import beside_golden, flown_missions
+from mavfi_cli.paper.flights import Flights
 
 _KINDS = {
     "number": pa.int64(), "pair": pa.string(), "world": pa.string(), "planner": pa.string(),
@@ -41,7 +41,7 @@ def table(*flights):
     columns = {
         name: pa.array([row.get(name) for row in rows], kind) for name, kind in _KINDS.items()
     }
-    return beside_golden(flown_missions(pa.table(columns)))
+    return Flights.of(pa.table(columns))
 
 
 def _mission(each):

@@ -10,8 +10,8 @@ from flown import flights, row
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.paper import claims, items
 from mavfi_cli.paper.claims import CLAIMS
+from mavfi_cli.paper.flights import WORLDS
 from mavfi_cli.paper.items import BY_NAME, printed
-from mavfi_cli.paper.layouts import WORLDS
 from mavfi_cli.stats.effects import ClaimVerdict, judge
 from mavfi_cli.stats.shares import wilson
 

@@ -3,9 +3,7 @@
 import pytest
 from flown import flights, row
 
-from mavfi_cli.analysis.flights import chosen
-from mavfi_cli.paper.claims import MEASURES, protected
-from mavfi_cli.paper.flights import share, struck
+from mavfi_cli.paper.claims import MEASURES
 
 PLANNING = {"target": "planning", "fault": {"field": "exponent"}}
 
@@ -22,14 +20,14 @@ def pairs(*outcomes):
 
 def test_a_fault_is_harmful_if_lost_or_more_than_5_percent_longer():
     those = flights(pairs(20.0, 21.0, 21.1, "timeout"))
-    found = share(struck(those), "harmed")
+    found = those.struck().share("harmed")
     assert (found.count, found.total) == (2, 4)
 
 
 def test_a_fault_without_a_successful_golden_flight_is_not_counted():
     rows = pairs("timeout", 40.0)
     rows[0] = {**rows[0], "outcome": "collision"}
-    found = share(struck(flights(rows)), "harmed")
+    found = flights(rows).struck().share("harmed")
     assert (found.count, found.total) == (1, 1)
 
 
@@ -68,7 +66,7 @@ def test_a_detector_saves_lost_missions_and_brings_long_ones_back():
     assert MEASURES["recovered"](those, "aad").effect.value == 1.0
     assert MEASURES["shortened"](those, "gad").told == "1 of 1 longer flights brought back"
     for name in ("gad", "aad"):
-        undone = share(chosen(protected(those, name), bare_harmed=True), "harmed", value=False)
+        undone = those.protected(name).chosen(bare_harmed=True).share("harmed", value=False)
         assert (undone.count, undone.total) == (2, 3)
     told = MEASURES["autoencoder_better"](those).told
     assert told == "1 missions by AAD only, 1 by GAD only, of 4"
@@ -94,14 +92,14 @@ def test_what_is_not_of_the_paper_is_marked():
         row("planning", instruction=True),
         row("planning", instruction=True, fault={"roles": ("destination",)}),
     ]
-    told = flights(rows)["as_paper"].to_pylist()
+    told = flights(rows)["as_paper"]
     assert told == [True, False, False, True, True, False, True, True, False]
-    assert flights(rows)["at"].to_pylist()[-6:-3] == ["random", "invocation=1", "random"]
+    assert flights(rows)["at"][-6:-3] == ["random", "invocation=1", "random"]
 
 
 def test_flights_are_chosen_by_their_columns():
     those = flights([row(seed=1), row("planning", seed=2), row("control", seed=3)])
-    found = chosen(those, fault_target=("planning", "control"))
-    assert found["seed"].to_pylist() == [2, 3]
-    assert chosen(those, fault_target=(None, "control"))["seed"].to_pylist() == [1, 3]
-    assert chosen(those, seed=1, level=None)["seed"].to_pylist() == [1]
+    found = those.chosen(fault_target=("planning", "control"))
+    assert found["seed"] == [2, 3]
+    assert those.chosen(fault_target=(None, "control"))["seed"] == [1, 3]
+    assert those.chosen(seed=1, level=None)["seed"] == [1]

@@ -7,7 +7,7 @@ from flown import table
 
 from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.paper import document
-from mavfi_cli.paper.flights import flown_missions, pooled
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import BY_NAME, FlightsPlan
 from mavfi_cli.paper.sources import STACKS
 
@@ -19,16 +19,16 @@ KINDS = FlightsPlan(items=[FIG13], stack="mavbench").kinds()
 def shown(monkeypatch):
     """What is shown of Fig. 13 on `mavbench`, and the run folders that are drawn."""
     monkeypatch.setattr(document, "ITEMS", [FIG13])
-    monkeypatch.setattr(document, "draw", lambda *given: given[1]["path"].to_pylist())
+    monkeypatch.setattr(document, "draw", lambda *given: given[1]["path"])
 
     def of(*exports):
-        tables = [flown_missions(each) for each in exports]
+        tables = [Flights.of(each) for each in exports]
         evidence = SimpleNamespace(
             campaigns=[SimpleNamespace(flights=each) for each in tables], isolated={}
         )
-        flights = {stack: pooled(tables, stack) for stack in STACKS}
+        flights = {stack: Flights.pooled(tables, stack) for stack in STACKS}
         shown = document.shown_items(evidence, flights)
-        return next(each for item in shown for each in item.parts if each.stack == "mavbench")
+        return next(each for item in shown for each in item["shown"] if each["stack"] == "mavbench")
 
     return of
 
@@ -52,11 +52,11 @@ def export(seed, folder=None):
 
 def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):
     found = shown(export(1), export(2, tmp_path))
-    assert found.figure == [str(tmp_path)] * len(KINDS)
-    assert found.table is not None
+    assert found["figure"] == [str(tmp_path)] * len(KINDS)
+    assert found["table"] is not None
 
 
 def test_without_run_folders_there_is_a_table_and_no_picture(shown, tmp_path):
     found = shown(export(1), export(2, tmp_path / "gone"))
-    assert found.figure is None
-    assert found.table is not None
+    assert found["figure"] is None
+    assert found["table"] is not None

@@ -7,14 +7,14 @@ from flown import row, table
 
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.paper.document import document
-from mavfi_cli.paper.flights import flown_missions
+from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.sources import CampaignSource, Evidence
 from mavfi_cli.stats.effects import ClaimVerdict
 
 
 def evidence(rows, name="mine", problems=()):
     path = Path(f"{name}.parquet")
-    flights = flown_missions(table(rows))
+    flights = Flights.of(table(rows))
     source = CampaignSource(path=path, name=name, spec=None, planned=None, flights=flights)
     return Evidence(campaigns=[source], kernels=[], problems=problems)
 
@@ -68,7 +68,7 @@ def test_missions_unlike_the_papers_judge_no_claim():
     rows = [row(seed=1), row("planning", seed=1), row("waypoint_x", **first)]
     told = document(evidence(rows))
     assert told["extent"] == "43 claims are judged by 2 missions."
-    assert [each.where for each in told["hourly"]["mavbench"]] == ["state: planning, sparse"]
+    assert [each["where"] for each in told["hourly"]["mavbench"]] == ["state: planning, sparse"]
     assert [each["lost"] for each in told["map_rows"]] == [1]
 
 
@@ -132,7 +132,7 @@ def test_an_effect_without_an_interval_is_no_number():
 
 def test_failures_an_hour_are_at_the_rate(told):
     (hourly,) = told["hourly"]["mavbench"]
-    assert hourly.per_hour[""][0] == pytest.approx(0.4)
+    assert hourly["per_hour"][""][0] == pytest.approx(0.4)
 
 
 def test_lost_and_longest_missions_have_their_command(told):

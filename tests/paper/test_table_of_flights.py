@@ -4,11 +4,11 @@ import pyarrow as pa
 import pytest
 from made_flights import flight, struck, table
 
-from mavfi_cli.paper.flights import by_value, comparable, flown_missions, pooled, share
+from mavfi_cli.paper.flights import Flights
 
 
 def columns(found, *names):
-    return list(zip(*(found[name].to_pylist() for name in names), strict=True))
+    return list(zip(*(found[name] for name in names), strict=True))
 
 
 def test_each_flight_stands_beside_its_golden_one():
@@ -37,30 +37,30 @@ def test_a_protected_flight_stands_beside_the_same_fault_without_a_detector():
 
 def test_a_shorter_export_has_empty_columns_and_errors_are_no_flights():
     short = {"state": ["flown", "error"], "outcome": ["success", None], "changes": ["{}", "{}"]}
-    found = flown_missions(pa.table(short))
+    found = Flights.of(pa.table(short))
     assert columns(found, "lost", "struck", "world", "check_share") == [(False, False, None, None)]
 
 
 def test_a_mission_of_several_campaigns_is_there_once():
     rows = {"state": ["flown"] * 2, "outcome": ["success"] * 2, "stack": ["ours", "theirs"],
             "changes": ["{}", '{"stack":"theirs"}']}  # fmt: skip
-    tables = [flown_missions(pa.table(rows))] * 2
-    assert pooled(tables).num_rows == 2
-    assert pooled(tables, "ours")["stack"].to_pylist() == ["ours"]
-    assert pooled([]).num_rows == 0
+    tables = [Flights.of(pa.table(rows))] * 2
+    assert len(Flights.pooled(tables)) == 2
+    assert Flights.pooled(tables, "ours")["stack"] == ["ours"]
+    assert len(Flights.pooled([])) == 0
 
 
 def test_flights_are_counted_where_a_column_is_known():
     found = table(flight("a", 20.0), struck("a", 22.0), struck("b", 30.0))
-    assert (share(found, "harmed").count, share(found, "harmed").total) == (1, 2)
-    assert share(found, value=False).count == 3
-    worlds = by_value(found, "world", "level")
-    assert {key: those.num_rows for key, those in worlds.items()} == {
+    assert (found.share("harmed").count, found.share("harmed").total) == (1, 2)
+    assert found.share(value=False).count == 3
+    worlds = found.by("world", "level")
+    assert {key: len(those) for key, those in worlds.items()} == {
         ("sparse", None): 1, ("sparse", "instruction"): 2,
     }  # fmt: skip
 
 
 def test_flights_with_a_part_of_the_stages_are_not_comparable():
     parts = [struck("a", 20.0, detector="gad", protect=each) for each in ("control", "planning")]
-    found = comparable(table(flight("a", 20.0), struck("a", 20.0, detector="aad"), *parts))
-    assert found["detector"].to_pylist() == [None, "aad"]
+    found = table(flight("a", 20.0), struck("a", 20.0, detector="aad"), *parts).comparable
+    assert found["detector"] == [None, "aad"]
