@@ -6,7 +6,7 @@ INTERRUPTED = 130
 
 if __name__ == "__main__":
     try:
-        from sitl.server.main import main
+        from sitl.server import main
     except KeyboardInterrupt:  # before the server handles the signal
         sys.exit(INTERRUPTED)
     sys.exit(main())

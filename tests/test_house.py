@@ -99,7 +99,7 @@ def test_tables_csv_and_pictures_are_made_in_report_only():
     made = (
         r"^\s*(import csv|from csv|from pyarrow import .*csv|from rich\.table|.*import.*matplotlib)"
     )
-    assert mentions(made, room="mavfi_cli.report") == {"sitl.world.draw"}  # the vehicle's own
+    assert mentions(made, room="mavfi_cli.report") == {"sitl.world.plan"}  # the vehicle's own
     assert mentions(r"report\.columns import", room="mavfi_cli.report") <= {
         "mavfi_cli.cli.inventory"
     }

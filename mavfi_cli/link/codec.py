@@ -15,7 +15,7 @@ import hashlib
 import hmac
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from typing import Any
 from pymavlink.dialects.v20 import common as dialect
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.link.added_messages import ADDED
 
 SIGNATURE_LENGTH = 13  # bytes: link id, timestamp, truncated digest
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, start of signing time
@@ -413,3 +412,75 @@ def frame_length(buffer: bytes, position: int, end: int) -> int:
             return 0
         length += 4 + (SIGNATURE_LENGTH if flags else 0)
     return length if position + length <= end else _INCOMPLETE
+
+
+# Messages of MAVLink's newer definitions that pymavlink's `common` dialect lacks. Fields are those
+# of the wire, in its order. Source: https://mavlink.io/en/messages/common.html.
+
+_TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "s": "char"}
+
+
+def _message_class(number: int, name: str, crc_extra: int, **layout: str) -> Any:
+    """Return a message class that the codec treats as one of the dialect's.
+
+    Args:
+        number, name, crc_extra: As in the definition.
+        layout: Fields with their codes of `struct`.
+    """
+    names = list(layout)
+    types = [_TYPES[code[-1]] for code in layout.values()]
+    counts = [int(code[:-1] or 0) for code in layout.values()]
+
+    def build(self: Any, *values: Any) -> None:
+        dialect.MAVLink_message.__init__(self, number, name)
+        for field, kind, value in zip(names, types, values, strict=True):
+            setattr(self, f"_{field}_raw" if kind == "char" else field, value)
+
+    attributes = {
+        "id": number,
+        "msgname": name,
+        "fieldnames": names,
+        "ordered_fieldnames": names,
+        "fieldtypes": types,
+        "lengths": [1 if t == "char" else n or 1 for t, n in zip(types, counts, strict=True)],
+        "array_lengths": counts,
+        "orders": list(range(len(names))),
+        "crc_extra": crc_extra,
+        "unpacker": struct.Struct("<" + "".join(layout.values())),
+        "__init__": build,
+    }
+    return type(f"MAVLink_{name.lower()}_message", (dialect.MAVLink_message,), attributes)
+
+
+ProtocolVersion = _message_class(
+    300, "PROTOCOL_VERSION", 217, version="H", min_version="H", max_version="H",
+    spec_version_hash="8B", library_version_hash="8B",
+)  # fmt: skip
+ComponentMetadata = _message_class(
+    397, "COMPONENT_METADATA", 182, time_boot_ms="I", file_crc="I", uri="100s"
+)
+AvailableModes = _message_class(
+    435, "AVAILABLE_MODES", 134, custom_mode="I", properties="I", number_modes="B", mode_index="B",
+    standard_mode="B", mode_name="35s",
+)  # fmt: skip
+
+ADDED: dict[int, Any] = {
+    message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
+}
+"""Message classes by id."""
+
+CHUNK_LENGTH = 50  # characters of a STATUSTEXT
+
+
+def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Message]:
+    """Yield the STATUSTEXTs of a text in ASCII, with a MAV_SEVERITY and an id in 1 .. 65535.
+
+    A text that fits into one message has id 0. A longer one is sent in chunks with the id, the last
+    of which is shorter than CHUNK_LENGTH (https://mavlink.io/en/messages/common.html#STATUSTEXT).
+    """
+    if len(data) <= CHUNK_LENGTH:
+        yield dialect.MAVLink_statustext_message(severity, data)
+        return
+    for number, start in enumerate(range(0, len(data) + 1, CHUNK_LENGTH)):
+        chunk = data[start : start + CHUNK_LENGTH]
+        yield dialect.MAVLink_statustext_message(severity, chunk, text_id, number)

@@ -1,23 +1,19 @@
-"""Endpoint URLs, such as `udpin:127.0.0.1:14540`: parses them, opens sockets, waits on them."""
+"""Endpoint URLs, such as `udpin:127.0.0.1:14540`: what they name, and who sends there."""
 
 from __future__ import annotations
 
 import errno
 import ipaddress
-import math
 import re
-import select
 import socket
 import time
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Generic, TypeVar
 
-from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.core.errors import EndpointError
+from mavfi_cli.link.codec import Message, dialect
 
-MAX_PEERS = 16  # of one listener
-CHUNK = 1 << 16  # bytes that are received at once
-SMALL_CHUNK = 2048  # bytes that a client of a listener hands over at once, a datagram at most
 _CONNECT_TIMEOUT_S = 5.0
 
 LISTENING = ("udpin", "tcpin")
@@ -160,70 +156,64 @@ def parse_endpoint(url: str) -> Endpoint:
     return Endpoint(url=url, scheme=scheme, host=host or _LOOPBACK, port=port)
 
 
-def text_of(address: Any) -> str:
-    """Return host and port of a socket's address; "" for None."""
-    return "" if address is None else f"{address[0]}:{address[1]}"
+Sender = TypeVar("Sender")
+SILENCE_S = 5.0  # time after which another sender may take a silent one's place
+TWO_AUTOPILOTS = "two autopilots send here"
 
 
-class Receiver(ABC):
-    """An end that waits on its descriptor while nothing can be pulled."""
-
-    url: str
-    datagram = False
-    address = ""
-
-    @property
-    def rival_address(self) -> str:
-        """See `Transport`."""
-        return ""
-
-    def receive(self, timeout_s: float) -> bytes:
-        """See `Transport`."""
-        data = self._pull()
-        if data or timeout_s <= 0.0:
-            return data
-        deadline_s = time.monotonic() + timeout_s
-        while not data and (left_s := deadline_s - time.monotonic()) > 0.0:
-            if not self._await(select.POLLIN, left_s):
-                break
-            data = self._pull()
-        return data
-
-    @abstractmethod
-    def fileno(self) -> int:
-        """See `Transport`."""
-
-    @abstractmethod
-    def _pull(self) -> bytes:
-        """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
-
-    def _await(self, event: int, timeout_s: float) -> bool:
-        """Return True if a poll event or an error occurs within `timeout_s`; inf: without end."""
-        poller = select.poll()
-        poller.register(self.fileno(), event)
-        return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
-
-    def _lost(self, why: object) -> NoReturn:
-        raise LinkLost(f"{self.url}: {why}") from None
+def is_of_autopilot(message: Message) -> bool:
+    """Return True if an autopilot has sent the message, by its component id."""
+    return bool(message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1)
 
 
-class SocketOwner:
-    """Owner of a socket that never blocks."""
+def two_autopilots(address: str, rival_address: str) -> str:
+    """Return the text that tells the senders, also as a STATUSTEXT of a camera."""
+    return f"{TWO_AUTOPILOTS}, {address} and {rival_address}"
 
-    def __init__(self, opened: socket.socket, url: str) -> None:
-        opened.settimeout(0.0)
-        self._socket = opened
-        self.url = url
+
+class SenderSlot(Generic[Sender]):
+    """The place of one sender. Another one may take it after 5 s of silence.
+
+    Args:
+        clock: Monotonic clock, s.
+
+    Attributes:
+        holder: The sender that counts; None before the first.
+        rival: A sender that spoke although the place was taken, and whom the holder has outlived;
+            None without one. An autopilot that restarts at another port has no rival.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.holder: Sender | None = None
+        self.rival: Sender | None = None
+        self._challenger: Sender | None = None
+        self._silent_from_s = 0.0  # then the holder has been silent for too long
 
     @property
-    def port(self) -> int:
-        """Local port. The system chooses it if the URL says 0."""
-        return int(self._socket.getsockname()[1])
+    def is_free(self) -> bool:
+        """True if there is no holder, or if it has been silent for too long."""
+        return self.holder is None or self._clock() >= self._silent_from_s
 
-    def fileno(self) -> int:
-        """See `Transport`."""
-        return self._socket.fileno()
+    def take(self, sender: Sender) -> None:
+        """Give the place to a sender."""
+        self.holder, self._challenger = sender, None
+        self.hears(sender)
 
-    def close(self) -> None:
-        """See `Transport`."""
-        self._socket.close()
+    def leave(self, sender: Sender) -> None:
+        """Free the place if a sender holds it."""
+        if sender == self.holder:
+            self.holder = None
+
+    def hears(self, sender: Sender) -> bool:
+        """Note that a sender has spoken. Return True if it holds the place."""
+        if sender != self.holder:
+            return False
+        if self._challenger is not None:
+            self.rival, self._challenger = self._challenger, None
+        self._silent_from_s = self._clock() + SILENCE_S
+        return True
+
+    def challenge(self, sender: Sender) -> None:
+        """Note that a sender claims a place that is taken."""
+        self._challenger = sender

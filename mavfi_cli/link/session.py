@@ -16,10 +16,9 @@ import numpy as np
 from mavfi_cli.core.errors import LinkError, NoAutopilot, NoCamera, UnfitAutopilot
 from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
-from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.codec import Message, dialect, text_messages
 from mavfi_cli.link.commands import Commands, Ticket
 from mavfi_cli.link.telemetry import Telemetry
-from mavfi_cli.link.texts import text_messages
 
 _IGNORED = (
     dialect.POSITION_TARGET_TYPEMASK_X_IGNORE

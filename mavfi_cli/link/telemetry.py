@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,8 @@ import numpy as np
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
 from mavfi_cli.core.types import FloatArray, VehicleState
-from mavfi_cli.link.codec import Message, dialect
-from mavfi_cli.link.sender_slot import TWO_AUTOPILOTS
-from mavfi_cli.link.texts import Text, TextCollector
+from mavfi_cli.link.codec import CHUNK_LENGTH, Message, dialect
+from mavfi_cli.link.endpoint import TWO_AUTOPILOTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,6 +128,85 @@ _IN_AIR = (
 )
 
 
+_MAX_OPEN = 16
+_MAX_TEXTS = 1000
+_PATIENCE_S = 1.0  # maximum wait for missing chunks
+_GAP = "[...]"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Text:
+    """A complete text of a component."""
+
+    stamp_s: float  # arrival of its last chunk
+    severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
+    text: str
+
+
+@dataclass(slots=True, kw_only=True)
+class _Open:
+    severity: int
+    started_s: float
+    chunks: dict[int, str]
+
+
+class _TextCollector:
+    """Collects texts.
+
+    Attributes:
+        texts: The newest thousand.
+        total: Number of all.
+        open: Texts whose chunks have not all come, by system, component and id.
+    """
+
+    def __init__(self) -> None:
+        self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
+        self.total = 0
+        self.open: dict[tuple[int, int, int], _Open] = {}
+
+    def since(self, total: int) -> list[_Text]:
+        """Return the texts received since `total` had this value."""
+        if total == self.total:
+            return []
+        fresh = min(self.total - total, len(self.texts))
+        return list(self.texts)[len(self.texts) - fresh :]
+
+    def add(self, message: Message, stamp_s: float) -> list[_Text]:
+        """Handle a STATUSTEXT. Return the texts that are complete now."""
+        if message.id == 0:
+            return [self._emit(stamp_s, message.severity, message.text)]
+        done = []
+        key = (message.get_srcSystem(), message.get_srcComponent(), message.id)
+        if key not in self.open:
+            if len(self.open) >= _MAX_OPEN:
+                done.append(self._finish(next(iter(self.open)), stamp_s))
+            self.open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
+        chunks = self.open[key].chunks
+        chunks[message.chunk_seq] = message.text
+        last = max(chunks)
+        if len(chunks[last]) < CHUNK_LENGTH and len(chunks) == last + 1:
+            done.append(self._finish(key, stamp_s))
+        return done
+
+    def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
+        """Close and return texts with chunks missing for longer than the patience, with a gap."""
+        late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
+        return [self._finish(key, stamp_s) for key in late]
+
+    def _finish(self, key: tuple[int, int, int], stamp_s: float) -> _Text:
+        part = self.open.pop(key)
+        last = max(part.chunks)
+        text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
+        if len(part.chunks[last]) >= CHUNK_LENGTH:
+            text += _GAP
+        return self._emit(stamp_s, part.severity, text)
+
+    def _emit(self, stamp_s: float, severity: int, text: str) -> _Text:
+        self.total += 1
+        self.texts.append(_Text(stamp_s=stamp_s, severity=severity, text=text.strip()))
+        return self.texts[-1]
+
+
 class Telemetry:
     """Newest telemetry of one autopilot.
 
@@ -166,7 +245,7 @@ class Telemetry:
         self.home_amsl_m: float | None = None
         self.battery_remaining: float | None = None
         self.battery_voltage_v: float | None = None
-        self.texts = TextCollector()
+        self.texts = _TextCollector()
         self.collision_text: str | None = None
         self.history = _StateHistory()
         self._quaternion: FloatArray | None = None  # body FLU -> ENU
@@ -281,7 +360,7 @@ class Telemetry:
         if self.texts.open:
             self._look_for_verdict(self.texts.expire(self.now_s))
 
-    def _look_for_verdict(self, texts: Iterable[Text]) -> None:
+    def _look_for_verdict(self, texts: Iterable[_Text]) -> None:
         for text in texts:
             if self.collision_text is None and text.text.startswith("Collision"):
                 self.collision_text = text.text

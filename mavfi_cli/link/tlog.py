@@ -17,7 +17,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length, frame_of
-from mavfi_cli.link.sender_slot import two_autopilots
+from mavfi_cli.link.endpoint import two_autopilots
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0

@@ -1,37 +1,51 @@
-"""Transports, opened by URL, that carry bytes to and from one peer."""
+"""Transports, opened by URL, that carry bytes to and from one peer, and listeners for several."""
 
 from __future__ import annotations
 
+import errno
+import math
+import select
 import socket
+import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.link.codec import begins_with_frame
-from mavfi_cli.link.datagrams import UdpListener, UdpTransport
-from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
-from mavfi_cli.link.streams import FirstClient, SerialPort, StreamTransport, TcpListener
+from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.link.codec import Codec, begins_with_frame, frame_length
+from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, is_of_autopilot, parse_endpoint
+
+MAX_PEERS = 16  # of one listener
+_CHUNK = 1 << 16  # bytes that are received at once
+_SMALL_CHUNK = 2048  # bytes that a client of a listener hands over at once, a datagram at most
+_SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
+_BACKLOG = 1 << 16  # bytes that wait for a slow client of a listener
+_MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
+_JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
+_PUMPED = 1000  # datagrams that one pass reads
+_MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 
 
-class Transport(Protocol):
-    """Bytes to and from one peer."""
+class Transport(ABC):
+    """Bytes to and from one peer.
 
-    @property
-    def url(self) -> str:
-        """URL of the endpoint, for error messages."""
+    Attributes:
+        url: URL of the endpoint, for error messages.
+        datagram: True if every `receive` returns whole frames; an argument of `Codec.decode`.
+        address: Address of a network peer, for error messages; "" if unknown.
+    """
 
-    @property
-    def datagram(self) -> bool:
-        """True if every `receive` returns whole frames; an argument of `Codec.decode`."""
-
-    @property
-    def address(self) -> str:
-        """Address of a network peer, for error messages; "" if unknown."""
+    url: str
+    datagram = False
+    address = ""
 
     @property
     def rival_address(self) -> str:
         """Address of an autopilot that sends here beside the peer; "" without one."""
+        return ""
 
+    @abstractmethod
     def send(self, data: bytes) -> None:
         """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed."""
 
@@ -41,12 +55,36 @@ class Transport(Protocol):
         Raises:
             LinkLost: The peer closed the connection, or the device was removed.
         """
+        data = self._pull()
+        if data or timeout_s <= 0.0:
+            return data
+        deadline_s = time.monotonic() + timeout_s
+        while not data and (left_s := deadline_s - time.monotonic()) > 0.0:
+            if not self._await(select.POLLIN, left_s):
+                break
+            data = self._pull()
+        return data
 
+    @abstractmethod
     def fileno(self) -> int:
         """The descriptor that becomes readable when `receive` would return something; -1: none."""
 
+    @abstractmethod
     def close(self) -> None:
         """Release the socket or device. May be called repeatedly."""
+
+    @abstractmethod
+    def _pull(self) -> bytes:
+        """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
+
+    def _await(self, event: int, timeout_s: float) -> bool:
+        """Return True if a poll event or an error occurs within `timeout_s`; inf: without end."""
+        poller = select.poll()
+        poller.register(self.fileno(), event)
+        return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
+
+    def _lost(self, why: object) -> NoReturn:
+        raise LinkLost(f"{self.url}: {why}") from None
 
 
 class Listener(Protocol):
@@ -84,15 +122,15 @@ def open_transport(
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "serial":
-        return SerialPort(endpoint)
+        return _SerialPort(endpoint)
     if endpoint.scheme == "fd":
-        return StreamTransport(endpoint.inherited_socket(), url)
+        return _Stream(endpoint.inherited_socket(), url)
     opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if opened.type == socket.SOCK_DGRAM:
-        return UdpTransport(opened, url, admits if endpoint.scheme == "udpin" else None)
+        return _Udp(opened, url, admits if endpoint.scheme == "udpin" else None)
     if endpoint.scheme == "tcp":
-        return StreamTransport(opened, url)
-    return FirstClient(TcpListener(opened, url))
+        return _Stream(opened, url)
+    return _FirstClient(_TcpListener(opened, url))
 
 
 def open_listener(
@@ -102,24 +140,21 @@ def open_listener(
     allow_unsigned: bool = False,
     admits: Callable[[bytes], bool] = begins_with_frame,
 ) -> Listener:
-    """Open an endpoint that serves several peers.
+    """Open an endpoint that serves several peers, with the arguments and errors of a transport.
 
     Args:
         url, signed, allow_unsigned: As in `open_transport`.
         admits: Tells from the first datagram of an unknown sender whether it becomes a peer.
-
-    Raises:
-        EndpointError: As in `open_transport`.
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "fd":
-        return _OnePeer(StreamTransport(endpoint.inherited_socket(), url, patient=False))
+        return _OnePeer(_Stream(endpoint.inherited_socket(), url, patient=False))
     if endpoint.scheme not in LISTENING:
         return _OnePeer(open_transport(url, signed=signed, allow_unsigned=allow_unsigned))
     opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if endpoint.scheme == "udpin":
-        return UdpListener(opened, url, admits)
-    return TcpListener(opened, url)
+        return _UdpListener(opened, url, admits)
+    return _TcpListener(opened, url)
 
 
 class _OnePeer:
@@ -134,6 +169,365 @@ class _OnePeer:
         return fresh
 
 
+class _SocketOwner:
+    """Owner of a socket that never blocks."""
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        opened.settimeout(0.0)
+        self._socket = opened
+        self.url = url
+
+    @property
+    def port(self) -> int:
+        """Local port. The system chooses it if the URL says 0."""
+        return int(self._socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _text_of(address: Any) -> str:
+    """Return host and port of a socket's address; "" for None."""
+    return "" if address is None else f"{address[0]}:{address[1]}"
+
+
+# Streams ------------------------------------------------------------------------------------------
+
+
+class _Stream(_SocketOwner, Transport):
+    """A connected stream socket with one peer.
+
+    A patient one waits for a slow reader. Any other keeps what the reader's buffer does not take,
+    64 KiB at most, and drops the oldest sends first, so that what arrives is recent.
+    """
+
+    def __init__(
+        self, connection: socket.socket, url: str, *, patient: bool = True, address: str = ""
+    ) -> None:
+        super().__init__(connection, url)
+        self.address = address
+        self._patient = patient
+        self._chunk = _CHUNK if patient else _SMALL_CHUNK
+        self._begun = b""  # rest of a send of which the peer has a part
+        self._waiting: deque[bytes] = deque()
+
+    def send(self, data: bytes) -> None:
+        if self._patient:
+            while data := self._push(data):
+                if not self._await(select.POLLOUT, _SEND_TIMEOUT_S):
+                    self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
+            return
+        self._waiting.append(data)
+        while self._begun or self._waiting:
+            self._begun = self._push(self._begun or self._waiting.popleft())
+            if self._begun:
+                break
+        while sum(map(len, self._waiting)) > _BACKLOG:
+            self._waiting.popleft()
+
+    def _push(self, data: bytes) -> bytes:
+        """Send as much as fits and return the rest."""
+        try:
+            return data[self._socket.send(data) :]
+        except BlockingIOError:
+            return data
+        except OSError as error:
+            self._lost(error.strerror or error)
+
+    def _pull(self) -> bytes:
+        try:
+            data = self._socket.recv(self._chunk)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            self._lost(error.strerror or error)
+        if not data:
+            self._lost("the peer closed the connection")
+        return data
+
+
+class _TcpListener(_SocketOwner):
+    """A port on which every TCP client becomes a peer. Slow readers among them lose frames.
+
+    There are at most MAX_PEERS. The connection of a further client is closed.
+    """
+
+    def __init__(self, opened: socket.socket, url: str) -> None:
+        super().__init__(opened, url)
+        self._peers: list[_Stream] = []
+
+    def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
+        clients: list[_Stream] = []
+        while True:
+            try:
+                connection, address = self._socket.accept()
+            except OSError:  # no client is waiting, or it has disconnected already
+                return clients
+            self._peers = [peer for peer in self._peers if peer.fileno() >= 0]
+            if len(self._peers) >= MAX_PEERS:
+                connection.close()
+                continue
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if not patient:  # the system's buffers would hold telemetry of half a minute
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BACKLOG)
+            clients.append(
+                _Stream(connection, self.url, patient=patient, address=_text_of(address))
+            )
+            self._peers.append(clients[-1])
+
+
+class _FirstClient(Transport):
+    """The first client of a TCP port. Data sent before it connects is lost."""
+
+    def __init__(self, listener: _TcpListener) -> None:
+        self._listener = listener
+        self._client: _Stream | None = None
+        self.url, self.port = listener.url, listener.port
+
+    def _serve(self) -> _Stream | None:
+        if self._client is None:
+            for client in self._listener.accept_ready(patient=True):
+                if self._client is None:
+                    self._client = client
+                else:
+                    client.close()
+        return self._client
+
+    def send(self, data: bytes) -> None:
+        if (client := self._serve()) is not None:
+            client.send(data)
+
+    def _pull(self) -> bytes:
+        client = self._serve()
+        return b"" if client is None else client._pull()
+
+    def fileno(self) -> int:
+        return (self._client or self._listener).fileno()
+
+    def close(self) -> None:
+        self._listener.close()
+        if self._client is not None:
+            self._client.close()
+
+
+class _SerialPort(Transport):
+    """A serial line to one peer, 8N1 without flow control."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        import serial
+
+        self.url = endpoint.url
+        self._failures: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+        try:
+            self._port: Any = serial.Serial(
+                endpoint.device, endpoint.baud, timeout=0, write_timeout=_SEND_TIMEOUT_S,
+                exclusive=True,
+            )  # fmt: skip
+        except (*self._failures, ValueError) as error:
+            raise EndpointError(endpoint.url, _serial_reason(error, endpoint.device)) from None
+
+    def send(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except self._failures as error:
+            self._lost(f"the serial device failed: {error}")
+
+    def _pull(self) -> bytes:
+        try:
+            return bytes(self._port.read(_CHUNK))
+        except self._failures as error:
+            self._lost(f"the serial device failed: {error}")
+
+    def fileno(self) -> int:
+        return int(self._port.fileno())
+
+    def close(self) -> None:
+        self._port.close()
+
+
+def _serial_reason(error: Exception, device: str) -> str:
+    in_use = f"{device} is in use"
+    known = {
+        **dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), f"no such device {device}"),
+        errno.EACCES: f"no permission to open {device}",
+        **dict.fromkeys((errno.EBUSY, errno.EAGAIN), in_use),
+        errno.ENOTTY: f"{device} is not a serial device",
+    }
+    return known.get(
+        getattr(error, "errno", None) or 0, in_use if "lock" in str(error) else str(error)
+    )
+
+
+# Datagrams ----------------------------------------------------------------------------------------
+
+
+class _Udp(_SocketOwner, Transport):
+    """A UDP socket with one peer.
+
+    A connected socket receives from that peer only. Any other takes the first admitted sender, and
+    another one in its place after some silence. Before the first one, everything it sends is lost.
+
+    Args:
+        admits: Tells from its datagram whether a sender becomes the peer; None: it is connected.
+    """
+
+    datagram = True
+
+    def __init__(
+        self, opened: socket.socket, url: str, admits: Callable[[bytes], bool] | None
+    ) -> None:
+        super().__init__(opened, url)
+        self._admits = admits
+        self._slot: SenderSlot[Any] = SenderSlot()
+
+    @property
+    def rival_address(self) -> str:
+        return _text_of(self._slot.rival)
+
+    def send(self, data: bytes) -> None:
+        if self._slot.holder is not None or self._admits is None:
+            _send_datagrams(self._socket, data, self._slot.holder)
+
+    def _pull(self) -> bytes:
+        for _ in range(_PUMPED):
+            data, sender = _receive_datagram(self._socket, _CHUNK)
+            if sender is None or self._admits is None or self._is_peer(data, sender, self._admits):
+                return data
+        return b""
+
+    def _is_peer(self, data: bytes, sender: Any, admits: Callable[[bytes], bool]) -> bool:
+        if self._slot.hears(sender):
+            return True
+        if not admits(data):
+            return False
+        if self._slot.is_free:
+            self._slot.take(sender)
+            self.address = _text_of(sender)
+            return True
+        if any(map(is_of_autopilot, Codec(0, 0).decode(data, datagram=True))):
+            self._slot.challenge(sender)
+        return False
+
+
+def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
+    """Return a datagram, up to a number of bytes, and its sender; b"" and None without one.
+
+    ECONNREFUSED means that nobody listens at the other end of a connected socket. It is not an
+    error for UDP, because the peer may start later.
+    """
+    try:
+        return opened.recvfrom(limit)
+    except OSError:
+        return b"", None
+
+
+def _send_datagrams(opened: socket.socket, data: bytes, peer: Any) -> None:
+    """Send to `peer`, or to the connected address. Data that cannot be sent is lost."""
+    for datagram in _split_frames(data):
+        for _attempt in range(2):  # the first may report the refusal of an earlier datagram
+            try:
+                if peer is None:
+                    opened.send(datagram)
+                else:
+                    opened.sendto(datagram, peer)
+                break
+            except OSError:
+                continue
+
+
+def _split_frames(data: bytes) -> list[bytes]:
+    """Combine well-formed frames into datagrams that fit an Ethernet packet."""
+    if len(data) <= _MTU_PAYLOAD:
+        return [data]
+    datagrams, start, position = [], 0, 0
+    while position < len(data):
+        length = frame_length(data, position, len(data))
+        if position > start and position + length - start > _MTU_PAYLOAD:
+            datagrams.append(data[start:position])
+            start = position
+        position += length
+    datagrams.append(data[start:])
+    return datagrams
+
+
+class _UdpListener(_SocketOwner):
+    """A port on which every admitted sender becomes a peer. All peers share one socket.
+
+    There are at most MAX_PEERS, and while one of them is open nobody else takes its place.
+    """
+
+    def __init__(self, opened: socket.socket, url: str, admits: Callable[[bytes], bool]) -> None:
+        super().__init__(opened, url)
+        self._admits = admits
+        self.peers: dict[Any, _UdpPeer] = {}  # by address
+        self._fresh: list[_UdpPeer] = []
+
+    def accept_ready(self) -> list[_UdpPeer]:
+        self.pump()
+        fresh, self._fresh = [peer for peer in self._fresh if not peer.lost], []
+        return fresh
+
+    def pump(self) -> None:
+        """Distribute the waiting datagrams to their peers."""
+        judged = 0
+        for _ in range(_PUMPED):
+            data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
+            if sender is None:
+                return
+            peer = self.peers.get(sender)
+            if peer is None:
+                if judged == _JUDGED or len(self.peers) >= MAX_PEERS:
+                    continue
+                judged += 1
+                if not self._admits(data):
+                    continue
+                peer = self.peers[sender] = _UdpPeer(self, sender)
+                self._fresh.append(peer)
+            peer.waiting.append(data)
+
+    def send_to(self, data: bytes, address: Any) -> None:
+        _send_datagrams(self._socket, data, address)
+
+    def close(self) -> None:
+        for peer in self.peers.values():
+            peer.lost = True
+        super().close()
+
+
+class _UdpPeer(Transport):
+    datagram = True
+
+    def __init__(self, listener: _UdpListener, address: Any) -> None:
+        self._listener = listener
+        self._address = address
+        self.address = _text_of(address)
+        self.url = listener.url
+        self.waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
+        self.lost = False
+
+    def send(self, data: bytes) -> None:
+        if self.lost:
+            self._lost("this peer was dropped")
+        self._listener.send_to(data, self._address)
+
+    def _pull(self) -> bytes:
+        if not self.waiting:
+            if self.lost:
+                self._lost("this peer was dropped")
+            self._listener.pump()
+        return self.waiting.popleft() if self.waiting else b""
+
+    def fileno(self) -> int:
+        return self._listener.fileno()
+
+    def close(self) -> None:
+        self.lost = True
+        self._listener.peers.pop(self._address, None)
+
+
 # In memory ----------------------------------------------------------------------------------------
 
 
@@ -144,15 +538,12 @@ def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
     return ours, theirs
 
 
-class _MemoryTransport:
+class _MemoryTransport(Transport):
     """One end of a link in memory; made in pairs by `memory_pair`.
 
     Nobody else runs while one end waits. So an end that has nothing to receive first has its
     `on_wait` called, in which the other end can act, and never sleeps.
     """
-
-    datagram = False
-    address = rival_address = ""
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -162,14 +553,17 @@ class _MemoryTransport:
 
     def send(self, data: bytes) -> None:
         if self._peer is None:
-            raise LinkLost(f"{self.url}: the peer closed the connection")
+            self._lost("the peer closed the connection")
         self._peer._arrived.append(data)
 
     def receive(self, timeout_s: float) -> bytes:
         if not self._arrived and self._peer is not None:
             self.on_wait()
+        return self._pull()
+
+    def _pull(self) -> bytes:
         if not self._arrived and self._peer is None:
-            raise LinkLost(f"{self.url}: the peer closed the connection")
+            self._lost("the peer closed the connection")
         data = b"".join(self._arrived)
         self._arrived.clear()
         return data

@@ -93,7 +93,7 @@ class VehicleInProcess(Vehicle):
     """
 
     def __init__(self, config: MissionConfig, folder: Path) -> None:
-        from sitl.server.main import embedded
+        from sitl.server import embedded
 
         super().__init__(folder)
         self._vehicle = embedded(_arguments(config), folder)
@@ -102,7 +102,7 @@ class VehicleInProcess(Vehicle):
     @staticmethod
     def warm_up() -> None:
         """Load and compile all that a vehicle in this process needs."""
-        from sitl.server.main import warm_up
+        from sitl.server import warm_up
 
         warm_up()
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.frames import Vector
-from mavfi_cli.link.codec import dialect
-from mavfi_cli.link.texts import text_messages
+from mavfi_cli.link.codec import dialect, text_messages
 from sitl.autopilot import services
 from sitl.autopilot.commander import (
     GPS_FIX_US,
@@ -21,12 +20,7 @@ from sitl.autopilot.commander import (
 )
 from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
-from sitl.autopilot.setpoint import (
-    Setpoint,
-    no_setpoint,
-)
-from sitl.autopilot.streams import Link, Preset
-from sitl.autopilot.telemetry import Snapshot
+from sitl.autopilot.telemetry import Link, Preset, Setpoint, Snapshot, no_setpoint
 from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
 

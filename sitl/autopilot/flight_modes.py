@@ -15,8 +15,7 @@ import numpy as np
 from mavfi_cli.core.frames import Vector
 from sitl.autopilot.commander import FlightMode
 from sitl.autopilot.parameters import Parameters
-from sitl.autopilot.setpoint import Setpoint
-from sitl.autopilot.telemetry import Snapshot
+from sitl.autopilot.telemetry import Setpoint, Snapshot
 from sitl.vehicle.vehicle import Truth
 
 _POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4

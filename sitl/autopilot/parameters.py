@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,6 @@ from mavfi_cli.link.codec import dialect
 TYPE_INT32: int = dialect.MAV_PARAM_TYPE_INT32
 TYPE_REAL32: int = dialect.MAV_PARAM_TYPE_REAL32
 HASH_NAME = "_HASH_CHECK"
-HASH_INDEX = 65535
 _TABLES = Path(__file__).with_suffix(".toml")
 
 
@@ -62,14 +60,6 @@ def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
     return tuple(sorted(rows, key=lambda row: row.name))
 
 
-class SetResult(Enum):
-    """Result of a PARAM_SET."""
-
-    CHANGED = "changed"
-    UNCHANGED = "unchanged"  # same or rejected value; the answer is the old value
-    IGNORED = "ignored"  # unknown name or wrong type; no answer, as in PX4
-
-
 class Parameters:
     """Parameter values by name and by index.
 
@@ -103,23 +93,24 @@ class Parameters:
         row = self._table[number]
         return float(min(max(self._values[number], row.low), row.high))
 
-    def write(self, name: str, wire_value: float, wire_type: int) -> SetResult:
-        """Store the value of a PARAM_SET, decoded by its type.
+    def write(self, name: str, wire_value: float, wire_type: int) -> bool | None:
+        """Store the value of a PARAM_SET, decoded by its type. Return True if it has changed.
 
+        An unknown name or a wrong type is ignored, as in PX4, and gives None.
         A value that is not finite is rejected (a real PX4 stores it and then hangs). A change of a
         read-only parameter is rejected, too.
         """
         number = self._index.get(name)
         if number is None or wire_type != self._table[number].wire_type:
-            return SetResult.IGNORED
+            return None
         row = self._table[number]
         value: float | int = wire_value
         if row.is_integer:
             (value,) = struct.unpack("<i", struct.pack("<f", wire_value))
         if row.read_only or not math.isfinite(value) or value == self._values[number]:
-            return SetResult.UNCHANGED
+            return False
         self._values[number] = _stored(row, value)
-        return SetResult.CHANGED
+        return True
 
     def message(self, index: int) -> Any:
         """Return the PARAM_VALUE of a valid index."""
@@ -133,7 +124,7 @@ class Parameters:
         for row, value in zip(self._table, self._values, strict=True):
             digest = zlib.crc32(row.name.encode() + row.packed(value), digest)
         wire = _float_of_bytes(struct.pack("<I", digest))
-        return _value_message(HASH_NAME, wire, dialect.MAV_PARAM_TYPE_UINT32, len(self), HASH_INDEX)
+        return _value_message(HASH_NAME, wire, dialect.MAV_PARAM_TYPE_UINT32, len(self), 65535)
 
 
 def _value_message(name: str, wire: float, kind: int, count: int, index: int) -> Any:

@@ -5,90 +5,60 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.commander import GPS_FIX_US, FlightMode, Result, Severity
-from sitl.autopilot.parameters import HASH_INDEX, HASH_NAME, SetResult
-from sitl.autopilot.setpoint import SetpointRefused, global_setpoint, local_setpoint
-from sitl.autopilot.streams import Link
-from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, int32
+from sitl.autopilot.parameters import HASH_NAME
+from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, Link, Setpoint, int32, no_setpoint
+from sitl.geodesy import Origin
 
 if TYPE_CHECKING:
     from sitl.autopilot.autopilot import Autopilot
 
 _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
-_RELATIVE_FRAMES = (3, 6, 10, 11)
-_FARTHEST_M = 1e6
+_FARTHEST_M = 1e6  # a setpoint's larger value counts as not controlled
 _NOT_REQUESTABLE = (dialect.MAVLINK_MSG_ID_MISSION_CURRENT,)  # as in PX4, though streamed
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
-
-# Commands.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Command:
-    """A command from either message. Missing parameters are NaN."""
-
-    message: Any
-    p1: float
-    p2: float
-    p3: float
-    p4: float
-    latitude_deg: float  # p5 of a COMMAND_LONG
-    longitude_deg: float  # p6
-    altitude_m: float  # p7
-    above_home: bool  # altitude above home; otherwise above sea level
+_LOCAL_NED, _BODY_NED = 1, 8
+_ABSOLUTE_ALTITUDE = (0, 5)
+_ABOVE_HOME = (3, 6, 10, 11)  # includes above terrain, because the ground is flat
+_IGNORE_POSITION = 0x0007
+_IGNORE_VELOCITY = 0x0038
+_IGNORE_ACCELERATION = 0x01C0
+_FORCE = 0x0200
+_IGNORE_YAW = 0x0400
+_IGNORE_YAW_RATE = 0x0800
+_STEEPEST = 100.0  # m/s^2 or rad/s
 
 
-_Handler = Callable[["Autopilot", _Command, Link], Result | None]
+def _sender(message: Any) -> tuple[int, int]:
+    return message.get_srcSystem(), message.get_srcComponent()
 
 
-def _command_of(message: Any) -> _Command:
-    if message.get_type() == "COMMAND_LONG":
-        place, above_home = (message.param5, message.param6, message.param7), False
-    else:
-        place = (_degrees(message.x), _degrees(message.y), message.z)
-        above_home = message.frame in _RELATIVE_FRAMES
-    return _Command(
-        message=message, p1=message.param1, p2=message.param2, p3=message.param3,
-        p4=message.param4, latitude_deg=place[0], longitude_deg=place[1], altitude_m=place[2],
-        above_home=above_home,
-    )  # fmt: skip
+# Commands: a handler takes a COMMAND_LONG or COMMAND_INT, and returns the result to acknowledge.
+
+_CommandHandler = Callable[["Autopilot", Any, Link], Result | None]
 
 
-def _degrees(value: int) -> float:
-    return math.nan if value == _INT_UNSET else value * 1e-7
+def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Execute a command for this system by name, and acknowledge it."""
+    if message.target_system != autopilot.system_id:
+        return
+    handler = _COMMANDS.get(message.command)
+    result = Result.UNSUPPORTED if handler is None else handler(autopilot, message, link)
+    if result is not None:
+        link.send(_acknowledge(message, message.command, result))
 
 
 def _acknowledge(message: Any, number: int, result: Result) -> Any:
     """Return the COMMAND_ACK of a command number to the sender of a message."""
-    return dialect.MAVLink_command_ack_message(
-        number, int(result), 0, 0, message.get_srcSystem(), message.get_srcComponent()
-    )
-
-
-def _whole(value: float) -> int | None:
-    """Return an integer parameter; None if it is not an integer."""
-    return int(value) if math.isfinite(value) and value == int(value) else None
-
-
-def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Execute a COMMAND_LONG or COMMAND_INT for this system by name, and acknowledge it."""
-    if message.target_system != autopilot.system_id:
-        return
-    handler = _COMMANDS.get(message.command)
-    result: Result | None = Result.UNSUPPORTED
-    if handler is not None:
-        result = handler(autopilot, _command_of(message), link)
-    if result is not None:
-        link.send(_acknowledge(message, message.command, result))
+    return dialect.MAVLink_command_ack_message(number, int(result), 0, 0, *_sender(message))
 
 
 def refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -104,30 +74,58 @@ def refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
             link.send(autopilot.parameters.message(index))
 
 
-def _arm_disarm(autopilot: Autopilot, command: _Command, _link: Link) -> Result | None:
-    force = _whole(command.p2) == _FORCE_MAGIC
-    if command.p1 == 1.0:
+def _whole(value: float) -> int | None:
+    """Return an integer parameter; None if it is not an integer."""
+    return int(value) if math.isfinite(value) and value == int(value) else None
+
+
+def _horizontal(autopilot: Autopilot, message: Any) -> tuple[float, float] | None:
+    """Return north and east of a command's place, m; None if it has none."""
+    if message.get_type() == "COMMAND_LONG":
+        latitude, longitude = message.param5, message.param6
+    elif _INT_UNSET in (message.x, message.y):
+        return None
+    else:
+        latitude, longitude = message.x * 1e-7, message.y * 1e-7
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return None
+    return autopilot.snapshot.origin.local(latitude, longitude)
+
+
+def _down(autopilot: Autopilot, message: Any) -> float:
+    """Return a command's height as local down, m; NaN if it has none."""
+    is_long = message.get_type() == "COMMAND_LONG"
+    altitude_m = message.param7 if is_long else message.z
+    if not abs(altitude_m) < _FARTHEST_M:
+        return math.nan
+    if not is_long and message.frame in _ABOVE_HOME:
+        return float(autopilot.snapshot.home_ned_m[2]) - float(altitude_m)
+    return autopilot.snapshot.origin.altitude_amsl_m - float(altitude_m)
+
+
+def _arm_disarm(autopilot: Autopilot, message: Any, _link: Link) -> Result | None:
+    force = _whole(message.param2) == _FORCE_MAGIC
+    if message.param1 == 1.0:
         return autopilot.commander.request_arm(force=force)
-    if command.p1 == 0.0:
+    if message.param1 == 0.0:
         return autopilot.commander.request_disarm(force=force)
     autopilot.commander.say(Severity.CRITICAL, "Unsupported ARM_DISARM param")
     return None
 
 
-def _set_mode(autopilot: Autopilot, command: _Command, link: Link) -> Result:
+def _set_mode(autopilot: Autopilot, message: Any, link: Link) -> Result:
     """Answer twice like PX4: its receiver acknowledges first, then its commander decides."""
-    link.send(_acknowledge(command.message, dialect.MAV_CMD_DO_SET_MODE, Result.ACCEPTED))
-    base, main, sub = (_whole(value) for value in (command.p1, command.p2, command.p3))
+    link.send(_acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, Result.ACCEPTED))
+    base, main, sub = map(_whole, (message.param1, message.param2, message.param3))
     if base is None or not base & 1 or main is None:
         return Result.TEMPORARILY_REJECTED
     return autopilot.enter_mode(FlightMode.from_numbers(main, sub or 0))
 
 
-def _takeoff(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
+def _takeoff(autopilot: Autopilot, message: Any, _link: Link) -> Result:
     height = autopilot.parameters.effective("MIS_TAKEOFF_ALT")
-    home_down = float(autopilot.snapshot.home_ned_m[2])
-    target = home_down - height
-    down = _down(autopilot, command)
+    target = float(autopilot.snapshot.home_ned_m[2]) - height
+    down = _down(autopilot, message)
     say = autopilot.commander.say
     if math.isnan(down):
         say(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m")
@@ -138,74 +136,55 @@ def _takeoff(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
     return autopilot.take_off(target)
 
 
-def _down(autopilot: Autopilot, command: _Command) -> float:
-    """Return a command's height as local down, m; NaN if it has none."""
-    if not abs(command.altitude_m) < _FARTHEST_M:
-        return math.nan
-    if command.above_home:
-        return float(autopilot.snapshot.home_ned_m[2]) - command.altitude_m
-    return autopilot.snapshot.origin.altitude_amsl_m - command.altitude_m
-
-
-def _mode_command(mode: FlightMode) -> _Handler:
-    return lambda autopilot, _command, _link: autopilot.enter_mode(mode)
-
-
-def _reposition(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
+def _reposition(autopilot: Autopilot, message: Any, _link: Link) -> Result:
     target = np.array(autopilot.snapshot.truth.position_ned_m)
-    latitude, longitude = command.latitude_deg, command.longitude_deg
-    if math.isfinite(latitude) and math.isfinite(longitude):
-        target[:2] = autopilot.snapshot.origin.local(latitude, longitude)
-    down = _down(autopilot, command)
+    place, down = _horizontal(autopilot, message), _down(autopilot, message)
+    if place is not None:
+        target[:2] = place
     if not math.isnan(down):
         target[2] = down
     if not np.all(np.abs(target) < _FARTHEST_M):
         return Result.DENIED
-    yaw = command.p4 if abs(command.p4) <= math.tau else math.nan
+    yaw = message.param4 if abs(message.param4) <= math.tau else math.nan
     return autopilot.go_to(target, yaw)
 
 
-def _change_speed(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
-    if not 0.0 < command.p2 < _FARTHEST_M:
+def _change_speed(autopilot: Autopilot, message: Any, _link: Link) -> Result:
+    if not 0.0 < message.param2 < _FARTHEST_M:
         return Result.DENIED
-    autopilot.set_parameter("MPC_XY_CRUISE", command.p2)
+    autopilot.set_parameter("MPC_XY_CRUISE", message.param2)
     return Result.ACCEPTED
 
 
-def _terminate(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
-    if command.p1 > 0.5:
+def _terminate(autopilot: Autopilot, message: Any, _link: Link) -> Result:
+    if message.param1 > 0.5:
         autopilot.commander.terminate("Flight termination active")
     return Result.ACCEPTED
 
 
-def _set_home(autopilot: Autopilot, command: _Command, _link: Link) -> Result:
+def _set_home(autopilot: Autopilot, message: Any, _link: Link) -> Result:
     place = np.array(autopilot.snapshot.truth.position_ned_m)
-    if command.p1 != 1.0:
-        latitude, longitude = command.latitude_deg, command.longitude_deg
-        down = _down(autopilot, command)
-        if not all(map(math.isfinite, (latitude, longitude, down))):
+    if message.param1 != 1.0:
+        horizontal, down = _horizontal(autopilot, message), _down(autopilot, message)
+        if horizontal is None or math.isnan(down):
             return Result.DENIED
-        place[:] = *autopilot.snapshot.origin.local(latitude, longitude), down
+        place[:] = *horizontal, down
     if not autopilot.commander.has_gps_fix or not np.all(np.abs(place) < _FARTHEST_M):
         return Result.TEMPORARILY_REJECTED
     autopilot.set_home(place)
     return Result.ACCEPTED
 
 
-def _send(number: int) -> _Handler:
-    return lambda autopilot, _command, link: _send_one(autopilot, number, link)
-
-
-def _request_message(autopilot: Autopilot, command: _Command, link: Link) -> Result:
-    number = _whole(command.p1)
+def _request_message(autopilot: Autopilot, message: Any, link: Link) -> Result:
+    number = _whole(message.param1)
     if number is None or number in _NOT_REQUESTABLE:
         return Result.DENIED
     describe = DESCRIPTIONS.get(number)
     if describe is None:
         return _send_one(autopilot, number, link)
-    messages = describe(autopilot.snapshot, _whole(command.p2) or 0)
-    for message in messages:
-        link.send(message)
+    messages = describe(autopilot.snapshot, _whole(message.param2) or 0)
+    for each in messages:
+        link.send(each)
     return Result.ACCEPTED if messages else Result.DENIED
 
 
@@ -219,16 +198,16 @@ def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
     return Result.ACCEPTED
 
 
-def _set_interval(autopilot: Autopilot, command: _Command, link: Link) -> Result:
-    number = _whole(command.p1)
-    if number is None or not math.isfinite(command.p2):
+def _set_interval(autopilot: Autopilot, message: Any, link: Link) -> Result:
+    number = _whole(message.param1)
+    if number is None or not math.isfinite(message.param2):
         return Result.FAILED
-    known = link.set_interval(number, command.p2, autopilot.snapshot.stamp_us)
+    known = link.set_interval(number, message.param2, autopilot.snapshot.stamp_us)
     return Result.ACCEPTED if known else Result.FAILED
 
 
-def _get_interval(_autopilot: Autopilot, command: _Command, link: Link) -> Result:
-    number = _whole(command.p1)
+def _get_interval(_autopilot: Autopilot, message: Any, link: Link) -> Result:
+    number = _whole(message.param1)
     if number is None or not 0 <= number <= 0xFFFF:
         return Result.FAILED
     interval = link.interval_us(number)
@@ -237,9 +216,9 @@ def _get_interval(_autopilot: Autopilot, command: _Command, link: Link) -> Resul
     return Result.ACCEPTED
 
 
-def _reboot(autopilot: Autopilot, command: _Command, link: Link) -> Result:
+def _reboot(autopilot: Autopilot, message: Any, link: Link) -> Result:
     """Restart the simulation at its start, from the ground or as a wreck."""
-    if _whole(command.p1) != 1 or link.in_lockstep:
+    if _whole(message.param1) != 1 or link.in_lockstep:
         return Result.UNSUPPORTED
     if autopilot.snapshot.stamp_us < GPS_FIX_US:
         return Result.TEMPORARILY_REJECTED  # still booting
@@ -250,49 +229,124 @@ def _reboot(autopilot: Autopilot, command: _Command, link: Link) -> Result:
     return Result.ACCEPTED
 
 
-def _always(result: Result) -> _Handler:
-    return lambda _autopilot, _command, _link: result
-
-
-_COMMANDS: dict[int, _Handler] = {
+_COMMANDS: Mapping[int, _CommandHandler] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
-    dialect.MAV_CMD_NAV_LAND: _mode_command(FlightMode.LAND),
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _mode_command(FlightMode.RTL),
+    dialect.MAV_CMD_NAV_LAND: lambda autopilot, *_: autopilot.enter_mode(FlightMode.LAND),
+    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda autopilot, *_: autopilot.enter_mode(
+        FlightMode.RTL
+    ),
     dialect.MAV_CMD_DO_REPOSITION: _reposition,
     dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
-    dialect.MAV_CMD_GET_HOME_POSITION: _send(dialect.MAVLINK_MSG_ID_HOME_POSITION),
+    dialect.MAV_CMD_GET_HOME_POSITION: lambda autopilot, _message, link: _send_one(
+        autopilot, dialect.MAVLINK_MSG_ID_HOME_POSITION, link
+    ),
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _send(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
+    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda autopilot, _message, link: _send_one(
+        autopilot, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION, link
+    ),
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    dialect.MAV_CMD_RUN_PREARM_CHECKS: _always(Result.ACCEPTED),
-    dialect.MAV_CMD_MISSION_START: _always(Result.DENIED),  # there is no mission
+    dialect.MAV_CMD_RUN_PREARM_CHECKS: lambda *_: Result.ACCEPTED,
+    dialect.MAV_CMD_MISSION_START: lambda *_: Result.DENIED,  # there is no mission
 }
 
 
-# Other messages.
+# Setpoints, by PX4's rules ------------------------------------------------------------------------
 
 
 def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Take a setpoint of SET_POSITION_TARGET_LOCAL_NED or _GLOBAL_INT."""
     now = autopilot.snapshot
-    try:
-        if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
-            setpoint = local_setpoint(message, now.truth.euler_rad[2])
-        else:
-            setpoint = global_setpoint(message, now.origin, float(now.home_ned_m[2]))
-    except SetpointRefused as refusal:
-        autopilot.commander.say(Severity.CRITICAL, str(refusal))
+    setpoint = setpoint_of(
+        message, heading_rad=now.truth.euler_rad[2], origin=now.origin,
+        home_down_m=float(now.home_ned_m[2]),
+    )  # fmt: skip
+    if isinstance(setpoint, str):
+        autopilot.commander.say(Severity.CRITICAL, f"{message.get_type()} {setpoint}")
         return
     silence_us = autopilot.parameters.effective("COM_OF_LOSS_T") * 1e6
     if autopilot.authority.follows(message, link, now.stamp_us, silence_us):
         now.offboard = setpoint
         autopilot.commander.offboard_setpoint_arrived()
+
+
+def setpoint_of(
+    message: Any, *, heading_rad: float, origin: Origin, home_down_m: float
+) -> Setpoint | str:
+    """Return the setpoint of a SET_POSITION_TARGET message, or in words what is not supported.
+
+    Args:
+        message: _LOCAL_NED with frame LOCAL_NED, or BODY_NED, which is rotated by the heading; or
+            _GLOBAL_INT with altitude above sea or home.
+        heading_rad: Present heading of the vehicle from north.
+        origin: Geographic origin of the local frame.
+        home_down_m: Height of home as local down.
+    """
+    frame, mask = message.coordinate_frame, message.type_mask
+    is_local = message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
+    if frame not in ((_LOCAL_NED, _BODY_NED) if is_local else _ABSOLUTE_ALTITUDE + _ABOVE_HOME):
+        return f"coordinate frame {frame} unsupported"
+    if frame == _BODY_NED:
+        mask |= _IGNORE_POSITION  # PX4 accepts positions in the local frame only
+    if problem := _unsupported(mask):
+        return problem
+    out = no_setpoint()
+    if mask & _IGNORE_POSITION != _IGNORE_POSITION:
+        if is_local:
+            place = message.x, message.y, message.z
+        else:
+            down = (home_down_m if frame in _ABOVE_HOME else origin.altitude_amsl_m) - message.alt
+            place = *origin.local(message.lat_int * 1e-7, message.lon_int * 1e-7), down
+        _fill(out, 0, place, mask, _FARTHEST_M)
+    _fill(out, 3, (message.vx, message.vy, message.vz), mask >> 3, _FARTHEST_M)
+    _fill(out, 6, (message.afx, message.afy, message.afz), mask >> 6, _STEEPEST)
+    if not mask & _IGNORE_YAW and math.isfinite(message.yaw):
+        out[9] = math.remainder(message.yaw, math.tau)
+    if not mask & _IGNORE_YAW_RATE and abs(message.yaw_rate) < _STEEPEST:
+        out[10] = message.yaw_rate
+    if frame == _BODY_NED:
+        _turn(out, heading_rad)
+    return out
+
+
+def _unsupported(mask: int) -> str:
+    """Return why a type mask is not supported; "" if it is."""
+    moves = any(mask & each != each for each in (_IGNORE_POSITION, _IGNORE_VELOCITY))
+    accelerates = mask & _IGNORE_ACCELERATION != _IGNORE_ACCELERATION
+    if accelerates and mask & _FORCE:  # the bit gives the acceleration fields' meaning
+        return "force not supported"
+    if moves:
+        return ""
+    return "acceleration without velocity not supported" if accelerates else "invalid"
+
+
+def _fill(
+    out: Setpoint, start: int, values: tuple[float, float, float], ignored: int, limit: float
+) -> None:
+    """Write the components that the mask does not ignore, except NaN and huge values."""
+    for axis, value in enumerate(values):
+        if not ignored >> axis & 1 and abs(value) <= limit:
+            out[start + axis] = value
+
+
+def _turn(out: Setpoint, heading_rad: float) -> None:
+    """Rotate velocity and acceleration from forward-right to north-east."""
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    for start in (3, 6):
+        forward, right = out[start], out[start + 1]
+        if math.isnan(forward) and math.isnan(right):
+            continue
+        forward, right = np.nan_to_num(forward), np.nan_to_num(right)
+        out[start] = cosine * forward - sine * right
+        out[start + 1] = sine * forward + cosine * right
+
+
+# Other messages -----------------------------------------------------------------------------------
 
 
 def _attitude_target(autopilot: Autopilot, _message: Any, _link: Link) -> None:
@@ -323,15 +377,12 @@ def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None
 
 def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Send one parameter by index, or by name if the index is -1; no answer if unknown."""
+    index: int | None = message.param_index
     if message.param_index < 0:
         if message.param_id == HASH_NAME:
             link.send(autopilot.parameters.hash_message())
             return
         index = autopilot.parameters.index(message.param_id)
-    elif message.param_index == HASH_INDEX:
-        index = None
-    else:
-        index = message.param_index
     if index is not None and index < len(autopilot.parameters):
         link.send(autopilot.parameters.message(index))
 
@@ -342,22 +393,18 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
         link.parameters_left.clear()  # the client's cache is valid and needs no list
         return
     store = autopilot.parameters
-    result = store.write(message.param_id, message.param_value, message.param_type)
+    changed = store.write(message.param_id, message.param_value, message.param_type)
     index = store.index(message.param_id)
-    if result is SetResult.IGNORED or index is None:
+    if changed is None or index is None:
         return
     link.send(store.message(index))
-    if result is SetResult.CHANGED:
+    if changed:
         autopilot.broadcast(store.message(index))
 
 
 def _mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer that there are no mission items."""
-    link.send(
-        dialect.MAVLink_mission_count_message(
-            message.get_srcSystem(), message.get_srcComponent(), 0, message.mission_type
-        )
-    )
+    link.send(dialect.MAVLink_mission_count_message(*_sender(message), 0, message.mission_type))
 
 
 def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -367,26 +414,17 @@ def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
         result = dialect.MAV_MISSION_INVALID_SEQUENCE
     elif getattr(message, "count", 0):
         result = dialect.MAV_MISSION_UNSUPPORTED
-    link.send(
-        dialect.MAVLink_mission_ack_message(
-            message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
-        )
-    )
+    link.send(dialect.MAVLink_mission_ack_message(*_sender(message), result, message.mission_type))
 
 
 def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer with a NAK, as there are no files, to stop the client's retries."""
-    request = bytes(message.payload)
-    sequence, session, opcode = struct.unpack_from("<HBB", request)
+    sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
     reply = struct.pack(
         "<HBBBBBxIB", (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0,
         _FTP_FILE_NOT_FOUND,
-    )  # fmt: skip
-    link.send(
-        dialect.MAVLink_file_transfer_protocol_message(
-            0, message.get_srcSystem(), message.get_srcComponent(), reply.ljust(251, b"\0")
-        )
-    )
+    ).ljust(251, b"\0")  # fmt: skip
+    link.send(dialect.MAVLink_file_transfer_protocol_message(0, *_sender(message), reply))
 
 
 def _log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
@@ -404,13 +442,12 @@ def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
 def _ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Echo a broadcast ping with the sender's ids."""
     if message.target_system == 0 and message.target_component == 0:
-        system, component = message.get_srcSystem(), message.get_srcComponent()
-        link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, system, component))
+        link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, *_sender(message)))
 
 
-Service = Callable[["Autopilot", Any, Link], None]
+_Service = Callable[["Autopilot", Any, Link], None]
 
-ADDRESSED: Mapping[int, Service] = {
+ADDRESSED: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: _param_request_list,
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: _param_request_read,
     dialect.MAVLINK_MSG_ID_PARAM_SET: _param_set,
@@ -429,7 +466,7 @@ ADDRESSED: Mapping[int, Service] = {
 }
 """Services by message id, for messages that name the autopilot as their target."""
 
-ANY_TARGET: Mapping[int, Service] = {
+ANY_TARGET: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_TIMESYNC: _timesync,
     dialect.MAVLINK_MSG_ID_PING: _ping,
     dialect.MAVLINK_MSG_ID_SET_MODE: _set_mode_message,

@@ -15,8 +15,7 @@ import numpy as np
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Signing, key_from_file
 from sitl.camera.component import Camera
-from sitl.camera.router import Router
-from sitl.camera.station import PoseTracker, Station, Witness
+from sitl.camera.station import PoseTracker, Router, Station, Witness
 from sitl.command_line import (
     CONTEXT,
     Place,

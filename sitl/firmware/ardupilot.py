@@ -19,7 +19,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
 from mavfi_cli.core.frames import Vector
-from sitl.firmware.process import FirmwareProcess, require_program
+from sitl.firmware.autopilot import FirmwareProcess, require_program
 from sitl.firmware.sensors import Sensors
 from sitl.geodesy import Origin
 from sitl.vehicle.gains import RateLoops

@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import EndpointError, LinkLost, VehicleProcessError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
-from sitl.firmware.process import FirmwareProcess, require_program
+from sitl.firmware.autopilot import FirmwareProcess, require_program
 from sitl.firmware.sensors import Sensors, pressure_altitude_m
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile

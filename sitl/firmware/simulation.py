@@ -15,13 +15,12 @@ import numpy as np
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.link.transport import open_transport
-from sitl.autopilot.streams import TICK_US
+from sitl.autopilot.telemetry import TICK_US
 from sitl.firmware.ardupilot import ArduPilotLink
-from sitl.firmware.autopilot import FirmwareAutopilot
-from sitl.firmware.process import FirmwareProcess
+from sitl.firmware.autopilot import FirmwareAutopilot, FirmwareProcess
 from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
-from sitl.server.simulation import Simulation
+from sitl.simulation import Simulation
 from sitl.vehicle.profile import VehicleProfile
 from sitl.world import World
 

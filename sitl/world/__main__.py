@@ -14,9 +14,8 @@ import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
 from sitl.command_line import CONTEXT, Place, Triple, exit_code
-from sitl.world.check import DEFAULT_CLEARANCE_M, WorldCheck, check_world
-from sitl.world.load import GENERATED, SCENE_FOLDER, load_world, read_scene, scene_toml, world_names
-from sitl.world.world import GeneratorParams, World, show
+from sitl.world.plan import DEFAULT_CLEARANCE_M, WorldCheck, check_world, world_svg
+from sitl.world.world import World, load_world, named_worlds, show
 
 _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
 
@@ -73,28 +72,13 @@ def _world() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 def _list(as_json: bool) -> None:
     """List all named worlds."""
-    rows = [(name, _describe(name)) for name in world_names()]
     if as_json:
-        click.echo(json.dumps([{"name": n, "description": d} for n, d in rows], indent=1))
+        rows = [{"name": name, "description": text} for name, text in named_worlds().items()]
+        click.echo(json.dumps(rows, indent=1))
         return
-    for name, description in rows:
+    for name, description in named_worlds().items():
         click.echo(f"{name:<14}{description}")
     click.echo("\nAlso gen:density,size (such as gen:0.1,4) and the path of a TOML file.")
-
-
-def _describe(name: str) -> str:
-    pair = GENERATED.get(name)
-    if pair is None:
-        return f"fixed scene: {read_scene(SCENE_FOLDER / f'{name}.toml').description}"
-    use = "to train detectors on: " if pair.family == "training" else ""
-    return use + _describe_pair(pair)
-
-
-def _describe_pair(pair: GeneratorParams) -> str:
-    return (
-        f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
-        "of the 10 x 10 m cells"
-    )
 
 
 @_world.command(name="make", epilog=_WORLD_HELP, short_help="Write a world as a TOML file.")
@@ -106,7 +90,7 @@ def _make(
     output: Path | None,
 ) -> None:
     """Write a world as a TOML file of boxes, which every --world option accepts."""
-    text = scene_toml(made)
+    text = made.toml()
     if output is not None:
         write_text(output, text)
     if as_json:
@@ -158,8 +142,6 @@ def _draw(
     with_path: bool,
 ) -> None:
     """Draw a world from above, as SVG."""
-    from sitl.world.draw import world_svg
-
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
     require_output(file, [".svg"])
     path = check_world(made).path_enu_m if with_path else None

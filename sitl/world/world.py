@@ -1,14 +1,29 @@
-"""A world: axis-aligned boxes on flat ground with a start and a goal; and the paper's generator.
+"""A world: axis-aligned boxes on flat ground with a start and a goal, generated or from a file.
 
-The generator has two numbers (paper, section VI-A). With probability `density`, a cell of
+The paper's generator has two numbers (section VI-A). With probability `density`, a cell of
 10 x 10 m contains a `size` x `size` m cuboid of unlimited height at its centre. Each cell draws
 from its own random stream (seed, family, density, size, cell), so a larger area only adds obstacles
 and never moves the others.
+
+A world file is a fixed scene, shipped (`factory`, `farm`) or a user's own:
+
+    name = "yard"                          # optional, default: the file's name
+    bounds_enu_m = [-20, -20, 0, 40, 40, 50]
+    start_enu_m = [0, 0, 0]                # optional
+    goal_enu_m = [30, 30, 5]               # optional
+
+    [[box]]
+    min_enu_m = [10, 10, 0]
+    max_enu_m = [12, 20, 8]
+
+The seed chooses start and goal if they are not given. They have no obstacle within 3 m
+horizontally. The goal is at `flight_height_m` and within `goal_distance_m` of the start. Each seed
+of a fixed scene thus gives a different mission.
 """
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,27 +31,45 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import RecordError, WorldError
+from mavfi_cli.core.config import load_toml, toml_text
+from mavfi_cli.core.errors import RecordError, UnknownName, WorldError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream, generator
 
-START_CLEAR_M = 0.5
-"""Minimum distance of a start from a box, as the vehicle must be able to stand there."""
-
-CELL_M = 10.0
-MARGIN_M = 20.0
 CLEAR_RADIUS_M = 3.0
 """Minimum horizontal distance of an obstacle from start and goal."""
 
-UNLIMITED_HEIGHT_M = 1000.0
-"""Height of an unlimited obstacle; a 300 s mission can climb 900 m at 3 m/s."""
+_START_CLEAR_M = 0.5  # distance of a start from a box, as the vehicle must be able to stand there
+_CELL_M = 10.0
+_MARGIN_M = 20.0
+_UNLIMITED_HEIGHT_M = 1000.0  # a 300 s mission can climb 900 m at 3 m/s
+_CEILING_M = 50.0
+_MAX_SPAN_M = 1000.0
+_TRIES = 2000
 
-CEILING_M = 50.0
-MAX_SPAN_M = 1000.0
+_SCENES = ("factory", "farm")
+_DEFAULT_START_ENU_M = (0.0, 0.0, 0.0)
+_DEFAULT_GOAL_ENU_M = (30.0, 40.0, 5.0)
 
-DEFAULT_START_ENU_M = (0.0, 0.0, 0.0)
-DEFAULT_GOAL_ENU_M = (30.0, 40.0, 5.0)
+
+def show(place: Vector) -> str:
+    """Format a point like (30, 40, 5)."""
+    return "(" + ", ".join(f"{float(c):g}" for c in place) + ")"
+
+
+def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector, *, plan: bool = False) -> Vector:
+    """Return the distance (n,), m, from a point (3,) to each box (n, 6); zero inside.
+
+    In `plan` only the horizontal distance counts.
+    """
+    below = boxes_enu_m[:, :3] - place_enu_m
+    above = place_enu_m - boxes_enu_m[:, 3:]
+    apart = np.maximum(0.0, np.maximum(below, above))
+    if plan:
+        apart[:, 2] = 0.0
+    gaps: Vector = np.linalg.norm(apart, axis=1)
+    return gaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,20 +93,31 @@ class World:
             array = np.array(getattr(self, field), dtype=np.float64).reshape(shape)
             array.flags.writeable = False
             object.__setattr__(self, field, array)
-        _refuse_bad_boxes(self)
+        if not np.isfinite(self.boxes_enu_m).all():
+            raise WorldError(f"world {self.name!r}: a box has a coordinate that is not finite")
+        flat = (self.boxes_enu_m[:, 3:] <= self.boxes_enu_m[:, :3]).any(axis=1)
+        if flat.any():
+            raise WorldError(f"world {self.name!r}: box {int(flat.argmax())} has max <= min")
         for what, place in (("start", self.start_enu_m), ("goal", self.goal_enu_m)):
-            refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
+            _refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
 
     def as_json(self) -> dict[str, Any]:
         """Return the world for a record, lengths in m."""
+        arrays = ("bounds", "start", "goal", "boxes")
         return {
             "name": self.name,
             "seed": self.seed,
-            "bounds": self.bounds_enu_m.tolist(),
-            "start": self.start_enu_m.tolist(),
-            "goal": self.goal_enu_m.tolist(),
-            "boxes": self.boxes_enu_m.tolist(),
+            **{key: getattr(self, f"{key}_enu_m").tolist() for key in arrays},
         }
+
+    def toml(self) -> str:
+        """Return the text of a world file, which reads back as the same world."""
+        places = {
+            key: getattr(self, key).tolist()
+            for key in ("bounds_enu_m", "start_enu_m", "goal_enu_m")
+        }
+        boxes = [{"min_enu_m": box[:3], "max_enu_m": box[3:]} for box in self.boxes_enu_m.tolist()]
+        return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
         """Write what a companion knows before the first message: start, goal, bounds and camera.
@@ -98,20 +142,12 @@ class World:
         write_json(folder / "briefing.json", briefing)
 
 
-def _refuse_bad_boxes(world: World) -> None:
-    if not np.isfinite(world.boxes_enu_m).all():
-        raise WorldError(f"world {world.name!r}: a box has a coordinate that is not finite")
-    flat = (world.boxes_enu_m[:, 3:] <= world.boxes_enu_m[:, :3]).any(axis=1)
-    if flat.any():
-        raise WorldError(f"world {world.name!r}: box {int(flat.argmax())} has max <= min")
-
-
-def refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
+def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
     """Raise WorldError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
 
     A start is blocked if a box (n, 6) is too near to stand there, a goal if it is inside a box.
     """
-    if not inside(bounds, place):
+    if not _inside(bounds, place):
         raise WorldError(
             f"world {name!r}: {what} {show(place)} is outside the world, which reaches "
             f"from {show(bounds[:3])} to {show(bounds[3:])} m"
@@ -119,10 +155,10 @@ def refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place:
     gaps = distance_to_boxes(boxes, place)
     if not gaps.size:
         return
-    if what == "start" and gaps.min() < START_CLEAR_M:
+    if what == "start" and gaps.min() < _START_CLEAR_M:
         raise WorldError(
             f"world {name!r}: start {show(place)} is blocked: box {int(gaps.argmin())} is "
-            f"{gaps.min():.2f} m away, {START_CLEAR_M:g} m needed"
+            f"{gaps.min():.2f} m away, {_START_CLEAR_M:g} m needed"
         )
     if what == "goal" and gaps.min() <= 0.0:
         raise WorldError(
@@ -130,34 +166,76 @@ def refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place:
         )
 
 
-def show(place: Vector) -> str:
-    """Format a point like (30, 40, 5)."""
-    return "(" + ", ".join(f"{float(c):g}" for c in place) + ")"
-
-
-def inside(bounds_enu_m: Vector, place_enu_m: Vector) -> bool:
+def _inside(bounds_enu_m: Vector, place_enu_m: Vector) -> bool:
     """Return True if a point (3,) is within the bounds (6,) or on a face; NaN is outside."""
     return bool((place_enu_m >= bounds_enu_m[:3]).all() and (place_enu_m <= bounds_enu_m[3:]).all())
 
 
-def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector) -> Vector:
-    """Return the distance (n,), m, from a point (3,) to each box (n, 6); zero inside."""
-    below = boxes_enu_m[:, :3] - place_enu_m
-    above = place_enu_m - boxes_enu_m[:, 3:]
-    gaps: Vector = np.linalg.norm(np.maximum(0.0, np.maximum(below, above)), axis=1)
-    return gaps
+def load_world(
+    name_or_path: str,
+    *,
+    seed: int,
+    start_enu_m: Sequence[float] | Vector | None = None,
+    goal_enu_m: Sequence[float] | Vector | None = None,
+) -> World:
+    """Load a world by name, `gen:density,size` or TOML file for one seed.
+
+    Args:
+        name_or_path: One of `named_worlds()`, a generator spec, or a path ending in `.toml`.
+        seed: Non-negative seed. The same seed always gives the same world.
+        start_enu_m: Start of the flight (3,), m; default: the world's own.
+        goal_enu_m: Goal of the flight (3,), m; default: the world's own.
+
+    Raises:
+        UnknownName: No world has this name. Suggests the nearest.
+        WorldError: Start or goal is outside or blocked, or the generator spec is invalid.
+        ConfigError: The file cannot be used. Names file, line and key.
+    """
+    if seed < 0:
+        raise WorldError(f"seed {seed} is negative")
+    start, goal = _place("start", start_enu_m), _place("goal", goal_enu_m)
+    pair = _GENERATED.get(name_or_path) or _pair_of_spec(name_or_path)
+    if pair is not None:
+        start = np.array(_DEFAULT_START_ENU_M) if start is None else start
+        goal = np.array(_DEFAULT_GOAL_ENU_M) if goal is None else goal
+        return _generate(name_or_path, pair, seed, start, goal)
+    if name_or_path in _SCENES:
+        return _world_of_scene(_shipped(name_or_path), name_or_path, seed, start, goal)
+    if not (name_or_path.endswith(".toml") or "/" in name_or_path):
+        raise UnknownName("world", name_or_path, named_worlds())
+    scene = load_toml(Path(name_or_path), _Scene)
+    return _world_of_scene(scene, scene.name or Path(name_or_path).stem, seed, start, goal)
 
 
-def plan_distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector) -> Vector:
-    """Return the horizontal distance (n,), m, from a point to each box; zero above or inside."""
-    flat = boxes_enu_m.copy()
-    flat[:, 2], flat[:, 5] = -np.inf, np.inf
-    place = np.array([place_enu_m[0], place_enu_m[1], 0.0])
-    return distance_to_boxes(flat, place)
+def named_worlds() -> dict[str, str]:
+    """Return descriptions of all named worlds by their names, evaluation worlds first."""
+    towers = {
+        name: f"towers of {pair.size_m:g} x {pair.size_m:g} m in {100 * pair.density:g} % "
+        "of the 10 x 10 m cells"
+        for name, pair in _GENERATED.items()
+    }
+    trained = {name: text for name, text in towers.items() if name.startswith("train-")}
+    return {
+        **{name: text for name, text in towers.items() if name not in trained},
+        **{name: f"fixed scene: {_shipped(name).description}" for name in _SCENES},
+        **{name: f"to train detectors on: {text}" for name, text in trained.items()},
+    }
+
+
+def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
+    if place is None:
+        return None
+    array = np.asarray(place, dtype=np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise WorldError(f"{what} must be three finite numbers (east, north, up in m)")
+    return array
+
+
+# Generated worlds ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GeneratorParams:
+class _Pair:
     """The generator's two numbers and the family of the random streams."""
 
     density: float  # probability that a cell contains an obstacle
@@ -167,58 +245,68 @@ class GeneratorParams:
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
             raise WorldError(f"density {self.density:g} is not a probability (0 to 1)")
-        if not 0.0 < self.size_m <= CELL_M:
-            raise WorldError(f"size {self.size_m:g} m does not fit a cell (above 0, to {CELL_M:g})")
+        if not 0.0 < self.size_m <= _CELL_M:
+            raise WorldError(
+                f"size {self.size_m:g} m does not fit a cell (above 0, to {_CELL_M:g})"
+            )
 
 
-def generate(
-    name: str, pair: GeneratorParams, seed: int, start_enu_m: Vector, goal_enu_m: Vector
-) -> World:
-    """Generate the world of a pair and a seed between a start (3,) and a goal (3,), ENU m.
+# Pairs of the paper (section VI-A): two for evaluation, four for training.
+_GENERATED = {
+    "sparse": _Pair(density=0.05, size_m=3.0),
+    "dense": _Pair(density=0.2, size_m=5.0),
+    **{
+        f"train-{density:g}-{size:g}": _Pair(density=density, size_m=size, family="training")
+        for density in (0.05, 0.2)
+        for size in (3.0, 5.0)
+    },
+}
+
+
+def _pair_of_spec(text: str) -> _Pair | None:
+    """Parse `gen:density,size`. Return None if the text is not such a spec."""
+    if not text.startswith("gen:"):
+        return None
+    try:
+        density, size = (float(part) for part in text.removeprefix("gen:").split(","))
+    except ValueError:
+        raise WorldError(f"{text!r}: expected gen:density,size, such as gen:0.2,5") from None
+    return _Pair(density=density, size_m=size)
+
+
+def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) -> World:
+    """Generate a world between a start (3,) and a goal (3,), ENU m.
 
     The area contains start and goal with a margin of at least 20 m, in whole cells.
 
     Raises:
         WorldError: Start and goal are more than 1000 m apart along an axis, or unusable.
     """
-    bounds = _area(start_enu_m, goal_enu_m)
+    places = np.array([start, goal])
+    if (np.ptp(places, axis=0) > _MAX_SPAN_M).any():
+        raise WorldError(
+            f"start {show(start)} and goal {show(goal)} must be at most "
+            f"{_MAX_SPAN_M:g} m apart along each axis"
+        )
+    low = np.floor((places.min(axis=0) - _MARGIN_M) / _CELL_M)[:2]
+    high = np.ceil((places.max(axis=0) + _MARGIN_M) / _CELL_M)[:2]
     boxes = np.array(
         [
             _cuboid(i, j, pair.size_m)
-            for i in _cells(bounds[0], bounds[3])
-            for j in _cells(bounds[1], bounds[4])
+            for i in range(int(low[0]), int(high[0]))
+            for j in range(int(low[1]), int(high[1]))
             if _occupied(pair, seed, i, j)
         ]
     ).reshape(-1, 6)
-    for place in (start_enu_m, goal_enu_m):
-        boxes = boxes[plan_distance_to_boxes(boxes, place) >= CLEAR_RADIUS_M]
+    for place in (start, goal):
+        boxes = boxes[distance_to_boxes(boxes, place, plan=True) >= CLEAR_RADIUS_M]
     return World(
-        name=name,
-        seed=seed,
-        boxes_enu_m=boxes,
-        bounds_enu_m=bounds,
-        start_enu_m=start_enu_m,
-        goal_enu_m=goal_enu_m,
-    )
+        name=name, seed=seed, boxes_enu_m=boxes, start_enu_m=start, goal_enu_m=goal,
+        bounds_enu_m=np.array([*low * _CELL_M, 0.0, *high * _CELL_M, _CEILING_M]),
+    )  # fmt: skip
 
 
-def _area(start_enu_m: Vector, goal_enu_m: Vector) -> Vector:
-    places = np.array([start_enu_m, goal_enu_m])
-    if not np.isfinite(places).all() or (np.ptp(places, axis=0) > MAX_SPAN_M).any():
-        raise WorldError(
-            f"start {show(start_enu_m)} and goal {show(goal_enu_m)} must be at most "
-            f"{MAX_SPAN_M:g} m apart along each axis"
-        )
-    low = np.floor((places.min(axis=0) - MARGIN_M) / CELL_M) * CELL_M
-    high = np.ceil((places.max(axis=0) + MARGIN_M) / CELL_M) * CELL_M
-    return np.array([low[0], low[1], 0.0, high[0], high[1], CEILING_M])
-
-
-def _cells(low_m: float, high_m: float) -> range:
-    return range(math.floor(low_m / CELL_M), math.ceil(high_m / CELL_M))
-
-
-def _occupied(pair: GeneratorParams, seed: int, i: int, j: int) -> bool:
+def _occupied(pair: _Pair, seed: int, i: int, j: int) -> bool:
     stream = generator(
         seed, Stream.WORLD, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
     )
@@ -226,5 +314,96 @@ def _occupied(pair: GeneratorParams, seed: int, i: int, j: int) -> bool:
 
 
 def _cuboid(i: int, j: int, size_m: float) -> list[float]:
-    x, y, half = (i + 0.5) * CELL_M, (j + 0.5) * CELL_M, size_m / 2.0
-    return [x - half, y - half, 0.0, x + half, y + half, UNLIMITED_HEIGHT_M]
+    x, y, half = (i + 0.5) * _CELL_M, (j + 0.5) * _CELL_M, size_m / 2.0
+    return [x - half, y - half, 0.0, x + half, y + half, _UNLIMITED_HEIGHT_M]
+
+
+# Fixed scenes -------------------------------------------------------------------------------------
+
+_Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Box:
+    """One obstacle with its corners in ENU, m."""
+
+    min_enu_m: _Triple
+    max_enu_m: _Triple
+
+    def __post_init__(self) -> None:
+        if any(high <= low for low, high in zip(self.min_enu_m, self.max_enu_m, strict=True)):
+            raise ValueError("max_enu_m must be beyond min_enu_m along each axis")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Scene:
+    bounds_enu_m: tuple[float, float, float, float, float, float]
+    name: str = ""
+    description: str = ""
+    start_enu_m: _Triple | None = None
+    goal_enu_m: _Triple | None = None
+    flight_height_m: float = 5.0
+    goal_distance_m: tuple[float, float] = (45.0, 55.0)  # horizontal limits, start to goal
+    box: list[_Box] = dataclasses.field(default_factory=list)
+
+
+def _shipped(name: str) -> _Scene:
+    return load_toml(Path(__file__).parent / "scenes" / f"{name}.toml", _Scene)
+
+
+def _world_of_scene(
+    scene: _Scene, name: str, seed: int, start: Vector | None, goal: Vector | None
+) -> World:
+    """Return the world of a scene. A given start or goal replaces the scene's own.
+
+    Raises:
+        WorldError: Start or goal is unusable, or the seed finds no clear position for it.
+    """
+    boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
+    bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
+    if (bounds[3:] <= bounds[:3]).any():
+        raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
+    start = _place("start", scene.start_enu_m) if start is None else start
+    goal = _place("goal", scene.goal_enu_m) if goal is None else goal
+    if start is None or goal is None:
+        for what, place in (("start", start), ("goal", goal)):
+            if place is not None:
+                _refuse_bad_place(name, boxes, bounds, what, place)
+        start, goal = _choose(scene, name, seed, boxes, bounds, start, goal)
+    return World(
+        name=name, seed=seed, boxes_enu_m=boxes, bounds_enu_m=bounds, start_enu_m=start,
+        goal_enu_m=goal,
+    )  # fmt: skip
+
+
+def _choose(
+    scene: _Scene,
+    name: str,
+    seed: int,
+    boxes: Vector,
+    bounds: Vector,
+    start: Vector | None,
+    goal: Vector | None,
+) -> tuple[Vector, Vector]:
+    """Draw missing start and goal until they are clear and at the scene's distance."""
+    stream = generator(seed, Stream.WORLD, "places", scene.name)
+    least, most = scene.goal_distance_m
+    low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
+    for _ in range(_TRIES):
+        plan = np.round(stream.uniform(low, np.maximum(low, high), size=(2, 2)), 1)
+        from_ = start if start is not None else np.array([*plan[0], bounds[2]])
+        to = goal if goal is not None else np.array([*plan[1], scene.flight_height_m])
+        drawn = [p for p, known in ((from_, start), (to, goal)) if known is None]
+        if least <= float(np.hypot(*(to - from_)[:2])) <= most and all(
+            _is_clear(boxes, bounds, place) for place in drawn
+        ):
+            return from_, to
+    raise WorldError(
+        f"world {name!r}, seed {seed}: no clear start and goal {least:g} to {most:g} m apart; "
+        "give start_enu_m and goal_enu_m"
+    )
+
+
+def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
+    gaps = distance_to_boxes(boxes, place, plan=True)
+    return _inside(bounds, place) and bool((gaps >= CLEAR_RADIUS_M).all())

@@ -256,7 +256,7 @@ def test_several_clients_of_one_listener_are_kept_apart() -> None:
 
 @pytest.mark.parametrize(("scheme", "caller"), [("udpin", "udpout"), ("tcpin", "tcp")])
 def test_a_full_listener_welcomes_somebody_once_a_peer_has_left(scheme: str, caller: str) -> None:
-    from mavfi_cli.link.endpoint import MAX_PEERS
+    from mavfi_cli.link.transport import MAX_PEERS
 
     listener = open_listener(f"{scheme}:127.0.0.1:0")
     url = f"{caller}:127.0.0.1:{listener.port}"  # type: ignore[attr-defined]

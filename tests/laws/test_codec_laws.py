@@ -9,8 +9,7 @@ from typing import Any
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from mavfi_cli.link.added_messages import ADDED
-from mavfi_cli.link.codec import MAX_FRAME_LENGTH, Codec, Message, dialect
+from mavfi_cli.link.codec import ADDED, MAX_FRAME_LENGTH, Codec, Message, dialect
 
 _RANGES = {"b": 8, "h": 16, "i": 32, "q": 64}
 CLASSES = sorted(dialect.mavlink_map.values(), key=lambda cls: cls.id)

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.world import load_world
-from sitl.world.world import CLEAR_RADIUS_M, distance_to_boxes, plan_distance_to_boxes
+from sitl.world.world import CLEAR_RADIUS_M, distance_to_boxes
 
 seeds = st.integers(0, 2**40)
 names = st.sampled_from(["sparse", "dense", "factory", "farm", "train-0.05-5", "gen:0.6,7.5"])
@@ -32,7 +32,7 @@ def test_moving_the_goal_moves_no_obstacle(seed: int, one: tuple, two: tuple) ->
         boxes = world.boxes_enu_m
         common = ((boxes[:, :2] >= low) & (boxes[:, 3:5] <= high)).all(axis=1)
         for goal in (one, two):
-            common &= plan_distance_to_boxes(boxes, np.array(goal)) >= CLEAR_RADIUS_M
+            common &= distance_to_boxes(boxes, np.array(goal), plan=True) >= CLEAR_RADIUS_M
         kept.append({tuple(box) for box in boxes[common].tolist()})
     assert kept[0] == kept[1]
 
@@ -44,7 +44,7 @@ def test_start_and_goal_are_clear_and_inside(name: str, seed: int) -> None:
     for place in (world.start_enu_m, world.goal_enu_m):
         assert (place >= world.bounds_enu_m[:3]).all()
         assert (place <= world.bounds_enu_m[3:]).all()
-        assert (plan_distance_to_boxes(world.boxes_enu_m, place) >= CLEAR_RADIUS_M).all()
+        assert (distance_to_boxes(world.boxes_enu_m, place, plan=True) >= CLEAR_RADIUS_M).all()
 
 
 @given(seeds, places)

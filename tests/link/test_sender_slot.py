@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.link.sender_slot import SILENCE_S, SenderSlot
+from mavfi_cli.link.endpoint import SILENCE_S, SenderSlot
 
 
 @pytest.fixture

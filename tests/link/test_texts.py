@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.link.codec import Codec
-from mavfi_cli.link.texts import text_messages
+from mavfi_cli.link.codec import Codec, text_messages
 
 printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=200)
 

@@ -11,7 +11,7 @@ from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.mission.vehicle import Vehicle, VehicleProcess
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
-from sitl.server.simulation import Simulation
+from sitl.simulation import Simulation
 
 FAULT = FaultConfig(target="command_velocity", at="time=1", together=True, field="exponent", seed=2)
 FILES = ("flight.tlog", "trace.parquet", "plans.parquet", "kernels.parquet")

@@ -5,7 +5,7 @@ import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
 from sitl.autopilot.autopilot import Autopilot
-from sitl.autopilot.streams import TICK_US, Preset
+from sitl.autopilot.telemetry import TICK_US, Preset
 from sitl.vehicle.vehicle import Truth
 
 NAN = math.nan

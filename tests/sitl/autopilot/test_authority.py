@@ -72,7 +72,7 @@ def test_a_flood_of_mistakes_is_not_one_of_texts(bench, velocity_target):
 
 @pytest.mark.parametrize("number", [0, 2, 3])
 def test_a_reboot_is_only_that_of_the_autopilot(make_bench, number):
-    from sitl.autopilot.streams import Preset
+    from sitl.autopilot.telemetry import Preset
 
     bench = make_bench(Preset.GCS)
     bench.run(5.0)
@@ -82,7 +82,7 @@ def test_a_reboot_is_only_that_of_the_autopilot(make_bench, number):
 
 
 def test_a_reboot_needs_a_vehicle_that_is_disarmed_or_lost(make_bench):
-    from sitl.autopilot.streams import Preset
+    from sitl.autopilot.telemetry import Preset
 
     bench = make_bench(Preset.GCS)
     bench.command(246, 1)

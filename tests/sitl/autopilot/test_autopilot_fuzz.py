@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.link.codec import Codec, dialect
-from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry import Preset
 
 _INTEGERS = {
     "uint8_t": (0, 255), "int8_t": (-128, 127), "uint16_t": (0, 65535),

@@ -3,7 +3,7 @@ import math
 import pytest
 
 from mavfi_cli.link.codec import dialect as d
-from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry import Preset
 
 NAN = math.nan
 REQUEST, SET, GET = (

@@ -6,7 +6,7 @@ import pytest
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.commander import FlightMode
-from sitl.autopilot.streams import STEP_US, TICK_US, Preset
+from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
 
 
 def requested(bench, number, *parameters):
@@ -21,7 +21,6 @@ def requested(bench, number, *parameters):
     [
         (264, "FLIGHT_INFORMATION"),
         (300, "PROTOCOL_VERSION"),
-        (395, "COMPONENT_INFORMATION"),
         (397, "COMPONENT_METADATA"),
     ],
 )

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.link.codec import Codec, dialect
-from sitl.autopilot.parameters import TYPE_INT32, TYPE_REAL32, Parameters, SetResult
+from sitl.autopilot.parameters import TYPE_INT32, TYPE_REAL32, Parameters
 
 
 def bytewise(value, form="<i"):
@@ -51,20 +51,20 @@ def test_reals_come_back_as_stored(value):
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_refused(value):
     store = Parameters(1)
-    assert store.write("MPC_XY_VEL_MAX", value, TYPE_REAL32) is SetResult.UNCHANGED
+    assert store.write("MPC_XY_VEL_MAX", value, TYPE_REAL32) is False
     assert store.value("MPC_XY_VEL_MAX") == 12.0
 
 
 def test_unknown_name_and_wrong_type_are_ignored():
     store = Parameters(1)
-    assert store.write("NO_SUCH", 1.0, TYPE_REAL32) is SetResult.IGNORED
-    assert store.write("MPC_XY_VEL_MAX", 5.0, TYPE_INT32) is SetResult.IGNORED
+    assert store.write("NO_SUCH", 1.0, TYPE_REAL32) is None
+    assert store.write("MPC_XY_VEL_MAX", 5.0, TYPE_INT32) is None
     assert store.value("MPC_XY_VEL_MAX") == 12.0
 
 
 def test_system_id_is_read_only():
     store = Parameters(7)
-    assert store.write("MAV_SYS_ID", bytewise(9), TYPE_INT32) is SetResult.UNCHANGED
+    assert store.write("MAV_SYS_ID", bytewise(9), TYPE_INT32) is False
     assert store.value("MAV_SYS_ID") == 7
 
 
@@ -112,7 +112,7 @@ def test_read_by_name_and_index_and_silence_for_the_rest(bench):
 
 
 def test_set_is_answered_twice_and_others_hear_it_once(bench):
-    from sitl.autopilot.streams import Preset
+    from sitl.autopilot.telemetry import Preset
 
     other = bench.autopilot.open_link(Preset.GCS)
     bench.send(dialect.MAVLink_param_set_message(1, 1, b"MPC_XY_CRUISE", 7.0, TYPE_REAL32))

@@ -3,8 +3,7 @@ from collections import Counter
 
 import pytest
 
-from sitl.autopilot.streams import Preset
-from sitl.autopilot.telemetry import BUILDERS
+from sitl.autopilot.telemetry import BUILDERS, Preset
 
 WIRE_RATES = {
     Preset.ONBOARD: {

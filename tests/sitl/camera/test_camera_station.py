@@ -18,8 +18,7 @@ from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport, open_transport
 from sitl.camera.__main__ import main
 from sitl.camera.component import Camera
-from sitl.camera.router import Router
-from sitl.camera.station import PoseTracker, Station, Witness
+from sitl.camera.station import PoseTracker, Router, Station, Witness
 from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import regression_power
 from sitl.world import load_world

@@ -9,7 +9,7 @@ import pytest
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
-from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry import Preset
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.vehicle.vehicle import Truth
 from tests.sitl.firmware.recorded import PX4_HEARTBEAT, PX4_POSITION

@@ -13,7 +13,7 @@ from live_processes import gone
 
 from mavfi_cli.core.errors import EndpointError, VehicleProcessError
 from sitl.firmware import px4
-from sitl.firmware.process import FirmwareProcess
+from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
 from sitl.firmware.simulation import FirmwareSimulation

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import WorldError
-from sitl.world.check import check_world
+from sitl.world.plan import check_world
 from sitl.world.world import World, distance_to_boxes
 
 WALL = [10.0, -20.0, 0.0, 11.0, 20.0, 20.0]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName, WorldError
-from sitl.world import load_world, world_names
-from sitl.world.check import check_world
-from sitl.world.load import scene_toml
-from sitl.world.world import CLEAR_RADIUS_M, plan_distance_to_boxes
+from sitl.world import load_world, named_worlds
+from sitl.world.plan import check_world
+from sitl.world.world import CLEAR_RADIUS_M, distance_to_boxes
 
 YARD = """name = "yard"
 bounds_enu_m = [-10, -10, 0, 40, 40, 30]
@@ -40,7 +39,7 @@ def test_a_users_world_is_what_its_file_says(yard: Path) -> None:
 def test_a_world_written_and_read_back_is_the_same(name: str, tmp_path: Path) -> None:
     world = load_world(name, seed=11)
     path = tmp_path / "made.toml"
-    path.write_text(scene_toml(world))
+    path.write_text(world.toml())
     again = load_world(str(path), seed=11)
     assert again.name == name
     for field in ("boxes_enu_m", "bounds_enu_m", "start_enu_m", "goal_enu_m"):
@@ -57,7 +56,7 @@ def test_a_hundred_seeds_of_a_scene_are_a_hundred_flyable_missions(name: str) ->
         assert 45.0 <= found.straight_m <= 55.0
         assert found.path_exists
         for place in (world.start_enu_m, world.goal_enu_m):
-            assert plan_distance_to_boxes(world.boxes_enu_m, place).min() >= CLEAR_RADIUS_M
+            assert distance_to_boxes(world.boxes_enu_m, place, plan=True).min() >= CLEAR_RADIUS_M
 
 
 def test_nothing_in_the_farm_reaches_flight_height() -> None:
@@ -83,7 +82,7 @@ def test_arrays_cannot_be_written_to() -> None:
 
 
 def test_every_name_loads() -> None:
-    for name in world_names():
+    for name in named_worlds():
         assert load_world(name, seed=0).name == name
 
 

@@ -13,7 +13,7 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
-from sitl.autopilot.streams import STEP_US, STEPS_A_TICK, TICK_US
+from sitl.autopilot.telemetry import STEP_US, STEPS_A_TICK, TICK_US
 from sitl.camera.component import Camera
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.referee import Referee

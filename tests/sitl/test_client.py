@@ -4,9 +4,9 @@ import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import memory_pair
-from sitl.autopilot.streams import Preset
-from sitl.server.client import Client
-from sitl.server.simulation import Simulation
+from sitl.autopilot.telemetry import Preset
+from sitl.server import Client
+from sitl.simulation import Simulation
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from sitl.server.main import main, warm_up
+from sitl.server import main, warm_up
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -114,7 +114,7 @@ def test_misuse_is_one_line_and_exit_2(run, arguments):
 
 
 def test_defaults_are_those_of_a_px4_sitl():
-    from sitl.server.options import parse
+    from sitl.options import parse
 
     options = parse([])
     assert [(preset.value, url) for preset, url in options.links] == [

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from sitl.autopilot.streams import Preset
+from sitl.autopilot.telemetry import Preset
 from sitl.command_line import (
     CONTEXT,
     Place,

@@ -13,7 +13,7 @@ from test_realtime import LONG_S, Client, free_port
 from mavfi_cli.link.codec import Codec, Signing, dialect, key_from_passphrase
 from sitl.world import load_world
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import itertools
 
 from hostile_frames import flood, running_server

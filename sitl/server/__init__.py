@@ -1,1 +1,0 @@
-"""The running vehicle: autopilot, physics, camera and referee behind MAVLink endpoints."""
