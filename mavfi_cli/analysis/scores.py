@@ -21,7 +21,7 @@ from mavfi_cli.analysis.detectors import Scored
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import BY_NAME, Stage, Trajectory
-from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
 from mavfi_cli.fi import bits
 from mavfi_cli.mission.run_folder import load_run

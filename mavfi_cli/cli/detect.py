@@ -24,7 +24,7 @@ def detect() -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
     """List the detectors with model files, stacks, thresholds and origin."""
-    from mavfi_cli.detect.model import listing
+    from mavfi_cli.detect.base import listing
 
     rows = listing(models)
     if as_json:

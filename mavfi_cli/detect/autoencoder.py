@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.fitted import OF_CONTROL, PASSED, FittedDetector, Shapes
+from mavfi_cli.detect.base import OF_CONTROL, PASSED, FittedDetector, Shapes
 from mavfi_cli.detect.preprocess import COUNT, DELTA, Codes, IntArray, plan_deltas, take_tick
 
 HIDDEN, CODED = 6, 3

@@ -1,16 +1,45 @@
-"""Interface of our detectors and those of other packages, found by their entry points."""
+"""Detectors: their interface, those of other packages, and the base and model files of ours.
+
+A model file is a fitted detector with its provenance in JSON. Reading is strict.
+
+Our detectors keep their state in one flat array. A cheap one scores a whole tick, or a whole plan,
+in one compiled call. The call overhead is larger than the arithmetic, and several times larger in
+flight, where caches hold other data.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, MavfiError, ModelError
+from mavfi_cli.core.files import write_json
 from mavfi_cli.core.installed import installed, load_plug_in
-from mavfi_cli.core.types import Stage
-from mavfi_cli.detect.preprocess import Codes
+from mavfi_cli.core.types import FloatArray, StackMark, Stage
+from mavfi_cli.detect.preprocess import (
+    EXTENDED,
+    LIMIT,
+    Codes,
+    PreprocessParams,
+    Ranges,
+    states_digest,
+)
+
+SCHEMA = 2
+SHIPPED = Path(__file__).parent / "models"  # one folder per stack
+DEFAULT_STACK = "mavbench"  # stack of the default models
+# An entry point of this group names a function that creates a detector. It takes the arguments of
+# `find_detector` but the name.
+ENTRY_POINT_GROUP = "mavfi.detectors"
 
 
 class Detector(Protocol):
@@ -44,11 +73,6 @@ class Detector(Protocol):
         """Update the model with an accepted sample. A fixed model does nothing."""
 
 
-# An entry point of this group names a function that creates a detector. It takes the arguments of
-# `find_detector` but the name.
-ENTRY_POINT_GROUP = "mavfi.detectors"
-
-
 def detector_names() -> list[str]:
     """Return the names of all installed detectors, sorted."""
     return sorted(installed(ENTRY_POINT_GROUP).names)
@@ -72,3 +96,273 @@ def find_detector(
     factory = load_plug_in(ENTRY_POINT_GROUP, "detector", name, detector_names())
     detector: Detector = factory(model=model, threshold=threshold)
     return detector
+
+
+def checked_threshold(value: float, key: str = "threshold") -> float:
+    """Return a threshold that is a finite number above 0.
+
+    Raises:
+        ConfigError: The threshold is not finite or not above 0.
+    """
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"must be a finite number above 0, got {value!r}", key=key)
+    return float(value)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """A fitted detector, with the keys of its file."""
+
+    schema: int = SCHEMA
+    mavfi: str = field(default_factory=lambda: version("mavfi"))
+    detector: str  # kind: gad, aad, range or l2
+    arrays: dict[str, Any]  # arrays of float64, which a file holds as lists
+    stack: StackMark  # stack of the flights it was fitted to
+    extended: Ranges  # ranges of the extended states in these flights
+    states: str = field(default_factory=states_digest)
+    preprocess: PreprocessParams = field(default_factory=PreprocessParams)
+    preprocess_digest: str = ""  # empty: that of `preprocess`
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.preprocess_digest:
+            object.__setattr__(self, "preprocess_digest", self.preprocess.digest())
+
+    @property
+    def training_flights(self) -> list[str]:
+        """Flights `world/seed` that the model has seen, of all parts of its split."""
+        parts = self.provenance.get("split", {})
+        if not isinstance(parts, Mapping):
+            return []
+        return [str(flight) for part in parts.values() for flight in part]
+
+    def save(self, path: Path) -> None:
+        """Write the model atomically.
+
+        Raises:
+            ModelError: A number is not finite. Nothing is written.
+            RecordError: The file could not be written.
+        """
+        for name, array in self.arrays.items():
+            _require_finite(path, name, array)
+        write_json(path, asdict(self))
+
+    @classmethod
+    def read(cls, path: Path) -> Model:
+        """Read a model file of any kind, made by any version with this schema.
+
+        Raises:
+            ModelError: The file cannot be read, is corrupt, or has another schema.
+        """
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ModelError(error.strerror or str(error), path=path) from None
+        except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
+            raise ModelError("corrupt model file: not JSON", path=path) from None
+        if not isinstance(data, dict):
+            raise ModelError("corrupt model file: no JSON object", path=path)
+        _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
+        if odd := set(data) ^ {each.name for each in fields(cls)}:
+            raise ModelError(f"corrupt model file: keys {', '.join(sorted(odd))}", path=path)
+        try:
+            model = structure(data, cls)
+        except ConfigError as error:
+            raise ModelError(f"corrupt model file: {error}", path=path) from None
+        if asdict(model.preprocess) != data["preprocess"]:
+            raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
+        return model
+
+    @classmethod
+    def load(
+        cls,
+        path: Path,
+        detector: str,
+        shapes: Mapping[str, tuple[int, ...]],
+        positive: Collection[str] = (),
+    ) -> Model:
+        """Read a model of a kind with arrays of the given shapes, for any stack.
+
+        Args:
+            positive: Names of arrays whose numbers must all be above 0.
+
+        Raises:
+            ModelError: As `read`; or the file has another mavfi version, state table,
+                preprocessing or kind; an array is missing, unknown, of another shape, not finite,
+                or out of range.
+        """
+        model = cls.read(path)
+        _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
+        _refuse_other(path, "detector", model.detector, detector)
+        if model.states != states_digest():
+            raise ModelError("made for another table of states; train it anew", path=path)
+        if model.preprocess_digest != model.preprocess.digest():
+            raise ModelError("made with another preprocessing; train it anew", path=path)
+        names = [state.name for state in EXTENDED]
+        if set(model.extended) != set(names):
+            raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
+        for name, (low, high) in model.extended.items():
+            if not -LIMIT <= low <= 0 <= high <= LIMIT:
+                raise ModelError(f"corrupt model file: extended: {name} is not a range", path=path)
+        if set(model.arrays) != set(shapes):
+            raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
+        arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
+        for name in positive:
+            if not (arrays[name] > 0.0).all():
+                raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
+        return replace(model, arrays=arrays)
+
+
+def _refuse_other(path: Path, what: str, found: object, wanted: object) -> None:
+    if found != wanted:
+        raise ModelError(f"made for {what} {found!r}, this is {wanted!r}", path=path)
+
+
+def _require_finite(path: Path, name: str, array: FloatArray) -> None:
+    if not np.isfinite(array).all():
+        raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
+
+
+def _array(path: Path, name: str, data: object, shape: tuple[int, ...]) -> FloatArray:
+    try:
+        array: FloatArray = np.array(data, np.float64)
+    except (TypeError, ValueError):
+        problem = f"corrupt model file: array {name!r} does not contain numbers"
+        raise ModelError(problem, path=path) from None
+    if array.shape != shape:
+        problem = f"array {name!r} has shape {array.shape}, this version needs {shape}"
+        raise ModelError(problem, path=path)
+    _require_finite(path, name, array)
+    return array
+
+
+def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
+    """Return the path of the model of our detector that is shipped for a stack, if one is."""
+    return SHIPPED / stack / f"{detector}.json"
+
+
+def listing(models: Path | None = None) -> list[dict[str, Any]]:
+    """Return one row per model: detector, file, stack, threshold, provenance, and a line about it.
+
+    A detector without a model has one row. For a model that cannot be used, the line says why.
+
+    Args:
+        models: Folder of model files `NAME.json`; None takes those that are shipped.
+    """
+    rows = []
+    for name in detector_names():
+        shipped_ones = sorted(SHIPPED.glob(f"*/{name}.json"))
+        paths = shipped_ones if models is None else [models / f"{name}.json"]
+        rows += [_row(name, path) for path in paths] or [_row(name, None)]
+    return rows
+
+
+def _row(name: str, path: Path | None) -> dict[str, Any]:
+    has_model = path is not None and path.is_file()
+    row: dict[str, Any] = {
+        "name": name,
+        "model": str(path) if has_model else None,
+        "stack": None,
+        "threshold": None,
+        "provenance": None,
+    }
+    try:
+        row["threshold"] = find_detector(name, model=path).threshold
+        if path is None:
+            return {**row, "told": "needs no training"}
+        model = Model.read(path)
+    except MavfiError as error:  # of the model, or of a plug-in that does not load
+        return {**row, "told": f"cannot be used: {error}"}
+    provenance, flights = model.provenance, model.training_flights
+    row["provenance"] = {"mavfi": model.mavfi, "detector": model.detector, **provenance}
+    row["stack"] = model.stack.name
+    seeds = sorted({int(end) for f in flights if (end := f.rpartition("/")[2]).isdigit()})
+    span = f", seeds {seeds[0]} to {seeds[-1]}" if seeds else ""
+    worlds = ", ".join(provenance.get("worlds", [])) or "unknown worlds"
+    flown = f"{provenance.get('flights', len(flights))} flights"
+    if autopilot := provenance.get("autopilot"):
+        flown += f" of {autopilot}"
+    return {**row, "told": f"{flown} in {worlds}{span}; mavfi {model.mavfi}"}
+
+
+Shapes = dict[str, tuple[int, ...]]
+# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score and its stage.
+TickJudge = Callable[..., tuple[float, int]]
+# (memory, work, waypoints, first, steps, changes, scores) -> number of steps.
+PlanJudge = Callable[..., int]
+PASSED, OF_PLANNING, OF_CONTROL = range(3)  # stage with a score above the threshold
+
+
+class FittedDetector:
+    """A detector with its state in one flat array, which compiled code takes as one argument.
+
+    Attributes:
+        flat: All of the memory as one array, the argument of compiled code.
+        shapes: Names and shapes of the parts of the memory, in their order. The first part is the
+            threshold, a single number.
+        divisors: Parts, besides the threshold, whose numbers must all be above 0.
+        scratch: Number of scratch elements for compiled code after the parts.
+        stack: Stack of the flights that the model was fitted to; None without a model file.
+        extended: Ranges of the extended states in these flights; None without a model file.
+        tick_judge: `preprocess.take_tick` followed by scoring and learning as in the gate.
+        plan_judge: `preprocess.plan_deltas` and the score of each step that it finds.
+    """
+
+    name: ClassVar[str]
+    per_stage: ClassVar[bool]
+    shapes: ClassVar[Shapes]
+    divisors: ClassVar[tuple[str, ...]] = ()
+    scratch: ClassVar[int] = 0
+    tick_judge: ClassVar[TickJudge | None] = None
+    plan_judge: ClassVar[PlanJudge | None] = None
+
+    def __init__(self, arrays: Mapping[str, FloatArray]) -> None:
+        pieces = [np.asarray(arrays[name], np.float64).ravel() for name in self.shapes]
+        self.flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
+        self.stack: StackMark | None = None
+        self.extended: Ranges | None = None
+        self._views()
+
+    def _views(self) -> None:
+        self._memory: dict[str, FloatArray] = {}
+        start = 0
+        for name, shape in self.shapes.items():
+            end = start + math.prod(shape)
+            self._memory[name] = self.flat[start:end].reshape(shape)
+            start = end
+
+    @property
+    def memory(self) -> Mapping[str, FloatArray]:
+        """Writable views of the detector's state. A change takes effect at the next sample."""
+        return self._memory
+
+    @property
+    def threshold(self) -> float:
+        """Threshold. A score above it raises an alarm."""
+        threshold: float = self.flat.item(0)
+        return threshold
+
+    @classmethod
+    def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
+        """Create the detector of a model file; see `find_detector`.
+
+        Without a file it takes the one that is shipped for the default stack.
+        """
+        path = shipped(cls.name) if model is None else model
+        positive = (next(iter(cls.shapes)), *cls.divisors)
+        loaded = Model.load(path, cls.name, cls.shapes, positive)
+        detector = cls(loaded.arrays)
+        detector.stack, detector.extended = loaded.stack, loaded.extended
+        if threshold is not None:
+            detector.flat[0] = checked_threshold(threshold)
+        return detector
+
+    def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Do nothing, because most models are fixed in flight. See `Detector`."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"flat": self.flat, "stack": self.stack, "extended": self.extended}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.flat, self.stack, self.extended = state["flat"], state["stack"], state["extended"]
+        self._views()

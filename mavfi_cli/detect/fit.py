@@ -16,7 +16,6 @@ import itertools
 import math
 import platform
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
@@ -28,16 +27,14 @@ from mavfi_cli.core.seeds import Stream, generator
 from mavfi_cli.core.types import DType, FloatArray, Stage
 from mavfi_cli.detect import gaussian, span
 from mavfi_cli.detect.autoencoder import CODED, HIDDEN, AutoencoderDetector
-from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import Dataset, FlightSamples
-from mavfi_cli.detect.gaussian import GaussianDetector
-from mavfi_cli.detect.model import Model, checked_threshold
+from mavfi_cli.detect.base import Detector, Model, checked_threshold
 from mavfi_cli.detect.norm import NormDetector
-from mavfi_cli.detect.preprocess import COUNT, DETECTED, NAMES, Codes
+from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.preprocess import COUNT, DETECTED, EXTENDED, NAMES, Ranges
 from mavfi_cli.detect.span import RangeDetector
-from mavfi_cli.detect.watch import ranges_of
 
 FLIGHTS_MIN = 10
+KINDS = ("gad", "aad", "range", "l2")
 # Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
 # Two reports can arrive between two ticks, so a sequence number may increase by two.
@@ -45,23 +42,6 @@ _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
 _X, _Y = ([NAMES.index(f"{prefix}{axis}") for prefix in ("waypoint_", "waypoint_v", "command_v")]
           for axis in "xy")  # fmt: skip
 _YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
-KINDS = ("gad", "aad", "range", "l2")
-
-
-def split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
-    """Split by flight, in the same way for each world. Return the indices by their use.
-
-    Raises:
-        ModelError: There are fewer than FLIGHTS_MIN flights.
-    """
-    _refuse_few(len(dataset))
-    drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
-    worlds = [dataset.flights[place].world for place in drawn]
-    ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
-    parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}
-    for number, place in enumerate(ordered):
-        parts[_TURNS[number % len(_TURNS)]].append(place)
-    return {name: sorted(places) for name, places in parts.items()}
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
@@ -75,142 +55,122 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
     for kind in kinds:
         if kind not in KINDS:
             raise UnknownName("detector", kind, KINDS)
-    _refuse_few(flights)
-    if n_sigma is not None:
-        checked_threshold(n_sigma, "n sigma")
-    if "aad" in kinds:
-        _require_torch()
-
-
-def _refuse_few(flights: int) -> None:
     if flights < FLIGHTS_MIN:
         raise ModelError(f"{flights} flights are too few to fit to: {FLIGHTS_MIN} at least")
+    if n_sigma is not None:
+        checked_threshold(n_sigma, "n sigma")
+    if "aad" in kinds and find_spec("torch") is None:  # its import would take seconds
+        raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
 
 
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
-    """Fit one kind of detector.
+    """Fit one kind of detector. Raises as `check`.
 
     Args:
         n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
             flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
-
-    Raises:
-        UnknownName: The kind is unknown.
-        ModelError: There are too few flights, or torch is missing for aad.
-        ConfigError: n sigma is out of range.
     """
-    parts = split(dataset, seed)
-    flights = dataset.flights
+    check([kind], len(dataset), n_sigma)
+    flights, parts = dataset.flights, _split(dataset, seed)
     train, validation, held_out = ([flights[place] for place in parts[use]] for use in parts)
-    details: dict[str, Any] = {}
+    details: Mapping[str, Any] = {}
     detector: Any
     if kind == "gad":
-        given = gaussian.N_SIGMA if n_sigma is None else checked_threshold(n_sigma, "n sigma")
-        detector = GaussianDetector.cold(given)
+        detector = gaussian.GaussianDetector.cold(n_sigma or gaussian.N_SIGMA)
         for flight, stage in itertools.product([*train, *validation], Stage):
             for deltas in flight.of_stage(stage):
                 detector.learn(deltas, stage)
         largest = _largest(detector, held_out)
-        details["largest_distance_sigma"] = largest
+        details = {"largest_distance_sigma": largest}
         if n_sigma is None:
-            detector.memory["n_sigma"][0] = max(gaussian.N_SIGMA, math.ceil(largest))
+            detector.flat[0] = max(gaussian.N_SIGMA, math.ceil(largest))
     elif kind == "range":
-        everything = mirrored(_all(list(flights)))
-        detector = RangeDetector(
-            {
-                "margin": np.array([span.MARGIN]),
-                "lowest": np.minimum(everything.min(axis=0), 0).astype(np.float64),
-                "highest": np.maximum(everything.max(axis=0), 0).astype(np.float64),
-            }
-        )
-    elif kind == "l2":
-        detector = NormDetector({"threshold": np.ones(1), "scale": scale_of(train)})
-        detector.memory["threshold"][0] = _largest(detector, held_out)
-    elif kind == "aad":
-        scale = scale_of(train)
-        trained = train_autoencoder(
-            mirrored(_all(train)) / scale, mirrored(_all(validation)) / scale, seed=seed
-        )
-        detector = AutoencoderDetector({"threshold": np.ones(1), "scale": scale, **trained.weights})
-        detector.memory["threshold"][0] = _largest(detector, held_out)
-        details.update(trained.provenance)
+        rows = _mirrored(flights)
+        lowest, highest = np.minimum(rows.min(axis=0), 0), np.maximum(rows.max(axis=0), 0)
+        margin = np.array([span.MARGIN])
+        detector = RangeDetector({"margin": margin, "lowest": lowest, "highest": highest})
     else:
-        raise UnknownName("detector", kind, KINDS)
-    arrays = {name: np.array(array) for name, array in detector.memory.items()}
+        scale = _scale_of(train)
+        arrays = {"threshold": np.ones(1), "scale": scale}
+        if kind == "l2":
+            detector = NormDetector(arrays)
+        else:
+            weights, details = _train_autoencoder(
+                _mirrored(train) / scale, _mirrored(validation) / scale, seed
+            )
+            detector = AutoencoderDetector({**arrays, **weights})
+        detector.flat[0] = _largest(detector, held_out)
     return Model(
         detector=kind,
-        arrays=arrays,
+        arrays={name: np.array(array) for name, array in detector.memory.items()},
         stack=dataset.stack,
-        extended=ranges_of(np.concatenate([flight.extended for flight in flights])),
+        extended=_extended_ranges(flights),
         preprocess=dataset.preprocess,
         provenance=_provenance(dataset, parts, seed, detector.threshold, details),
     )
 
 
-def scale_of(flights: list[FlightSamples]) -> FloatArray:
+def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
+    """Split by flight, in the same way for each world. Return the indices by their use."""
+    drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
+    worlds = [dataset.flights[place].world for place in drawn]
+    ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
+    parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}
+    for number, place in enumerate(ordered):
+        parts[_TURNS[number % len(_TURNS)]].append(place)
+    return {name: sorted(places) for name, places in parts.items()}
+
+
+def _scale_of(flights: Sequence[FlightSamples]) -> FloatArray:
     """Return the largest |delta| in each state's group (COUNT,), at least 1.
 
     The scaled inputs lie within about +-1. The components of a vector share one scale, because each
     component may take the values of the others.
     """
-    rows = mirrored(_all(flights))
-    largest = np.maximum(np.abs(rows).max(axis=0), _LEAST_SCALE)
+    largest = np.maximum(np.abs(_mirrored(flights)).max(axis=0), _LEAST_SCALE)
     groups = np.array([state.group for state in DETECTED])
     return np.array([largest[groups == group].max() for group in groups], np.float64)
 
 
-def mirrored(deltas: Codes) -> NDArray[np.int64]:
-    """Return the distinct rows (m, COUNT) of the deltas (n, COUNT) and their mirror images.
+def _mirrored(flights: Sequence[FlightSamples]) -> NDArray[np.int64]:
+    """Return the distinct deltas (m, COUNT) of the flights and their mirror images.
 
     The training worlds have their goals north-east of the start, but no direction is special. The
     images mirror east, mirror north, and swap the two. A mirrored velocity or position has the
     negated code. Yaw is negated with north. Its delta stays unchanged under the other two, which is
     an approximation.
     """
+    deltas = np.concatenate([flight.deltas for flight in flights])
     rows = np.unique(deltas.astype(np.int64), axis=0)
+    swapped = rows.copy()
+    swapped[:, _X], swapped[:, _Y] = rows[:, _Y], rows[:, _X]
     images = []
-    for swapped in (False, True):
-        turned = rows.copy()
-        if swapped:
-            turned[:, _X], turned[:, _Y] = rows[:, _Y], rows[:, _X]
-        for east in (1, -1):
-            for north in (1, -1):
-                image = turned.copy()
-                image[:, _X] *= east
-                image[:, [*_Y, *_YAW]] *= north
-                images.append(image)
+    for turned, east, north in itertools.product((rows, swapped), (1, -1), (1, -1)):
+        image = turned.copy()
+        image[:, _X] *= east
+        image[:, [*_Y, *_YAW]] *= north
+        images.append(image)
     return np.unique(np.concatenate(images), axis=0)
 
 
-def scores(detector: Detector, flight: FlightSamples) -> FloatArray:
-    """Return the score of every judged message (n,): the highest score of its stages."""
-    found = np.zeros(len(flight.deltas))
-    flags = (flight.reports, flight.plan_steps, flight.new_waypoint)
-    rows = zip(flight.deltas, *(flag.tolist() for flag in flags), strict=True)
-    for row, (deltas, report, step, new) in enumerate(rows):
-        if report:
-            found[row] = detector.score(deltas, Stage.PERCEPTION)
-            continue
-        if not (step and detector.per_stage):
-            found[row] = detector.score(deltas, Stage.CONTROL)
-        if (new or step) and detector.per_stage:
-            found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
-    return found
-
-
-def _all(flights: list[FlightSamples]) -> Codes:
-    return np.concatenate([flight.deltas for flight in flights])
-
-
-def _largest(detector: Detector, flights: list[FlightSamples]) -> float:
+def _largest(detector: Detector, flights: Sequence[FlightSamples]) -> float:
     """Return the largest score of the flights.
 
     For a detector with one score over all states it includes the mirror images.
     """
     if detector.per_stage:
-        return max(float(scores(detector, flight).max(initial=0.0)) for flight in flights)
-    rows = mirrored(_all(flights)).astype(np.int16)
+        return max(float(flight.scores(detector).max(initial=0.0)) for flight in flights)
+    rows = _mirrored(flights).astype(np.int16)
     return max(detector.score(deltas, Stage.CONTROL) for deltas in rows)
+
+
+def _extended_ranges(flights: Sequence[FlightSamples]) -> Ranges:
+    """Return the smallest and largest change of each extended state; ranges include 0."""
+    rows = np.concatenate([flight.extended for flight in flights])
+    return {
+        state.name: (min(0, *column), max(0, *column))
+        for state, column in zip(EXTENDED, rows.T.tolist(), strict=True)
+    }
 
 
 def _provenance(
@@ -221,6 +181,7 @@ def _provenance(
     details: Mapping[str, Any],
 ) -> dict[str, Any]:
     names = [f"{flight.world}/{flight.seed}" for flight in dataset.flights]
+    versions = {"python": platform.python_version(), "numpy": np.__version__}
     return {
         "flights": len(dataset),
         "samples": sum(len(flight.deltas) for flight in dataset.flights),
@@ -228,12 +189,8 @@ def _provenance(
         "split": {use: [names[place] for place in places] for use, places in parts.items()},
         "seed": seed,
         "threshold": threshold,
-        "versions": {
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            **details.get("versions", {}),
-        },
-        **{name: value for name, value in details.items() if name != "versions"},
+        **details,
+        "versions": {**versions, **details.get("versions", {})},
     }
 
 
@@ -241,29 +198,11 @@ EPOCHS = 1000
 STARTS = 5
 LEARNING_RATE = 0.01
 CURVE_EVERY = 20  # epochs between two points of the recorded loss curve
+Trained = tuple[dict[str, FloatArray], dict[str, Any]]  # weights by name, and their provenance
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _TrainedWeights:
-    """Weights, named as in `autoencoder.WEIGHTS`, and the provenance of the training."""
-
-    weights: Mapping[str, FloatArray]
-    provenance: Mapping[str, Any]
-
-
-def _require_torch() -> None:
-    """Check that torch is installed, without the seconds that its import takes."""
-    if find_spec("torch") is None:
-        raise ModelError("training the autoencoder needs torch: pip install 'mavfi[train]'")
-
-
-def train_autoencoder(inputs: FloatArray, validation: FloatArray, *, seed: int) -> _TrainedWeights:
-    """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13).
-
-    Raises:
-        ModelError: torch is not installed.
-    """
-    _require_torch()
+def _train_autoencoder(inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
+    """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13)."""
     import torch
 
     threads = torch.get_num_threads()
@@ -272,17 +211,14 @@ def train_autoencoder(inputs: FloatArray, validation: FloatArray, *, seed: int) 
         starts = [_train_once(torch, inputs, validation, seed + number) for number in range(STARTS)]
     finally:
         torch.set_num_threads(threads)
-    return min(starts, key=lambda start: float(start.provenance["validation_error"]))
+    return min(starts, key=lambda start: float(start[1]["validation_error"]))
 
 
-def _train_once(
-    torch: Any, inputs: FloatArray, validation: FloatArray, seed: int
-) -> _TrainedWeights:
+def _train_once(torch: Any, inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
     source = torch.Generator().manual_seed(seed)
-    sizes = ((COUNT, HIDDEN), (HIDDEN, CODED), (CODED, COUNT))
-    names = ("hidden", "coded", "output")
+    sizes = {"hidden": (COUNT, HIDDEN), "coded": (HIDDEN, CODED), "output": (CODED, COUNT)}
     weights = {}
-    for name, (before, after) in zip(names, sizes, strict=True):
+    for name, (before, after) in sizes.items():
         reach = (6.0 / (before + after)) ** 0.5  # Glorot, uniform
         drawn = torch.rand((after, before), generator=source, dtype=torch.float64)
         weights[f"{name}_weights"] = (reach * (2.0 * drawn - 1.0)).requires_grad_()
@@ -293,7 +229,7 @@ def _train_once(
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]
-        return ((output - rows) ** 2).mean(dim=1)  # one error per vector
+        return ((output - rows) ** 2).mean(dim=1)
 
     rows, checked = torch.tensor(inputs), torch.tensor(validation)
     optimiser = torch.optim.Adam(list(weights.values()), lr=LEARNING_RATE)
@@ -311,17 +247,14 @@ def _train_once(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return _TrainedWeights(
-        weights=kept,
-        provenance={
-            "epochs": EPOCHS,
-            "learning_rate": LEARNING_RATE,
-            "best_epoch": best_epoch,
-            "validation_error": best,
-            "starts": STARTS,
-            "start_seed": seed,
-            "distinct_vectors": {"train": len(inputs), "validation": len(validation)},
-            "loss_curve": {"columns": ["epoch", "train_mean", "validation_largest"], "rows": curve},
-            "versions": {"torch": str(torch.__version__)},
-        },
-    )
+    return kept, {
+        "epochs": EPOCHS,
+        "learning_rate": LEARNING_RATE,
+        "best_epoch": best_epoch,
+        "validation_error": best,
+        "starts": STARTS,
+        "start_seed": seed,
+        "distinct_vectors": {"train": len(inputs), "validation": len(validation)},
+        "loss_curve": {"columns": ["epoch", "train_mean", "validation_largest"], "rows": curve},
+        "versions": {"torch": str(torch.__version__)},
+    }

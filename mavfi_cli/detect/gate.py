@@ -10,39 +10,47 @@ detector over all stages scores one vector: of a report on its arrival, and of e
 with the report that arrived since the last tick. Its alarm always names control (paper, section
 V-D). The gate also checks a plan as a whole. Such an alarm names the waypoint to drop.
 
-An extended watch checks further states of reports and plans one by one before the detector scores
-the message. Its alarm names the stage of the message for every detector.
+An extended watch checks the extended states of reports and plans one by one before the detector
+scores the message. Its alarm names the stage of the message for every detector.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Stage, Trajectory
-from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.fitted import OF_CONTROL, OF_PLANNING, PASSED, FittedDetector, TickJudge
+from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Message, Stage, Trajectory
+from mavfi_cli.detect.base import (
+    OF_CONTROL,
+    OF_PLANNING,
+    PASSED,
+    Detector,
+    FittedDetector,
+    TickJudge,
+)
 from mavfi_cli.detect.preprocess import (
     CODE,
     COUNT,
     DELTA,
+    EXTENDED,
+    LIMIT,
     NAMES,
     PREVIOUS,
     REFERENCE,
     SPANS,
     Codes,
     PreprocessParams,
+    Ranges,
+    extended_codes,
     plan_deltas,
     take_report,
     take_tick,
-    working_array,
 )
 from mavfi_cli.detect.span import MARGIN
-from mavfi_cli.detect.watch import ExtendedWatch, Finding
 
 _NO_WAYPOINTS = np.zeros((0, 10))
 _TICK, _TICK_AND_WAYPOINT = (Stage.CONTROL,), (Stage.PLANNING, Stage.CONTROL)
@@ -60,6 +68,81 @@ class Alarm:
     states: tuple[str, ...]  # anomalous states, worst first
     waypoint: int | None = None  # waypoint to drop, for the alarm of a plan
     mended: Trajectory | None = None  # active plan with the accepted extended states
+
+
+class ExtendedWatch:
+    """Watch of the extended states, each judged by its range of changes in error-free flights.
+
+    The change since the last accepted message must lie between the smallest and the largest change
+    in the training flights. All counters begin at 0 without a predicted collision, so the first
+    message is judged, too. A planner with its own counter also counts plans that never took effect.
+    After n messages that were not accepted, n + 1 changes may therefore add up.
+
+    Attributes:
+        memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
+            state. A modification takes effect at once.
+    """
+
+    def __init__(self, ranges: Ranges) -> None:
+        rows = zip(*(ranges[state.name] for state in EXTENDED), strict=True)
+        self.memory: Codes = np.array([[0] * len(EXTENDED), *rows], np.int16)
+        self._lost = {CollisionReport: 0, Trajectory: 0}  # messages since the last accepted one
+        self._accepted: dict[float, Trajectory] = {}  # plans by their stamps
+
+    def judge(self, message: CollisionReport | Trajectory) -> Alarm | None:
+        """Judge a message on its arrival. `accept` or `lose` must follow."""
+        return self._judge(message, self.memory[0].tolist(), self._lost[type(message)] + 1)
+
+    def accept(self, message: CollisionReport | Trajectory) -> None:
+        """Accept a message, which takes effect and becomes the reference."""
+        for place, code in extended_codes(message):
+            self.memory[0, place] = code
+        self._lost[type(message)] = 0
+        if isinstance(message, Trajectory):
+            self._accepted[message.stamp_s] = message
+
+    def lose(self, kind: type[CollisionReport | Trajectory]) -> None:
+        """Note that a message of that kind did not take effect."""
+        self._lost[kind] += 1
+
+    def judge_flown(self, plan: Trajectory) -> Alarm | None:
+        """Judge the active plan, whose states may have changed since it was accepted."""
+        accepted = self._accepted.get(plan.stamp_s)
+        if accepted is None:
+            return None
+        alarm = self._judge(plan, dict(extended_codes(accepted)), 1)
+        if alarm is None:
+            return None
+        mended: Message = plan
+        for state in EXTENDED:
+            if isinstance(accepted, state.message):
+                mended = state.write(mended, 0, state.read(accepted, 0))
+        assert isinstance(mended, Trajectory)
+        return replace(alarm, mended=mended)
+
+    def _judge(
+        self,
+        message: CollisionReport | Trajectory,
+        references: Mapping[int, int] | Sequence[int],
+        steps: int,
+    ) -> Alarm | None:
+        found: list[tuple[int, int]] = []
+        for place, code in extended_codes(message):
+            delta = min(max(code - references[place], -LIMIT), LIMIT)
+            lowest, highest = self.memory[1:, place].tolist()
+            distance = max(steps * lowest - delta, delta - steps * highest)
+            if distance > 0:
+                found.append((-distance, place))
+        if not found:
+            return None
+        found.sort()
+        return Alarm(
+            stage=EXTENDED[found[0][1]].stage,
+            detector="extended watch",
+            score=float(-found[0][0]),
+            threshold=MARGIN,
+            states=tuple(EXTENDED[place].name for _, place in found),
+        )
 
 
 class Gate:
@@ -87,7 +170,7 @@ class Gate:
         self.protect = protect
         self.fresh: tuple[Stage, ...] = ()
         self._per_stage = detector.per_stage
-        self._work = working_array(params or PreprocessParams())
+        self._work = (params or PreprocessParams()).working_array()
         self._deltas = self._work[DELTA]
         self._trajectory: Trajectory | None = None  # last accepted waypoint
         self._index = -1
@@ -124,7 +207,7 @@ class Gate:
             self._deltas[:] = 0
             return None
         self._report = report
-        alarm = self._watched(report, Stage.PERCEPTION)
+        alarm = None if self._watch is None else self._watch.judge(report)
         if alarm is None:
             score = self.detector.score(self._deltas, Stage.PERCEPTION)
             if not score <= self.detector.threshold:
@@ -143,18 +226,13 @@ class Gate:
         Only per-stage detectors judge the steps. An alarm of a detector over all stages recomputes
         control, and there is no command to recompute yet; see `judge_ahead`.
         """
-        alarm = self._watched(trajectory, Stage.PLANNING)
+        if Stage.PLANNING not in self.protect:
+            return None
+        alarm = None if self._watch is None else self._watch.judge(trajectory)
         if alarm is None and self._per_stage:
             alarm = self._judge_steps(trajectory, 0)
-        if Stage.PLANNING in self.protect:
-            self._settle(trajectory, alarm)
+        self._settle(trajectory, alarm)
         return alarm
-
-    def _watched(self, message: CollisionReport | Trajectory, stage: Stage) -> Alarm | None:
-        """Return the alarm of the extended watch about a message that arrives."""
-        if self._watch is None or stage not in self.protect:
-            return None
-        return _watch_alarm(self._watch.judge(message), stage)
 
     def _settle(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> None:
         """Tell the extended watch whether a judged message takes effect."""
@@ -179,16 +257,15 @@ class Gate:
             Alarm of the first bad step, which names the waypoint to drop, or alarm about extended
             states that differ from the accepted plan's.
         """
-        if self._watch is not None and Stage.PLANNING in self.protect:
-            found = self._watch.judge_flown(trajectory)
-            if found is not None:
-                return _watch_alarm(found, Stage.PLANNING, self._watch.mended(trajectory))
-        return self._judge_steps(trajectory, first)
+        if Stage.PLANNING not in self.protect:
+            return None
+        alarm = None if self._watch is None else self._watch.judge_flown(trajectory)
+        return alarm or self._judge_steps(trajectory, first)
 
     def _judge_steps(self, trajectory: Trajectory, first: int) -> Alarm | None:
-        if Stage.PLANNING not in self.protect or len(trajectory.waypoints) < 2:
-            return None
         rows = len(trajectory.waypoints)
+        if rows < 2:
+            return None
         scores = self._look(trajectory, first)
         threshold, steps, changes = self.detector.threshold, self._steps, self._changes
         bad: tuple[int, float] | None = None
@@ -334,19 +411,3 @@ class Gate:
         alone.sort(key=lambda entry: (-entry[0], entry[1]))
         above = [place for score, place in alone if score > threshold]
         return tuple(NAMES[place] for place in above or [place for _, place in alone])
-
-
-def _watch_alarm(
-    found: Finding | None, stage: Stage, mended: Trajectory | None = None
-) -> Alarm | None:
-    if found is None:
-        return None
-    distance, states = found
-    return Alarm(
-        stage=stage,
-        detector="extended watch",
-        score=distance,
-        threshold=MARGIN,
-        states=states,
-        mended=mended,
-    )

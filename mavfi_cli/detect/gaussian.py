@@ -19,7 +19,7 @@ import numpy as np
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.fitted import OF_CONTROL, OF_PLANNING, PASSED, FittedDetector, Shapes
+from mavfi_cli.detect.base import OF_CONTROL, OF_PLANNING, PASSED, FittedDetector, Shapes
 from mavfi_cli.detect.preprocess import (
     COUNT,
     DELTA,

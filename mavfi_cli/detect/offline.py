@@ -1,4 +1,8 @@
-"""Replays a flight's trace through the gate to get samples for a fit and scores of a detector.
+"""Recorded flights: their traces replayed through the gate, and data sets of their samples.
+
+A replay gives the scores of a detector, and the samples of error-free flights to fit models to. One
+row of a data set is one judged message: a collision report, a control tick, or one step of a
+published plan from waypoint to waypoint. Its deltas are the detector's input.
 
 A trace maps column names to arrays with one row per control tick. It has `stamp_s` and every
 monitored state by its name (NaN or masked before the first message with the state). Optional
@@ -11,14 +15,17 @@ this, too, if it gets the published plans and the changes that a fault made to t
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.files import read_parquet, write_parquet
 from mavfi_cli.core.types import (
     BY_NAME,
     STATES,
@@ -26,22 +33,24 @@ from mavfi_cli.core.types import (
     Command,
     DType,
     FloatArray,
+    StackMark,
     Stage,
     Trajectory,
 )
 from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
 from mavfi_cli.detect.preprocess import (
     COUNT,
+    EXTENDED,
+    LIMIT,
     NAMES,
     SPANS,
     Codes,
     PreprocessParams,
+    extended_codes,
     plan_deltas,
-    working_array,
+    states_digest,
 )
-from mavfi_cli.detect.watch import EXTENDED, changes
 
 Columns = Mapping[str, NDArray[Any]]
 _WAYPOINT = [s.name for s in STATES if s.group.startswith("waypoint_") and s.unit != "s"]
@@ -71,21 +80,15 @@ class _Judgement:
 
 
 class _Probe:
-    """Wraps a detector and keeps the highest score since the last `look`."""
+    """Wraps a detector, or none, and keeps the highest score since the last `look`."""
 
     def __init__(self, detector: Detector | None) -> None:
+        self._detector = detector
         self.name = "none" if detector is None else detector.name
         self.per_stage = detector is not None and detector.per_stage
+        self.threshold = np.inf if detector is None else detector.threshold
+        self.memory: Mapping[str, NDArray[Any]] = {} if detector is None else detector.memory
         self.highest = -np.inf
-        self._detector = detector
-
-    @property
-    def threshold(self) -> float:
-        return np.inf if self._detector is None else self._detector.threshold
-
-    @property
-    def memory(self) -> Mapping[str, NDArray[Any]]:
-        return {} if self._detector is None else self._detector.memory
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the detector's score, or 0 without one. Keep it if it is the highest or NaN."""
@@ -160,53 +163,6 @@ def replay(
             yield judged
 
 
-def flight_of(
-    trace: Columns,
-    world: str,
-    seed: int,
-    params: PreprocessParams | None = None,
-    plans: Sequence[Trajectory] = (),
-) -> FlightSamples:
-    """Extract the samples of one error-free flight for a data set.
-
-    Args:
-        plans: All published plans. The trace holds the flown waypoints only.
-    """
-    params = params or PreprocessParams()
-    judged = list(replay(trace, None, params))
-    steps = [step for plan in plans for step in plan_steps(plan, params)]
-    stamps = [plan.stamp_s for plan in plans for _ in range(len(plan.waypoints) - 1)]
-    messages = [False] * len(judged)
-    extended = np.zeros((len(judged) + len(steps), len(EXTENDED)), np.int16)
-    extended[np.flatnonzero([each.report for each in judged])] = changes(_Messages(trace).reports)
-    firsts = np.cumsum([len(judged), *(len(plan.waypoints) - 1 for plan in plans)])[:-1]
-    for first, plan, row in zip(firsts.tolist(), plans, changes(plans), strict=True):
-        if len(plan.waypoints) > 1:
-            extended[first] = row
-    return FlightSamples(
-        world=world,
-        seed=seed,
-        stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),
-        reports=np.array([each.report for each in judged] + [False] * len(steps), np.bool_),
-        plan_steps=np.array(messages + [True] * len(steps), np.bool_),
-        new_waypoint=np.array(
-            [each.new_waypoint for each in judged] + [False] * len(steps), np.bool_
-        ),
-        deltas=np.array([each.deltas for each in judged] + steps, np.int16).reshape(-1, COUNT),
-        extended=extended,
-    )
-
-
-def plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
-    """Return the deltas (n - 1, COUNT) of a plan's steps, computed as in the gate."""
-    rows = len(plan.waypoints)
-    steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
-    count = plan_deltas(plan.waypoints, 0, working_array(params), steps, changes)
-    found = np.zeros((max(0, rows - 1), COUNT), np.int16)
-    found[steps[:count]] = changes[:count]
-    return found
-
-
 class _FlownPlans:
     """The active plan in each row of a trace."""
 
@@ -273,11 +229,6 @@ class _Messages:
         self._trajectory: Trajectory | None = None
         collision = trace.get("collision")  # without it, a finite time means a collision
         self._collisions = np.isfinite(self._reports[:, 0]) if collision is None else collision
-
-    @property
-    def reports(self) -> list[CollisionReport]:
-        found = (self.report(row) for row in range(len(self.stamps_s)))
-        return [report for report in found if report is not None]
 
     def report(self, row: int) -> CollisionReport | None:
         """Return the report that took effect in this tick, or None."""
@@ -346,3 +297,201 @@ def columns_of(table: Any) -> dict[str, NDArray[Any]]:
         values = column.fill_null(fill).to_numpy(zero_copy_only=False)
         columns[name] = np.ma.array(values, mask=column.is_null().to_numpy(zero_copy_only=False))
     return columns
+
+
+SCHEMA = "2"
+_CODED = (*NAMES, *(state.name for state in EXTENDED))
+_FLAGS = ("reports", "plan_steps", "new_waypoint")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSamples:
+    """Samples of one error-free flight, oldest first."""
+
+    world: str
+    seed: int
+    stamps_s: FloatArray  # (n,)
+    reports: NDArray[np.bool_]  # (n,) True for a collision report
+    plan_steps: NDArray[np.bool_]  # (n,) True for a step of a plan; otherwise a control tick
+    new_waypoint: NDArray[np.bool_]  # (n,) True for a control tick with new planning states
+    deltas: Codes  # (n, COUNT)
+    extended: Codes  # (n, 3) extended states; those of a plan are in the row of its first step
+
+    @classmethod
+    def of_trace(
+        cls,
+        trace: Columns,
+        world: str,
+        seed: int,
+        params: PreprocessParams | None = None,
+        plans: Sequence[Trajectory] = (),
+    ) -> FlightSamples:
+        """Extract the samples of a flight.
+
+        Args:
+            plans: All published plans. The trace holds the flown waypoints only.
+        """
+        params = params or PreprocessParams()
+        judged = list(replay(trace, None, params))
+        steps = [step for plan in plans for step in _plan_steps(plan, params)]
+        stamps = [plan.stamp_s for plan in plans for _ in range(len(plan.waypoints) - 1)]
+        extended = np.zeros((len(judged) + len(steps), len(EXTENDED)), np.int16)
+        messages = _Messages(trace)
+        reports = [messages.report(row) for row in range(len(messages.stamps_s))]
+        extended[np.flatnonzero([each.report for each in judged])] = _extended_changes(
+            [report for report in reports if report is not None]
+        )
+        firsts = np.cumsum([len(judged), *(len(plan.waypoints) - 1 for plan in plans)])[:-1]
+        for first, plan, row in zip(firsts.tolist(), plans, _extended_changes(plans), strict=True):
+            if len(plan.waypoints) > 1:
+                extended[first] = row
+        no_steps, no_messages = [False] * len(steps), [False] * len(judged)
+        return cls(
+            world=world,
+            seed=seed,
+            stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),
+            reports=np.array([each.report for each in judged] + no_steps, np.bool_),
+            plan_steps=np.array(no_messages + [True] * len(steps), np.bool_),
+            new_waypoint=np.array([each.new_waypoint for each in judged] + no_steps, np.bool_),
+            deltas=np.array([each.deltas for each in judged] + steps, np.int16).reshape(-1, COUNT),
+            extended=extended,
+        )
+
+    def of_stage(self, stage: Stage) -> Codes:
+        """Return the deltas (m, COUNT) of the samples with new states of a stage."""
+        if stage is Stage.PERCEPTION:
+            return self.deltas[self.reports]
+        if stage is Stage.PLANNING:
+            return self.deltas[self.new_waypoint | self.plan_steps]
+        return self.deltas[~(self.reports | self.plan_steps)]
+
+    def scores(self, detector: Detector) -> FloatArray:
+        """Return the score of every judged message (n,): the highest score of its stages."""
+        found = np.zeros(len(self.deltas))
+        flags = (self.reports, self.plan_steps, self.new_waypoint)
+        rows = zip(self.deltas, *(flag.tolist() for flag in flags), strict=True)
+        for row, (deltas, report, step, new) in enumerate(rows):
+            if report:
+                found[row] = detector.score(deltas, Stage.PERCEPTION)
+                continue
+            if not (step and detector.per_stage):
+                found[row] = detector.score(deltas, Stage.CONTROL)
+            if (new or step) and detector.per_stage:
+                found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
+        return found
+
+
+def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
+    """Return the deltas (n - 1, COUNT) of a plan's steps, computed as in the gate."""
+    rows = len(plan.waypoints)
+    steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
+    count = plan_deltas(plan.waypoints, 0, params.working_array(), steps, changes)
+    found = np.zeros((max(0, rows - 1), COUNT), np.int16)
+    found[steps[:count]] = changes[:count]
+    return found
+
+
+def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
+    """Return the changes (n, 3) of the extended states between messages of one kind."""
+    found = np.zeros((len(messages), len(EXTENDED)), np.int16)
+    before = [0] * len(EXTENDED)
+    for row, message in enumerate(messages):
+        for place, code in extended_codes(message):
+            found[row, place] = min(max(code - before[place], -LIMIT), LIMIT)
+            before[place] = code
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset:
+    """Flights with distinct combinations of world and seed."""
+
+    flights: tuple[FlightSamples, ...]
+    preprocess: PreprocessParams
+    stack: StackMark  # stack of all flights
+
+    def __post_init__(self) -> None:
+        keys = [(flight.world, flight.seed) for flight in self.flights]
+        if len(set(keys)) != len(keys):
+            raise ModelError("a data set holds each flight (world and seed) once only")
+
+    def __len__(self) -> int:
+        return len(self.flights)
+
+    def save(self, path: Path) -> None:
+        """Write the data set as Parquet, atomically. Equal data sets give equal bytes."""
+        import pyarrow as pa
+
+        flights = self.flights
+        lengths = [len(flight.stamps_s) for flight in flights]
+        worlds = np.repeat([f.world for f in flights], lengths).tolist()
+        columns: dict[str, pa.Array] = {
+            "world": pa.array(worlds, pa.string()),
+            "seed": pa.array(np.repeat([f.seed for f in flights], lengths), pa.int64()),
+            "stamp_s": pa.array(np.concatenate([[], *(f.stamps_s for f in flights)]), pa.float64()),
+        }
+        for flag in _FLAGS:
+            flags = np.concatenate([np.zeros(0, np.bool_), *(getattr(f, flag) for f in flights)])
+            columns[flag] = pa.array(flags, pa.bool_())
+        codes = [np.column_stack([f.deltas, f.extended]) for f in flights]
+        coded = np.concatenate([np.zeros((0, len(_CODED)), np.int16), *codes])
+        for place, name in enumerate(_CODED):
+            columns[name] = pa.array(coded[:, place], pa.int16())
+        stack = {"mavfi_stack": self.stack.name, "mavfi_stack_digest": self.stack.digest}
+        metadata = {**_signature(self.preprocess), **stack}
+        write_parquet(path, pa.table(columns).replace_schema_metadata(metadata))
+
+    @classmethod
+    def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
+        """Read a data set.
+
+        Args:
+            preprocess: Parameters that the data set must have been made with.
+
+        Raises:
+            RecordError: The file is unreadable.
+            ModelError: It is not a data set, or was made with another state table or other
+                preprocessing.
+        """
+        params = preprocess or PreprocessParams()
+        table = read_parquet(path, "data set")
+        pairs = (table.schema.metadata or {}).items()
+        metadata = {
+            key.decode(errors="replace"): text.decode(errors="replace") for key, text in pairs
+        }
+        if "mavfi_samples" not in metadata:
+            raise ModelError("is not a data set of mavfi", path=path)
+        if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
+            raise ModelError(
+                "made for another version, table of states or preprocessing; fly it anew", path=path
+            )
+        stack = StackMark(name=metadata["mavfi_stack"], digest=metadata["mavfi_stack_digest"])
+        return cls(flights=tuple(_flights(table)), preprocess=params, stack=stack)
+
+
+def _signature(preprocess: PreprocessParams) -> dict[str, str]:
+    return {
+        "mavfi_samples": SCHEMA,
+        "mavfi_states": states_digest(),
+        "mavfi_preprocess": preprocess.digest(),
+    }
+
+
+def _flights(table: Any) -> Iterator[FlightSamples]:
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    worlds, seeds = columns["world"], columns["seed"]
+    rows = len(worlds)
+    if not rows:
+        return
+    changed = (worlds[1:] != worlds[:-1]) | (seeds[1:] != seeds[:-1])
+    edges = [0, *(np.flatnonzero(changed) + 1).tolist(), rows]
+    coded = np.column_stack([columns[name] for name in _CODED]).astype(np.int16)
+    for start, end in itertools.pairwise(edges):
+        yield FlightSamples(
+            world=str(worlds[start]),
+            seed=int(seeds[start]),
+            stamps_s=columns["stamp_s"][start:end],
+            **{flag: columns[flag][start:end].astype(np.bool_) for flag in _FLAGS},
+            deltas=coded[start:end, :COUNT],
+            extended=coded[start:end, COUNT:],
+        )

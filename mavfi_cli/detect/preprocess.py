@@ -15,6 +15,9 @@ same state, saturated to 16 bits. It is 0 if there is no such sample. Yaw wraps:
 2 rad to below -2 rad, or back, counts as no change.
 
 docs/results/detectors.md compares this code with other combinations of sign and exponent.
+
+The extended states are `collision` of a report, and `plan_trajectory_seq` and
+`plan_future_collision_seq` of a plan. They are integers, which are their own codes.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.types import STATES, DType, FloatArray, Stage, State
+from mavfi_cli.core.types import BY_NAME, STATES, DType, FloatArray, Message, Stage, State
 
 Codes = NDArray[np.int16]
 IntArray = NDArray[np.int64]
@@ -37,6 +40,11 @@ IntArray = NDArray[np.int64]
 DETECTED: tuple[State, ...] = tuple(state for state in STATES if state.detected)
 NAMES: tuple[str, ...] = tuple(state.name for state in DETECTED)
 COUNT = len(DETECTED)
+
+EXTENDED = tuple(
+    BY_NAME[name] for name in ("collision", "plan_trajectory_seq", "plan_future_collision_seq")
+)
+Ranges = dict[str, tuple[int, int]]  # smallest and largest change of each extended state by name
 
 LIMIT = 32767  # maximum of a code and of a delta
 UNKNOWN = -32768  # reference of a state without an accepted sample
@@ -94,8 +102,13 @@ class PreprocessParams:
         if self.time_to_collision_ceiling <= self.time_to_collision_floor:
             raise ConfigError("must be above the floor", key="time_to_collision_ceiling")
 
-    def table(self) -> Codes:
-        """Return floor, ceiling and kind of each detected state, (3, COUNT)."""
+    def working_array(self) -> Codes:
+        """Create the working array (ROWS, COUNT) of the functions below, without references.
+
+        Row REFERENCE holds the reference codes of the deltas, PREVIOUS the codes before the last
+        sample, CODE and DELTA those of the last sample. FLOOR, CEILING and KIND define the
+        encoding.
+        """
         floors = {
             "time_to_collision": self.time_to_collision_floor,
             "waypoint_position": self.position_floor,
@@ -113,7 +126,10 @@ class PreprocessParams:
             ceiling = self.time_to_collision_ceiling if endless else LIMIT
             kind = _ANGLE if state.unit == "rad" else _REAL
             columns.append((floors[state.group], ceiling, kind))
-        return np.array(columns, np.int16).T.copy()
+        work = np.zeros((ROWS, COUNT), np.int16)
+        work[REFERENCE : PREVIOUS + 1] = UNKNOWN
+        work[FLOOR:] = np.array(columns, np.int16).T
+        return work
 
     def digest(self) -> str:
         """Return the SHA-256 of the parameters and of the coding."""
@@ -129,16 +145,13 @@ def _digest(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def working_array(params: PreprocessParams) -> Codes:
-    """Create the working array (ROWS, COUNT) of the functions below, without references.
-
-    Row REFERENCE holds the reference codes of the deltas, PREVIOUS the codes before the last
-    sample, CODE and DELTA those of the last sample. FLOOR, CEILING and KIND define the encoding.
-    """
-    work = np.zeros((ROWS, COUNT), np.int16)
-    work[REFERENCE : PREVIOUS + 1] = UNKNOWN
-    work[FLOOR:] = params.table()
-    return work
+def extended_codes(message: Message) -> list[tuple[int, int]]:
+    """Return place in EXTENDED and code of each extended state of a message."""
+    return [
+        (place, min(max(int(state.read(message, 0)), -LIMIT), LIMIT))
+        for place, state in enumerate(EXTENDED)
+        if isinstance(message, state.message)
+    ]
 
 
 @compiled

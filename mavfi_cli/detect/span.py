@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, Stage
-from mavfi_cli.detect.fitted import FittedDetector, Shapes
+from mavfi_cli.detect.base import FittedDetector, Shapes
 from mavfi_cli.detect.preprocess import COUNT, Codes, span
 
 MARGIN = 0.5  # codes are integers, so the first code outside the range exceeds this

@@ -14,7 +14,7 @@ from mavfi_cli.spec.stack import load_stack
 
 if TYPE_CHECKING:
     from mavfi_cli.detect.base import Detector
-    from mavfi_cli.detect.watch import ExtendedWatch
+    from mavfi_cli.detect.gate import ExtendedWatch
 
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
@@ -32,7 +32,7 @@ class DetectorConfig:
         model: Path of a model file; None selects the one shipped for the mission's stack.
         alarms_max: Number of consecutive alarms of a stage at which the vehicle holds and replans.
         any_stack: Allow a model for another stack than the mission's.
-        watch: Watched states: `paper` for the 13 states, `extended` adds those of `detect.watch`.
+        watch: Watched states: `paper` for the 13 states, `extended` adds three more.
     """
 
     name: str
@@ -82,13 +82,13 @@ def model_path(config: DetectorConfig, stack: str) -> Path | None:
     Args:
         stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
     """
-    from mavfi_cli.detect.model import shipped, shipped_stacks
+    from mavfi_cli.detect.base import shipped
 
     if config.model is not None:
         return Path(config.model)
     while stack:
         flown = load_stack(stack)
-        if flown.name in shipped_stacks() and (path := shipped(config.name, flown.name)).is_file():
+        if (path := shipped(config.name, flown.name)).is_file():
             return path
         stack = flown.base
     return None
@@ -105,8 +105,7 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
         ModelError: The model cannot be used, or is for another stack without `any_stack`.
         ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
     """
-    from mavfi_cli.detect.base import find_detector
-    from mavfi_cli.detect.fitted import FittedDetector
+    from mavfi_cli.detect.base import FittedDetector, find_detector
 
     path = model_path(config, stack)
     detector = find_detector(config.name, model=path, threshold=config.threshold)
@@ -131,8 +130,8 @@ def watch_of(config: DetectorConfig, detector: Detector) -> ExtendedWatch | None
     Raises:
         ConfigError: The model lacks ranges of the extended states.
     """
-    from mavfi_cli.detect.fitted import FittedDetector
-    from mavfi_cli.detect.watch import ExtendedWatch
+    from mavfi_cli.detect.base import FittedDetector
+    from mavfi_cli.detect.gate import ExtendedWatch
 
     if config.watch == PAPER:
         return None

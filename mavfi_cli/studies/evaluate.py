@@ -24,7 +24,7 @@ from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.installed import installed_versions
-from mavfi_cli.detect.model import Model, training_flights
+from mavfi_cli.detect.base import Model
 from mavfi_cli.spec.detector import detector_of, model_path
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan
 from mavfi_cli.studies.flying import fly
@@ -81,7 +81,7 @@ def require_held_out(plan: EvaluationPlan) -> None:
     for detector in map(plan.detector_config, plan.protectors):
         detector_of(detector, plan.base.stack)
         path = model_path(detector, plan.base.stack)
-        for flight in () if path is None else training_flights(Model.read(path).provenance):
+        for flight in () if path is None else Model.read(path).training_flights:
             seed = flight.rpartition("/")[2]
             if seed.isdigit() and int(seed) in plan.seeds:
                 raise ModelError(

@@ -9,9 +9,9 @@ from pathlib import Path
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.detect.dataset import Dataset
+from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.fit import check, fit
-from mavfi_cli.detect.model import Model
+from mavfi_cli.detect.offline import Dataset
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack

@@ -15,9 +15,8 @@ from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome, StackMark
-from mavfi_cli.detect.dataset import FlightSamples
 from mavfi_cli.detect.fit import KINDS
-from mavfi_cli.detect.offline import columns_of, flight_of
+from mavfi_cli.detect.offline import FlightSamples, columns_of
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.mission.run_folder import RESULT, Run, load_run
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
@@ -85,7 +84,9 @@ def fly_training(
 def _samples(run: Run, name: str) -> FlightSamples:
     assert run.trace is not None
     columns, plans = columns_of(run.trace), run.folder.read_plans()
-    return flight_of(columns, name, run.record.config["seed"], PreprocessParams(), plans)
+    return FlightSamples.of_trace(
+        columns, name, run.record.config["seed"], PreprocessParams(), plans
+    )
 
 
 def collect_flown(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:

@@ -20,8 +20,7 @@ from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.core.errors import ConfigError, LinkLost, ModelError
 from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect import base
-from mavfi_cli.detect.base import Detector
-from mavfi_cli.detect.fitted import FittedDetector
+from mavfi_cli.detect.base import Detector, FittedDetector
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, LIMIT, NAN_CODE
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport

@@ -6,15 +6,15 @@ from detect_builders import STACK, plan, trace
 
 from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.detect.dataset import Dataset
-from mavfi_cli.detect.offline import flight_of
+from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams
 
 
 def dataset(count=3, params=None):
     params = params or PreprocessParams()
     flights = tuple(
-        flight_of(trace(4.0, seed), "w", seed, params, [plan(12)] * seed) for seed in range(count)
+        FlightSamples.of_trace(trace(4.0, seed), "w", seed, params, [plan(12)] * seed)
+        for seed in range(count)
     )
     return Dataset(flights=flights, preprocess=params, stack=STACK)
 

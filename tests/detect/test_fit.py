@@ -1,4 +1,6 @@
+import itertools
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,9 +9,8 @@ from detect_builders import STACK
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import base, fit
-from mavfi_cli.detect.dataset import Dataset, FlightSamples
-from mavfi_cli.detect.preprocess import COUNT, NAMES, PreprocessParams
-from mavfi_cli.detect.watch import EXTENDED
+from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.preprocess import COUNT, EXTENDED, NAMES, PreprocessParams
 
 
 def flight(world, seed, rows=120):
@@ -47,19 +48,50 @@ def quick(monkeypatch):
     monkeypatch.setattr(fit, "STARTS", 2)
 
 
-def parts_of(dataset, places):
-    return [dataset.flights[place] for place in places]
+def parts_of(dataset, model, *uses):
+    """The flights of some parts of a model's split."""
+    named = {f"{each.world}/{each.seed}": each for each in dataset.flights}
+    return [named[name] for use in uses for name in model.provenance["split"][use]]
+
+
+def images_of(rows):
+    """Deltas and their mirror images, each written out."""
+    axes = [(NAMES.index(f"{p}x"), NAMES.index(f"{p}y"))
+            for p in ("waypoint_", "waypoint_v", "command_v")]  # fmt: skip
+    yaws = NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")
+    for row in rows:
+        for swapped, east, north in itertools.product((False, True), (1, -1), (1, -1)):
+            image = row.copy()
+            for x, y in axes:
+                image[x] = east * row[y if swapped else x]
+                image[y] = north * row[x if swapped else y]
+            for yaw in yaws:
+                image[yaw] = north * row[yaw]
+            yield image
+
+
+def with_deltas(dataset, **changes):
+    """The same flights, with other values in the sixth row of each."""
+    flights = []
+    for each in dataset.flights:
+        deltas = each.deltas.copy()
+        for name, value in changes.items():
+            deltas[5, NAMES.index(name)] = value
+        flights.append(replace(each, deltas=deltas))
+    return replace(dataset, flights=tuple(flights))
 
 
 def test_the_split_is_by_flight_alike_in_each_world_and_drawn(dataset):
-    split = fit.split(dataset, 1)
+    fitted, again, other = (fit.fit("l2", dataset, seed=seed) for seed in (1, 1, 2))
+    split = fitted.provenance["split"]
     parts = [split["train"], split["validation"], split["threshold"]]
     assert [len(part) for part in parts] == [10, 2, 8]
-    assert sorted(place for part in parts for place in part) == list(range(20))
+    flights = sorted(name for part in parts for name in part)
+    assert flights == sorted(f"{each.world}/{each.seed}" for each in dataset.flights)
+    assert sorted(fitted.training_flights) == flights
     for part in parts:
-        worlds = [dataset.flights[place].world for place in part]
-        assert abs(worlds.count("w0") - worlds.count("w1")) <= 0
-    assert fit.split(dataset, 1) == split != fit.split(dataset, 2)
+        assert 2 * sum(name.startswith("w0/") for name in part) == len(part)
+    assert again.provenance["split"] == split != other.provenance["split"]
 
 
 def test_too_few_flights_are_refused(dataset):
@@ -78,8 +110,7 @@ def test_bad_requests(dataset):
 
 def test_gad_is_warmed_by_the_flights_that_set_no_threshold(dataset):
     fitted = fit.fit("gad", dataset, n_sigma=6.5)
-    split = fit.split(dataset, 1)
-    learned = parts_of(dataset, [*split["train"], *split["validation"]])
+    learned = parts_of(dataset, fitted, "train", "validation")
     x = np.concatenate([each.of_stage(Stage.PLANNING) for each in learned])[:, 2].astype(float)
     assert fitted.arrays["count"][2] == len(x)
     assert fitted.arrays["mean"][2] == pytest.approx(x.mean())
@@ -94,12 +125,12 @@ def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
     fitted = fit.fit(kind, dataset)
     fitted.save(tmp_path / "m.json")
     detector = base.find_detector(kind, model=tmp_path / "m.json")
-    held_out = parts_of(dataset, fit.split(dataset, 1)["threshold"])
-    images = fit.mirrored(np.concatenate([each.deltas for each in held_out])).astype(np.int16)
-    largest = max(detector.score(deltas, Stage.CONTROL) for deltas in images)
+    held_out = parts_of(dataset, fitted, "threshold")
+    rows = np.unique(np.concatenate([each.deltas for each in held_out]), axis=0)
+    largest = max(detector.score(deltas, Stage.CONTROL) for deltas in images_of(rows))
     assert detector.threshold == largest > 0.0
     for each in held_out:
-        assert (fit.scores(detector, each) <= detector.threshold).all()
+        assert (each.scores(detector) <= detector.threshold).all()
 
 
 def test_range_holds_all_flights_and_their_mirror_images(dataset):
@@ -121,30 +152,21 @@ def test_a_model_tells_its_stack_and_what_all_flights_showed_of_the_extended_sta
     assert list(fitted.extended) == [state.name for state in EXTENDED]
 
 
-def test_mirror_images():
-    row = np.zeros((1, COUNT), np.int16)
-    place = NAMES.index
-    row[0, [place("waypoint_x"), place("command_vy"), place("command_yaw")]] = 2, 3, 1
-    images = {tuple(image) for image in fit.mirrored(row).tolist()}
-    assert len(images) == 8
-    assert tuple(row[0].tolist()) in images
-    assert all(sorted(map(abs, image)) == [0] * 10 + [1, 2, 3] for image in images)
-    assert {abs(image[place("command_yaw")]) for image in images} == {1}
-    swapped = [image for image in images if image[place("waypoint_y")] != 0]
-    assert len(swapped) == 4
-    assert all(abs(image[place("command_vx")]) == 3 for image in swapped)
+def test_mirror_images(dataset):
+    """East and north are mirrored and swapped; yaw is negated, and never swapped."""
+    fitted = fit.fit("range", with_deltas(dataset, waypoint_x=20, command_vy=30, command_yaw=10))
+    widest = {"waypoint_x": 20, "waypoint_y": 20, "command_vx": 30, "command_vy": 30,
+              "command_yaw": 10}  # fmt: skip
+    for name, value in widest.items():
+        place = NAMES.index(name)
+        assert fitted.arrays["highest"][place] == -fitted.arrays["lowest"][place] == value
+    others = [place for place, name in enumerate(NAMES) if name not in widest]
+    assert np.abs(fitted.arrays["highest"][others]).max() <= 1
 
 
 def test_components_of_a_vector_share_their_scale(dataset):
-    (one,) = [each for each in dataset.flights if each.seed == 0]
-    deltas = one.deltas.copy()
-    deltas[5, NAMES.index("command_vz")] = -4
-    changed = FlightSamples(
-        world="w", seed=99, stamps_s=one.stamps_s, reports=one.reports,
-        plan_steps=one.plan_steps, new_waypoint=one.new_waypoint, deltas=deltas,
-        extended=one.extended,
-    )  # fmt: skip
-    assert fit.scale_of([changed]).tolist() == [1, 2, 1, 1, 1, 1, 1, 1, 1, 4, 4, 4, 1]
+    fitted = fit.fit("l2", with_deltas(dataset, command_vz=-4))
+    assert fitted.arrays["scale"].tolist() == [1, 2, 1, 1, 1, 1, 1, 1, 1, 4, 4, 4, 1]
 
 
 def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
@@ -161,11 +183,9 @@ def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
     assert sum(len(part) for part in told["split"].values()) == told["flights"] == 20
 
 
-def test_trained_weights_reconstruct_better_than_the_first_ones(quick):
-    rows = fit.mirrored(flight("w", 1, 400).deltas).astype(float)
-    trained = fit.train_autoencoder(rows, rows, seed=1)
-    curve = np.array(trained.provenance["loss_curve"]["rows"])
-    assert trained.provenance["validation_error"] < curve[0, 2]
+def test_trained_weights_reconstruct_better_than_the_first_ones(dataset, quick):
+    told = fit.fit("aad", dataset).provenance
+    assert told["validation_error"] < told["loss_curve"]["rows"][0][2]
 
 
 def test_without_torch_only_the_autoencoder_is_missing(dataset, monkeypatch):

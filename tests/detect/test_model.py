@@ -7,13 +7,14 @@ from detect_builders import RANGES, STACK
 
 from mavfi_cli.core import installed
 from mavfi_cli.core.errors import ConfigError, ModelError
-from mavfi_cli.detect import base, model
+from mavfi_cli.detect import base
+from mavfi_cli.detect.base import Model, shipped
 from mavfi_cli.detect.gaussian import GaussianDetector
-from mavfi_cli.detect.model import Model
 from mavfi_cli.detect.preprocess import PreprocessParams
 
 SHAPES = GaussianDetector.shapes
 OURS = ["gad", "aad", "range", "l2"]
+STACKS = ["hardened", "mavbench"]
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_arrays_are_checked(path, value, problem):
 )  # fmt: skip
 @pytest.mark.parametrize("value", [0.0, -2.0])
 def test_thresholds_and_divisors_out_of_range_are_refused(tmp_path, name, array, value):
-    data = json.loads(model.shipped(name).read_text())
+    data = json.loads(shipped(name).read_text())
     data["arrays"][array][-1] = value
     path = tmp_path / "odd.json"
     path.write_text(json.dumps(data))
@@ -140,7 +141,7 @@ def test_a_number_that_is_not_finite_overwrites_nothing(path):
 @pytest.mark.parametrize("value", [0, -2.0, float("nan"), float("inf")])
 def test_thresholds_out_of_range(value):
     with pytest.raises(ConfigError, match="n sigma: must be a finite number above 0"):
-        model.checked_threshold(value, "n sigma")
+        base.checked_threshold(value, "n sigma")
 
 
 def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
@@ -150,15 +151,15 @@ def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
 
 
 def test_models_are_shipped_for_these_stacks():
-    assert model.shipped_stacks() == ["hardened", "mavbench"]
     for name in OURS:
-        assert base.find_detector(name).stack.name == model.DEFAULT_STACK
+        assert all(shipped(name, stack).is_file() for stack in STACKS)
+        assert base.find_detector(name).stack.name == base.DEFAULT_STACK
 
 
-@pytest.mark.parametrize("stack", model.shipped_stacks())
+@pytest.mark.parametrize("stack", STACKS)
 @pytest.mark.parametrize("name", OURS)
 def test_the_shipped_models_tell_where_they_come_from(name, stack):
-    path = model.shipped(name, stack)
+    path = shipped(name, stack)
     detector = base.find_detector(name, model=path)
     loaded = Model.load(path, name, type(detector).shapes)
     assert loaded.stack.name == stack
@@ -178,7 +179,7 @@ def test_a_plug_in_that_does_not_load_has_a_row_of_its_own(monkeypatch):
     )
     installed.installed.cache_clear()
     try:
-        rows = {row["name"]: row for row in model.listing()}
+        rows = {row["name"]: row for row in base.listing()}
     finally:
         installed.installed.cache_clear()
     assert rows["gone"]["told"].startswith("cannot be used: the plug-in 'gone'")

@@ -6,8 +6,8 @@ from detect_builders import plan, trace
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.detect import base
-from mavfi_cli.detect.offline import PlanStrike, columns_of, flight_of, plan_steps, replay
-from mavfi_cli.detect.preprocess import NAMES, PreprocessParams
+from mavfi_cli.detect.offline import FlightSamples, PlanStrike, columns_of, replay
+from mavfi_cli.detect.preprocess import NAMES
 
 
 def test_every_message_is_judged_once_and_in_order():
@@ -117,16 +117,15 @@ def test_steps_of_plans_are_what_the_gate_looks_at():
     """All steps, also those in which no code changes, with the other stages' states at 0."""
     flown = plan(20)
     flown.waypoints[9, 4:6] = -2.5, 2.5
-    steps = plan_steps(flown, PreprocessParams())
+    flight = FlightSamples.of_trace(trace(1.0), "w", 1, plans=[flown])
+    steps = flight.deltas[flight.plan_steps]
     assert steps.shape == (19, 13)
     changed = np.flatnonzero(steps.any(axis=1)).tolist()
     assert {8, 9} < set(changed)
     place = NAMES.index("waypoint_vx")
     assert steps[8, place] == -steps[9, place] == -2
-    flight = flight_of(trace(1.0), "w", 1, plans=[flown])
-    np.testing.assert_array_equal(flight.deltas[flight.plan_steps], steps)
-    assert not flight.deltas[flight.plan_steps][:, 9:].any()
-    assert plan_steps(plan(1), PreprocessParams()).shape == (0, 13)
+    assert not steps[:, 9:].any()
+    assert not FlightSamples.of_trace(trace(1.0), "w", 1, plans=[plan(1)]).plan_steps.any()
 
 
 def test_a_missing_column_is_named():
@@ -138,11 +137,11 @@ def test_a_missing_column_is_named():
 
 def test_a_real_flight_gives_samples(short_flight):
     columns = columns_of(pq.read_table(short_flight.trace))
-    flight = flight_of(columns, "farm", 5)
+    flight = FlightSamples.of_trace(columns, "farm", 5)
     assert flight.reports.sum() > 0
     assert flight.new_waypoint.sum() > 5
     ticks = flight.deltas[~flight.reports]
     assert len(ticks) > 100
     assert (ticks[:, NAMES.index("command_vx")] != 0).any()
-    again = flight_of(columns, "farm", 5)
+    again = FlightSamples.of_trace(columns, "farm", 5)
     np.testing.assert_array_equal(flight.deltas, again.deltas)

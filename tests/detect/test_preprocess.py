@@ -81,7 +81,7 @@ def test_yaw_wraps_and_its_sign_flip_elsewhere_does_not():
 
 def test_reports_and_ticks_write_only_what_is_theirs():
     keep = True
-    work = pre.working_array(PreprocessParams())
+    work = PreprocessParams().working_array()
     waypoints = np.zeros((2, 10))
     waypoints[1, 0] = 9.0
     pre.take_report(math.inf, 1, work)

@@ -8,9 +8,9 @@ from detect_builders import RANGES, command, plan, report, trace
 
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory
 from mavfi_cli.detect import base
-from mavfi_cli.detect.gate import Gate
-from mavfi_cli.detect.offline import flight_of
-from mavfi_cli.detect.watch import EXTENDED, ExtendedWatch, changes, ranges_of
+from mavfi_cli.detect.gate import ExtendedWatch, Gate
+from mavfi_cli.detect.offline import FlightSamples
+from mavfi_cli.detect.preprocess import EXTENDED
 
 OURS = ["gad", "aad", "range", "l2"]
 FIRST = plan()
@@ -162,23 +162,16 @@ def test_watching_more_changes_nothing_for_the_13_states(name):
         np.testing.assert_array_equal(array, wide.memory[part])
 
 
-def test_changes_and_their_ranges():
-    plans = [numbered(seq, known) for seq, known in ((1, 0), (2, 0), (4, 5), (-1, 5))]
-    found = changes(plans)
-    assert found.tolist() == [[0, 1, 0], [0, 1, 0], [0, 2, 5], [0, -5, 0]]
-    assert ranges_of(found) == {
-        "collision": (0, 0), "plan_trajectory_seq": (-5, 2), "plan_future_collision_seq": (0, 5),
-    }  # fmt: skip
-    assert changes([]).shape == (0, 3)
-    assert {state.message for state in EXTENDED} == {CollisionReport, Trajectory}
-
-
-def test_a_flight_tells_its_changes():
+def test_a_flight_tells_the_changes_of_its_messages():
     columns = trace(4.0)
     columns["collision"] = np.isfinite(columns["time_to_collision"])
-    flown = flight_of(columns, "w", 1, plans=[numbered(1), numbered(2, 3), numbered(3, 3)])
+    plans = [numbered(seq, known) for seq, known in ((1, 0), (2, 0), (4, 5), (-1, 5))]
+    flown = FlightSamples.of_trace(columns, "w", 1, plans=plans)
     assert flown.extended.shape == (len(flown.deltas), 3)
-    assert ranges_of(flown.extended) == {
-        "collision": (-1, 1), "plan_trajectory_seq": (0, 1), "plan_future_collision_seq": (0, 3),
-    }  # fmt: skip
-    assert not flown.extended[~(flown.reports | flown.plan_steps)].any()
+    first_steps = np.flatnonzero(flown.plan_steps)[:: len(FIRST.waypoints) - 1]
+    assert flown.extended[first_steps].tolist() == [[0, 1, 0], [0, 1, 0], [0, 2, 5], [0, -5, 0]]
+    assert set(flown.extended[flown.reports, 0].tolist()) == {-1, 0, 1}
+    others = flown.extended.copy()
+    others[first_steps], others[flown.reports] = 0, 0
+    assert not others.any()
+    assert {state.message for state in EXTENDED} == {CollisionReport, Trajectory}

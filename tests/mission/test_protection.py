@@ -13,7 +13,7 @@ from mavfi_cli.companion.protection import PASSED, Protection, Response
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, ModelError, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.detect import model
+from mavfi_cli.detect.base import shipped
 from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
@@ -176,12 +176,12 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
     mine = tmp_path / "mine.toml"
     mine.write_text('name = "mine"\nbase = "hardened"\nguards_tracking = false\n')
     for stack in ("mavbench", "hardened"):
-        assert path(stack) == path(stack, any_stack=True) == model.shipped("gad", stack)
+        assert path(stack) == path(stack, any_stack=True) == shipped("gad", stack)
     for stack, base in (
         ("mavbench-release", "mavbench"), ("mavbench-release:goal_tolerance_m=2.0", "mavbench"),
         (str(mine), "hardened"), ("hardened:guards_tracking=false", "hardened"),
     ):  # fmt: skip
-        assert path(stack) == path(stack, any_stack=True) == model.shipped("gad", base)
+        assert path(stack) == path(stack, any_stack=True) == shipped("gad", base)
         assert detector_of(DetectorConfig(name="gad", any_stack=True), stack).stack.name == base
     assert path("hardened", model="my.json") == Path("my.json")
     assert path("hardened", model="my.json", any_stack=True) == Path("my.json")
@@ -192,7 +192,7 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
     [
         ("mavbench-release", {}, r"made for the stack 'mavbench', not for 'mavbench-release'; "),
         ("mavbench:guards_tracking=true", {}, "mavfi train --stack mavbench:guards_tracking=true"),
-        ("mavbench", {"model": str(model.shipped("gad", "hardened"))},
+        ("mavbench", {"model": str(shipped("gad", "hardened"))},
          r"hardened/gad\.json: .*the stack 'hardened', not for 'mavbench'"),
     ],
 )  # fmt: skip
@@ -212,7 +212,7 @@ def test_a_stack_that_differs_in_nothing_needs_no_model_of_its_own():
 
 
 def test_a_model_of_the_stack_as_it_once_was_is_refused(tmp_path):
-    held = json.loads(model.shipped("gad").read_text())
+    held = json.loads(shipped("gad").read_text())
     held["stack"]["digest"] = "0" * 64
     (tmp_path / "old.json").write_text(json.dumps(held))
     config = DetectorConfig(name="gad", model=str(tmp_path / "old.json"))

@@ -6,8 +6,7 @@ import shutil
 
 import pytest
 
-from mavfi_cli.detect import model as model_file
-from mavfi_cli.detect.base import find_detector
+from mavfi_cli.detect.base import Model, find_detector, shipped
 
 
 def refused(mavfi, tmp_path, *arguments):
@@ -35,7 +34,7 @@ def test_bad_input_gets_one_line(mavfi, tmp_path, option, given, told):
 
 
 def test_seeds_of_the_training_are_refused_by_name(mavfi, tmp_path):
-    flight = model_file.Model.read(model_file.shipped("gad")).provenance["split"]["train"][0]
+    flight = Model.read(shipped("gad")).provenance["split"]["train"][0]
     line = refused(mavfi, tmp_path, "--detector", "gad", "--first-seed", flight.split("/")[1])
     assert "gad was made with the flight train-" in line
 
@@ -53,17 +52,15 @@ def test_the_list_names_model_threshold_and_training(mavfi):
     stacks = ("hardened", "mavbench")
     assert {(n, s) for n in ("gad", "aad", "range", "l2") for s in stacks} <= set(rows)
     aad = rows["aad", "mavbench"]
-    assert aad["model"] == str(model_file.shipped("aad"))
-    assert (
-        aad["threshold"] == model_file.Model.read(model_file.shipped("aad")).provenance["threshold"]
-    )
+    assert aad["model"] == str(shipped("aad"))
+    assert aad["threshold"] == Model.read(shipped("aad")).provenance["threshold"]
     text = mavfi("detect", "list").stdout
     assert f"threshold {aad['threshold']:.6g}" in text
     assert f"{aad['provenance']['flights']} flights in train-0.05-3" in text
 
 
 def test_the_list_tells_of_a_model_that_cannot_be_used(mavfi, tmp_path):
-    shutil.copy(model_file.shipped("gad"), tmp_path)
+    shutil.copy(shipped("gad"), tmp_path)
     (tmp_path / "aad.json").write_text("{")
     done = mavfi("detect", "list", "--models", tmp_path)
     assert done.returncode == 0

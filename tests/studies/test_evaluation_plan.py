@@ -10,10 +10,9 @@ import pytest
 from mavfi_cli.analysis.detector_pairs import NONE
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import BY_NAME, DType
-from mavfi_cli.detect import model as model_file
+from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.gaussian import GaussianDetector
-from mavfi_cli.detect.model import Model, training_flights
-from mavfi_cli.detect.watch import EXTENDED
+from mavfi_cli.detect.preprocess import EXTENDED
 from mavfi_cli.spec.stack import load_stack
 from mavfi_cli.studies.evaluate import require_held_out
 from mavfi_cli.studies.evaluation_plan import EvaluationPlan
@@ -132,7 +131,7 @@ def test_a_model_that_is_missing_or_damaged_is_refused(models):
 
 
 def test_all_parts_of_the_split_are_seen(models):
-    flights = training_flights(model_file.Model.read(models / "gad.json").provenance)
+    flights = Model.read(models / "gad.json").training_flights
     assert sorted(flights) == ["train-0.05-3/40", "train-0.2-5/41"]
 
 

@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from mavfi_cli.detect import base, fit, model
-from mavfi_cli.detect.dataset import Dataset
-from mavfi_cli.detect.model import Model
+from mavfi_cli.detect import base
+from mavfi_cli.detect.base import Model, shipped
+from mavfi_cli.detect.offline import Dataset
 
 WORLD, FIRST_SEED, FLIGHTS = "train-0.2-5", 10_075, 10
 FLOWN = {f"{WORLD}/{seed}" for seed in range(FIRST_SEED, FIRST_SEED + FLIGHTS)}
@@ -34,9 +34,7 @@ def flights_of(told):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder, kind):
-    new, ours = (
-        json.loads(path.read_text()) for path in (folder / f"{kind}.json", model.shipped(kind))
-    )
+    new, ours = (json.loads(path.read_text()) for path in (folder / f"{kind}.json", shipped(kind)))
     for key in ("schema", "mavfi", "states", "preprocess", "preprocess_digest", "detector"):
         assert new[key] == ours[key]
     assert set(new["arrays"]) == set(ours["arrays"])
@@ -61,12 +59,10 @@ def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_mad
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
     detector = base.find_detector(kind)
-    setting = set(Model.read(model.shipped(kind)).provenance["split"]["threshold"]) & FLOWN
+    setting = set(Model.read(shipped(kind)).provenance["split"]["threshold"]) & FLOWN
     flights = Dataset.load(folder / "dataset.parquet").flights
     scores = [
-        fit.scores(detector, flight)
-        for flight in flights
-        if f"{flight.world}/{flight.seed}" in setting
+        flight.scores(detector) for flight in flights if f"{flight.world}/{flight.seed}" in setting
     ]
     assert len(scores) == len(setting) > 0
     assert np.concatenate(scores).max() <= detector.threshold
