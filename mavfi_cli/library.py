@@ -36,7 +36,7 @@ def fly(
             and `detector` are their dataclasses or mappings with the same keys.
 
     Raises:
-        UnknownKey: `MissionConfig` does not have this setting. Names the nearest.
+        ConfigError: `MissionConfig` does not have this setting. Names the nearest.
         ConfigError: A setting has the wrong type or is out of range.
         MavfiError: The mission could not begin, or its record could not be written.
     """

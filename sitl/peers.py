@@ -83,7 +83,7 @@ class Peers(Generic[P]):
         """Open an endpoint, whose transports `make` turns into peers; else close all.
 
         Raises:
-            EndpointError: It cannot be opened.
+            LinkError: It cannot be opened.
         """
         signing = self._signing
         try:

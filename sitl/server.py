@@ -309,7 +309,7 @@ class _Realtime:
     """The clients of a simulation that is paced by the wall clock, any number of them.
 
     Raises:
-        EndpointError: An endpoint cannot be opened.
+        LinkError: An endpoint cannot be opened.
         ConfigError: The file of the signing key cannot be read.
     """
 

@@ -15,12 +15,12 @@ from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Setting, Spec
 from mavfi_cli.core.config import (
     Shipped,
+    parse_toml,
     read_text,
     structure,
-    syntax_error,
     toml_text,
 )
-from mavfi_cli.core.errors import ConfigError, UnknownKey, named_member
+from mavfi_cli.core.errors import ConfigError, named_member
 
 _PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
@@ -47,11 +47,7 @@ def load_spec(name: str) -> Spec:
 
 def parse_spec(text: str, path: Path) -> Spec:
     """Parse a specification in TOML; `path` is for messages and the default name."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise syntax_error(error, path) from None
-    return _read_spec(data, path, text)
+    return _read_spec(parse_toml(text, path), path, text)
 
 
 def _read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
@@ -131,7 +127,7 @@ class _Reader:
         """Refuse keys that are not among the names."""
         for key in data:
             if key not in names:
-                raise UnknownKey(f"{prefix}{key}", names, path=self._path)
+                raise ConfigError.unknown_key(f"{prefix}{key}", names, path=self._path)
 
     def table(self, value: Any, key: str) -> dict[str, Any]:
         """Require that the value of a key is a table."""
@@ -182,7 +178,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
             as in TOML, and all values may be written as one TOML list.
 
     Raises:
-        UnknownKey: no such factor; names the nearest.
+        ConfigError: no such factor; names the nearest.
         ConfigError: a change is not KEY=VALUE, the specification lacks this factor of faults, or it
             cannot have these values.
     """
@@ -212,7 +208,7 @@ def folder_name(text: str) -> str:
 
 def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
     if key not in NAMES:
-        raise UnknownKey(key, NAMES)
+        raise ConfigError.unknown_key(key, NAMES)
     fixed, crossed = data.setdefault("mission", {}), data.setdefault("factors", {})
     found = [table for table in (crossed, *data["setting"]) if key in table]
     for table in found:

@@ -110,7 +110,7 @@ class LocalWorkers(Workers):
         """Start a mission.
 
         Raises:
-            ForkServerFailed: the processes cannot be started.
+            MavfiError: the processes cannot be started.
         """
         channel = self._server.start(changes, out, limit_s)
         self._selector.register(channel, selectors.EVENT_READ)

@@ -94,7 +94,7 @@ def vpm(
     In the F-1 visual performance model a vehicle flies as fast as it can stop within its sensing
     range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
     """
-    from mavfi_cli.core.config import require_distinct
+    from mavfi_cli.core.errors import ConfigError
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.model import model_csv, model_lines, redundancy_csv
     from mavfi_cli.vpm.model import schemes_with
@@ -113,7 +113,9 @@ def vpm(
     if options["models"] is not None and options["train"]:
         raise click.UsageError("--models and --train exclude each other")
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
-    require_distinct([vehicle.name for vehicle in chosen], "vehicle")
+    names = [vehicle.name for vehicle in chosen]
+    if twice := [name for place, name in enumerate(names) if name in names[:place]]:
+        raise ConfigError(f"{twice[0]} is named twice", key="vehicle")
     choices = _choices(options)
     platform = choices.platform
     known = overheads(options["overheads"], None if platform is None else platform.name)

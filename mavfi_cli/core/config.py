@@ -15,7 +15,7 @@ import cattrs
 from cattrs import AttributeValidationNote, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, make_mapping_structure_fn
 
-from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.core.errors import ConfigError, UnknownName
 
 T = TypeVar("T")
 
@@ -25,8 +25,8 @@ def load_toml(path: Path, cls: type[T]) -> T:
 
     Raises:
         ConfigError: The file cannot be read or parsed, a key is missing or has the wrong type, or
-            `cls` rejects a value (a ValueError from `__post_init__`). Names file, line and key.
-        UnknownKey: `cls` does not have this key. Names the nearest key.
+            `cls` rejects a value (a ValueError from `__post_init__`) or does not have a key. Names
+            file, line and key, and the nearest key.
     """
     data, text = read_toml(path)
     return structure(data, cls, path=path, text=text)
@@ -41,10 +41,19 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         ConfigError: The file cannot be read or parsed. Names file and line.
     """
     text = read_text(path)
+    return parse_toml(text, path), text
+
+
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """Parse TOML. A ConfigError names `path`, and the line if the parser reports one."""
     try:
-        return tomllib.loads(text), text
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise syntax_error(error, path) from None
+        problem, at, place = str(error).rpartition(" (at line ")
+        if not at:
+            raise ConfigError(str(error), path=path) from None
+        line, _, column = place.rstrip(")").partition(", ")
+        raise ConfigError(f"{problem} ({column})", path=path, line=int(line)) from None
 
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")  # a key that needs no quotes
@@ -121,15 +130,6 @@ class Shipped:
         return str(name)
 
 
-def syntax_error(error: tomllib.TOMLDecodeError, path: Path) -> ConfigError:
-    """Convert a TOML syntax error, with its line if the parser reports one."""
-    problem, at, place = str(error).rpartition(" (at line ")
-    if not at:
-        return ConfigError(str(error), path=path)
-    line, _, column = place.rstrip(")").partition(", ")
-    return ConfigError(f"{problem} ({column})", path=path, line=int(line))
-
-
 def structure(
     data: Mapping[str, Any], cls: type[T], *, path: Path | None = None, text: str = ""
 ) -> T:
@@ -142,7 +142,7 @@ def structure(
         key, error = "", extra
     if isinstance(error, _Extra):
         key = f"{key}.{error.key}".lstrip(".")
-        raise UnknownKey(key, error.known, path=path, line=_line_of(text, key))
+        raise ConfigError.unknown_key(key, error.known, path=path, line=_line_of(text, key))
     problem = "is missing" if isinstance(error, KeyError) else str(error)
     raise ConfigError(problem, path=path, line=_line_of(text, key), key=key)
 
@@ -285,10 +285,3 @@ def _table_of(head: str, counts: dict[str, int]) -> str:
         f"{part.strip()}[{counts[name]}]" if name in counts else part.strip()
         for part, name in zip(parts, names, strict=True)
     )
-
-
-def require_distinct(names: Sequence[str], key: str) -> None:
-    """Raise ConfigError for the setting `key` if a name occurs twice."""
-    for place, name in enumerate(names):
-        if name in names[:place]:
-            raise ConfigError(f"{name} is named twice", key=key)

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 E = TypeVar("E", bound=Enum)
 
@@ -76,19 +76,13 @@ class ConfigError(MavfiError):
         named = f"{key}: " if key else ""
         super().__init__(f"{place}{named}{problem}")
 
-
-class UnknownKey(ConfigError):
-    """A TOML key that no setting has. Suggests the nearest known key."""
-
-    def __init__(
-        self, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
-    ) -> None:
-        super().__init__(
-            f"unknown key; {_suggestion(key.rsplit('.', 1)[-1], known)}",
-            path=path,
-            line=line,
-            key=key,
-        )
+    @classmethod
+    def unknown_key(
+        cls, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
+    ) -> Self:
+        """Return the error about a key that no setting has. It suggests the nearest known key."""
+        problem = f"unknown key; {_suggestion(key.rpartition('.')[2], known)}"
+        return cls(problem, path=path, line=line, key=key)
 
 
 class WorldError(MavfiError):
@@ -96,48 +90,15 @@ class WorldError(MavfiError):
 
 
 class LinkError(MavfiError):
-    """The MAVLink connection failed."""
-
-
-class EndpointError(LinkError):
-    """A URL that is malformed or cannot be opened (port in use, no such device)."""
-
-    def __init__(self, url: str, problem: str) -> None:
-        super().__init__(f"{url}: {problem}")
+    """The MAVLink connection failed or cannot be opened, or what answers cannot be flown."""
 
 
 class NoAutopilot(LinkError):
     """No autopilot heartbeat arrived."""
 
-    def __init__(self, url: str, waited_s: float) -> None:
-        super().__init__(f"no autopilot at {url}: no heartbeat within {waited_s:g} s")
-
-
-class UnfitAutopilot(LinkError):
-    """An autopilot that is not flown: of an unknown kind, or one of two on a link."""
-
-    def __init__(self, url: str, what: str) -> None:
-        super().__init__(f"{url}: {what}")
-
-
-class NoCamera(LinkError):
-    """No depth camera answered, so the vehicle would fly blind."""
-
-    def __init__(self, url: str, waited_s: float) -> None:
-        super().__init__(
-            f"{url}: no camera (MAVLink component 100) answered within {waited_s:g} s, so the "
-            "vehicle does not take off; --eyes starts one"
-        )
-
 
 class CommandRefused(LinkError):
-    """The autopilot refused a command. Quotes the autopilot's status texts."""
-
-    def __init__(self, command: str, result: str, texts: Iterable[str] = ()) -> None:
-        words = "; ".join(texts)
-        super().__init__(
-            f"autopilot refused {command}: {result}" + (f" ({words})" if words else "")
-        )
+    """The autopilot refused a command."""
 
 
 class LinkLost(LinkError):
@@ -145,16 +106,7 @@ class LinkLost(LinkError):
 
 
 class CannotLift(MavfiError):
-    """A vehicle whose rotors cannot lift its payload. Gives the numbers."""
-
-    def __init__(
-        self, vehicle: str, *, pull_n: float, mass_kg: float, compute_kg: float, limit_kg: float
-    ) -> None:
-        super().__init__(
-            f"vehicle {vehicle!r} cannot lift its compute: {pull_n:.2f} N of rotor pull lift less "
-            f"than {limit_kg:.3f} kg, {mass_kg:.3f} kg + {compute_kg:.3f} kg of compute are "
-            f"{mass_kg + compute_kg:.3f} kg"
-        )
+    """A vehicle whose rotors cannot lift its payload."""
 
 
 class VehicleProcessError(MavfiError):
@@ -182,20 +134,6 @@ class FaultError(MavfiError):
 
 class FaultSpecError(FaultError):
     """An inconsistent fault description."""
-
-
-class BitOutsideWidth(FaultError):
-    """A bit that the type or register does not have."""
-
-    def __init__(self, bit: int, kind: str, width: int) -> None:
-        super().__init__(f"bit {bit} is outside {kind}, which has bits 0 to {width - 1}")
-
-
-class FieldUnavailable(FaultError):
-    """A field that the type lacks, or that has too few bits for the fault."""
-
-    def __init__(self, field: str, kind: str, known: Iterable[str]) -> None:
-        super().__init__(f"{kind} has no field {field!r}; it has: {', '.join(known)}")
 
 
 class TracingForbidden(FaultError):

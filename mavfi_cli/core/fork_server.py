@@ -75,10 +75,6 @@ class _Module(Protocol):
         """Do a task; the folder that it left, in `folder`."""
 
 
-class ForkServerFailed(MavfiError):
-    """The process that forks the workers could not start."""
-
-
 # The client's side --------------------------------------------------------------------------------
 
 
@@ -97,7 +93,7 @@ class ForkServer:
             folder: for what the worker leaves, its standard error and temporary files included.
 
         Raises:
-            ForkServerFailed: the server cannot be started.
+            MavfiError: the server cannot be started.
         """
         order = json.dumps({"task": task, "folder": str(folder), "limit_s": limit_s}).encode()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -111,7 +107,7 @@ class ForkServer:
                     continue
                 undo.pop_all()
                 return ours
-        raise ForkServerFailed("the process that forks the workers ends at once")
+        raise MavfiError("the process that forks the workers ends at once")
 
     def _running(self) -> socket.socket:
         if self._control is not None:
@@ -133,7 +129,7 @@ class ForkServer:
         if said != _READY:
             ours.close()
             self._process.wait()
-            raise ForkServerFailed("the process that forks the workers could not start")
+            raise MavfiError("the process that forks the workers could not start")
         self._control = ours
         return ours
 

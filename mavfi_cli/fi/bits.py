@@ -13,7 +13,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.core.errors import BitOutsideWidth, FieldUnavailable
+from mavfi_cli.core.errors import FaultError
 
 Scalar = float | int | bool
 
@@ -39,13 +39,16 @@ class BitType:
         """The bits of `field`.
 
         Raises:
-            FieldUnavailable: the type has no such field.
+            FaultError: the type has no such field.
         """
         try:
             return self.fields[field]
         except KeyError:
-            known = [known.value for known in self.fields]
-            raise FieldUnavailable(field.value, self.name, known) from None
+            raise self.lacks(field.value, [known.value for known in self.fields]) from None
+
+    def lacks(self, field: str, known: Iterable[str]) -> FaultError:
+        """The error about a field that the type does not have."""
+        return FaultError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
 
 
 def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
@@ -81,12 +84,14 @@ def mask_of(bits: Iterable[int], kind: BitType) -> int:
     """The xor mask of distinct bits.
 
     Raises:
-        BitOutsideWidth: a bit that `kind` does not have.
+        FaultError: a bit that `kind` does not have.
     """
     mask = 0
     for bit in bits:
         if not 0 <= bit < kind.width:
-            raise BitOutsideWidth(bit, kind.name, kind.width)
+            raise FaultError(
+                f"bit {bit} is outside {kind.name}, which has bits 0 to {kind.width - 1}"
+            )
         mask |= 1 << bit
     return mask
 
@@ -102,13 +107,13 @@ def draw_bits(
     """`count` distinct bits of a field, uniformly, ascending.
 
     Raises:
-        FieldUnavailable: the type has no such field, or the field has fewer than `count` bits.
+        FaultError: the type has no such field, or the field has fewer than `count` bits.
     """
     candidates = kind.field_bits(field)
     if not 1 <= count <= len(candidates):
         wanted = f"{field.value} of at least {count} bits"
         known = [f"{name.value} ({len(bits)})" for name, bits in kind.fields.items()]
-        raise FieldUnavailable(wanted, kind.name, known)
+        raise kind.lacks(wanted, known)
     chosen = rng.choice(len(candidates), size=count, replace=False)
     return tuple(sorted(candidates[int(index)] for index in chosen))
 

@@ -38,8 +38,8 @@ def inject(
     Raises:
         FaultSpecError: The type of the value is not supported, or the array is empty.
         UnknownName: No field has this name.
-        FieldUnavailable: The type lacks the field, or the field has too few bits.
-        BitOutsideWidth: The type lacks a bit of `exact_bits`.
+        FaultError: The type lacks the field or a bit of `exact_bits`, or the field has too few
+            bits.
     """
     corrupted: NDArray[Any] = np.array(value)
     kind = NUMPY_TYPES.get(corrupted.dtype.name)

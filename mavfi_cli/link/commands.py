@@ -186,7 +186,9 @@ class Commands:
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
         said = (each for each in texts.since(self._texts_before) if each.severity <= _WARNING)
-        raise CommandRefused(command, result, dict.fromkeys(text.text for text in said))
+        words = "; ".join(dict.fromkeys(text.text for text in said))
+        quoted = f" ({words})" if words else ""
+        raise CommandRefused(f"autopilot refused {command}: {result}{quoted}")
 
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
         """Send a command until it is accepted. Return True from then on.

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from mavfi_cli.core.errors import EndpointError
+from mavfi_cli.core.errors import LinkError
 from mavfi_cli.link.codec import Message, dialect
 
 _CONNECT_TIMEOUT_S = 5.0
@@ -48,21 +48,20 @@ class Endpoint:
         """Open the bound or connected socket of a network URL, `beyond` this machine if allowed.
 
         Raises:
-            EndpointError: As in `open_transport`.
+            LinkError: As in `open_transport`.
         """
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
         try:
             found = socket.getaddrinfo(self.host, self.port, type=kind)
         except (OSError, UnicodeError):
-            raise EndpointError(self.url, f"no such host {self.host!r}") from None
+            raise LinkError(f"{self.url}: no such host {self.host!r}") from None
         found.sort(key=lambda entry: entry[0] != socket.AF_INET)  # IPv4 first
         family, address = found[0][0], str(found[0][4][0])
         if not (beyond or ipaddress.ip_address(address.partition("%")[0]).is_loopback):
-            raise EndpointError(
-                self.url,
-                f"{address} is beyond this machine, where MAVLink signing is required: "
-                "give --key-file",
+            raise LinkError(
+                f"{self.url}: {address} is beyond this machine, where MAVLink signing is required: "
+                "give --key-file"
             )
         opened = socket.socket(family, kind)
         try:
@@ -79,7 +78,7 @@ class Endpoint:
                     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except OSError as error:
             opened.close()
-            raise EndpointError(self.url, self._refusal(error, address)) from None
+            raise LinkError(f"{self.url}: {self._refusal(error, address)}") from None
         return opened
 
     def _refusal(self, error: OSError, address: str) -> str:
@@ -99,13 +98,13 @@ class Endpoint:
         """Return the connected stream socket that the parent process left open.
 
         Raises:
-            EndpointError: The descriptor is not one.
+            LinkError: The descriptor is not one.
         """
         try:
             connection = socket.socket(fileno=self.fd)
         except OSError as error:
             problem = "not a socket" if error.errno == errno.ENOTSOCK else "not an open descriptor"
-            raise EndpointError(self.url, problem) from None
+            raise LinkError(f"{self.url}: {problem}") from None
         problem = "" if connection.type == socket.SOCK_STREAM else "not a stream socket"
         try:
             connection.getpeername()
@@ -113,7 +112,7 @@ class Endpoint:
             problem = "not a connected socket"
         if problem:
             connection.detach()
-            raise EndpointError(self.url, problem)
+            raise LinkError(f"{self.url}: {problem}")
         return connection
 
 
@@ -121,20 +120,20 @@ def parse_endpoint(url: str) -> Endpoint:
     """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
     Raises:
-        EndpointError: The scheme is unknown (lists the known ones), or the rest does not fit it.
+        LinkError: The scheme is unknown (lists the known ones), or the rest does not fit it.
     """
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")
     scheme = _ALIASES.get(word, word)
     if scheme not in _FORMS:
-        raise EndpointError(url, f"unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
-    malformed = EndpointError(url, f"not of the form {_FORMS[scheme]}")
+        raise LinkError(f"{url}: unknown kind of endpoint; known: {', '.join(_FORMS.values())}")
+    malformed = LinkError(f"{url}: not of the form {_FORMS[scheme]}")
 
     def number(text: str, largest: int) -> int:
         if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
             raise malformed
         if int(text) > largest:
-            raise EndpointError(url, f"{text} is more than {largest}")
+            raise LinkError(f"{url}: {text} is more than {largest}")
         return int(text)
 
     if scheme == "fd":
@@ -152,7 +151,7 @@ def parse_endpoint(url: str) -> Endpoint:
         raise malformed
     port = number(match["port"], 65_535)
     if port == 0 and scheme not in LISTENING:
-        raise EndpointError(url, "port 0 cannot be called")
+        raise LinkError(f"{url}: port 0 cannot be called")
     return Endpoint(url=url, scheme=scheme, host=host or _LOOPBACK, port=port)
 
 

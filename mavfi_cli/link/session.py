@@ -13,7 +13,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.core.errors import LinkError, NoAutopilot, NoCamera, UnfitAutopilot
+from mavfi_cli.core.errors import LinkError, NoAutopilot
 from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect, text_messages
@@ -313,7 +313,9 @@ class OffboardSession:
         self._require_fit()
         if not self.telemetry.heard:
             if self._elapsed_s() >= self._settings.connect_timeout_s:
-                raise NoAutopilot(self._url, self._settings.connect_timeout_s)
+                waited_s = self._settings.connect_timeout_s
+                told = f"no autopilot at {self._url}: no heartbeat within {waited_s:g} s"
+                raise NoAutopilot(told)
             return
         if not self._greeted:
             self._greeted, self._phase_since_s = True, self._now_s
@@ -327,20 +329,24 @@ class OffboardSession:
     def _require_fit(self) -> None:
         """Refuse what cannot be flown, until the vehicle has taken off."""
         if self.telemetry.unfit:
-            raise UnfitAutopilot(self._url, self.telemetry.unfit)
+            raise LinkError(f"{self._url}: {self.telemetry.unfit}")
 
     def _knows_place(self) -> bool:
         """Return True once a needed camera has told the origin, if it knows one, and a state came.
 
         Raises:
-            NoCamera: No camera has answered for some seconds.
+            LinkError: No camera has answered for some seconds.
             CommandRefused: One of them did not arrive within the time to get ready.
         """
         settings, asked = self._settings, self._origin_asked
         if not settings.needs_camera or asked is None:
             return True
         if not self._camera_heard and self._elapsed_s() >= settings.camera_timeout_s:
-            raise NoCamera(self._url, settings.camera_timeout_s)
+            raise LinkError(
+                f"{self._url}: no camera (MAVLink component 100) answered within "
+                f"{settings.camera_timeout_s:g} s, so the vehicle does not take off; "
+                "--eyes starts one"
+            )
         self._require_soon()
         if self._elapsed_s() < _LISTEN_S:
             return False

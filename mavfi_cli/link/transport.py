@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.core.errors import LinkError, LinkLost
 from mavfi_cli.link.codec import Codec, begins_with_frame, frame_length
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, is_of_autopilot, parse_endpoint
 
@@ -117,7 +117,7 @@ def open_transport(
         admits: Tells from a datagram of an unknown sender whether `udpin` takes it for its peer.
 
     Raises:
-        EndpointError: The URL is malformed, its scheme is unknown, its port is in use, nobody
+        LinkError: The URL is malformed, its scheme is unknown, its port is in use, nobody
             listens, the device does not exist, or an unsigned link reaches beyond this machine.
     """
     endpoint = parse_endpoint(url)
@@ -327,7 +327,7 @@ class _SerialPort(Transport):
                 exclusive=True,
             )  # fmt: skip
         except (*self._failures, ValueError) as error:
-            raise EndpointError(endpoint.url, _serial_reason(error, endpoint.device)) from None
+            raise LinkError(f"{endpoint.url}: {_serial_reason(error, endpoint.device)}") from None
 
     def send(self, data: bytes) -> None:
         try:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.config import Shipped, read_toml, structure
-from mavfi_cli.core.errors import ConfigError, UnknownKey
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import StackMark
 from mavfi_cli.spec.platform import KERNELS
 
@@ -168,7 +168,7 @@ def load_stack(text: str) -> Stack:
 
     Raises:
         UnknownName: No shipped stack has this name, and it is not a path to a TOML file.
-        UnknownKey: No stack has this key. Suggests the nearest.
+        ConfigError: No stack has this key. Suggests the nearest.
         ConfigError: The file or a value cannot be used, a key is missing, or the stack is
             inconsistent.
     """
@@ -221,4 +221,4 @@ def _changes(text: str) -> dict[str, Any]:
 def _require_known(values: Mapping[str, Any], path: Path | None) -> None:
     for key in values:
         if key not in (*KEYS, *_ABOUT):
-            raise UnknownKey(key, (*KEYS, *_ABOUT), path=path)
+            raise ConfigError.unknown_key(key, (*KEYS, *_ABOUT), path=path)

@@ -14,7 +14,6 @@ from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.config import require_distinct
 from mavfi_cli.core.errors import ConfigError, UnknownName
 
 
@@ -54,7 +53,8 @@ def require_named(
     """
     if len(names) < least:
         raise ConfigError("name at least one", key=key)
-    for name in names:
+    for place, name in enumerate(names):
         if known is not None and name not in known:
             raise UnknownName(key, name, known)
-    require_distinct(names, key)
+        if name in names[:place]:
+            raise ConfigError(f"{name} is named twice", key=key)

@@ -178,12 +178,12 @@ class ModelInputs:
 
     def too_heavy(self, copies: int) -> CannotLift:
         """The error that says why this many boards cannot be lifted."""
+        own_kg, compute_kg = self.vehicle.mass_kg, self.carried_kg(copies)
+        limit_kg = self.mass_kg(copies) * (1.0 + self.acceleration_mps2(copies) / GRAVITY_MPS2)
         return CannotLift(
-            self.vehicle.name,
-            pull_n=self.pull_n,
-            mass_kg=self.vehicle.mass_kg,
-            compute_kg=self.carried_kg(copies),
-            limit_kg=self.mass_kg(copies) * (1.0 + self.acceleration_mps2(copies) / GRAVITY_MPS2),
+            f"vehicle {self.vehicle.name!r} cannot lift its compute: {self.pull_n:.2f} N of rotor "
+            f"pull lift less than {limit_kg:.3f} kg, {own_kg:.3f} kg + {compute_kg:.3f} kg of "
+            f"compute are {own_kg + compute_kg:.3f} kg"
         )
 
 

@@ -89,7 +89,7 @@ class Router:
         take: Handles a message. Returns True if it goes to the other peers, too.
 
     Raises:
-        EndpointError: An endpoint cannot be opened.
+        LinkError: An endpoint cannot be opened.
     """
 
     def __init__(

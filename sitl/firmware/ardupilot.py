@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import EndpointError, VehicleProcessError
+from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from mavfi_cli.core.frames import Vector
 from sitl.firmware.autopilot import FirmwareProcess, require_program
 from sitl.firmware.sensors import Sensors
@@ -46,7 +46,7 @@ class ArduPilotLink:
         port: UDP port that ArduPilot sends to; 0 for any.
 
     Raises:
-        EndpointError: The port cannot be opened.
+        LinkError: The port cannot be opened.
     """
 
     step_s = STEP_S
@@ -60,14 +60,14 @@ class ArduPilotLink:
             self._socket.bind((_LOOPBACK, port))
         except OSError as error:
             self._socket.close()
-            raise EndpointError(f"udp port {port}", error.strerror or str(error)) from None
+            raise LinkError(f"udp port {port}: {error.strerror or error}") from None
         self._peer: Any = None
         self._frame = -1
         self._throttles = np.zeros(4)
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> ArduPilotLink:
-        """Open ArduPilot's port, or any if we start it. Raises EndpointError."""
+        """Open ArduPilot's port, or any if we start it. Raises LinkError."""
         return cls(sensors, 0 if ours else PORT)
 
     @staticmethod

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.core.errors import EndpointError, LinkLost, VehicleProcessError
+from mavfi_cli.core.errors import LinkError, LinkLost, VehicleProcessError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
@@ -95,13 +95,13 @@ class Px4Link:
         """Open the first free port of PX4's instances, of the first one unless we start it.
 
         Raises:
-            EndpointError: All of them are in use.
+            LinkError: All of them are in use.
         """
         *others, last = range(PORT, PORT + (_INSTANCES if ours else 1))
         for port in others:
             if _is_running(port - PORT):
                 continue
-            with contextlib.suppress(EndpointError):
+            with contextlib.suppress(LinkError):
                 return cls(open_transport(f"tcpin:127.0.0.1:{port}"), sensors, port)
         return cls(open_transport(f"tcpin:127.0.0.1:{last}"), sensors, last)
 

@@ -51,7 +51,7 @@ class FirmwareSimulation(Simulation):
         options: Further arguments of `Simulation`.
 
     Raises:
-        EndpointError: A port is in use.
+        LinkError: A port is in use.
         VehicleProcessError: The binary cannot be started.
     """
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from mavfi_cli.core.errors import EndpointError, LinkLost
+from mavfi_cli.core.errors import LinkError, LinkLost
 from mavfi_cli.link.codec import Codec, Signing, begins_with_frame, dialect, key_from_passphrase
 from mavfi_cli.link.transport import Transport, memory_pair, open_listener, open_transport
 from mavfi_cli.testing import StreamTransportContract, TransportContract
@@ -202,7 +202,7 @@ def test_a_port_in_use_is_one_clear_line(scheme: str) -> None:
     first = open_transport(f"{scheme}:127.0.0.1:0")
     port = first.port  # type: ignore[attr-defined]
     for opener in (open_transport, open_listener):
-        with pytest.raises(EndpointError, match=f"port {port} is in use"):
+        with pytest.raises(LinkError, match=f"port {port} is in use"):
             opener(f"{scheme}:127.0.0.1:{port}")
     first.close()
 
@@ -211,7 +211,7 @@ def test_nobody_listening_is_one_clear_line() -> None:
     vacant = socket.socket()
     vacant.bind(("127.0.0.1", 0))
     port = vacant.getsockname()[1]
-    with pytest.raises(EndpointError, match="nothing listens there"):
+    with pytest.raises(LinkError, match="nothing listens there"):
         open_transport(f"tcp:127.0.0.1:{port}")
     vacant.close()
 
@@ -227,7 +227,7 @@ def test_an_inherited_descriptor_must_be_a_connected_stream_socket() -> None:
         "fd:9999": "not an open descriptor",
     }
     for url, problem in cases.items():
-        with pytest.raises(EndpointError, match=problem):
+        with pytest.raises(LinkError, match=problem):
             open_transport(url)
     for descriptor in (read, write):
         os.close(descriptor)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core.config import load_toml, toml_text
-from mavfi_cli.core.errors import ConfigError, UnknownKey
+from mavfi_cli.core.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def test_a_good_file(tmp_path):
     ],
 )
 def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
-    with pytest.raises(UnknownKey, match=message):
+    with pytest.raises(ConfigError, match=message):
         load(tmp_path, text)
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from live_processes import LONG_S, children, gone
 
-from mavfi_cli.core.fork_server import PACKET, SERVER, ForkServer, ForkServerFailed
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.fork_server import PACKET, SERVER, ForkServer
 
 
 @pytest.fixture
@@ -92,5 +93,5 @@ def test_workers_are_fresh_and_a_killed_server_is_started_again(server, tmp_path
 
 def test_a_server_that_cannot_load_its_module_says_so(server, tmp_path, monkeypatch):
     monkeypatch.setenv("MAVFI_TEST_UNPREPARED", "1")
-    with pytest.raises(ForkServerFailed, match="could not start"):
+    with pytest.raises(MavfiError, match="could not start"):
         server.start({}, tmp_path, LONG_S)

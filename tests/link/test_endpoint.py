@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.core.errors import EndpointError
+from mavfi_cli.core.errors import LinkError
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import open_listener, open_transport
 
@@ -68,7 +68,7 @@ def test_serial_urls(url: str, device: str, baud: int) -> None:
     ],
 )
 def test_malformed_urls_say_what_is_wrong(url: str, problem: str) -> None:
-    with pytest.raises(EndpointError, match=problem):
+    with pytest.raises(LinkError, match=problem):
         parse_endpoint(url)
 
 
@@ -76,7 +76,7 @@ def test_malformed_urls_say_what_is_wrong(url: str, problem: str) -> None:
 def test_any_text_parses_or_is_refused_in_one_line(text: str, prefix: str) -> None:
     try:
         endpoint = parse_endpoint(prefix + text)
-    except EndpointError:
+    except LinkError:
         return
     assert 0 <= endpoint.port <= 65_535
     assert endpoint.url == prefix + text
@@ -87,7 +87,7 @@ def test_any_text_parses_or_is_refused_in_one_line(text: str, prefix: str) -> No
 )
 def test_beyond_this_machine_signing_is_required(url: str) -> None:
     for opener in (open_transport, open_listener):
-        with pytest.raises(EndpointError, match="signing is required"):
+        with pytest.raises(LinkError, match="signing is required"):
             opener(url)
 
 
@@ -98,20 +98,20 @@ def test_beyond_this_machine_with_permission(permission: dict[str, bool]) -> Non
 
 
 def test_a_host_that_does_not_exist() -> None:
-    with pytest.raises(EndpointError, match="no such host"):
+    with pytest.raises(LinkError, match="no such host"):
         open_transport("udpout:no-such-host.invalid:14550")
 
 
 def test_an_address_of_another_machine_cannot_be_bound() -> None:
-    with pytest.raises(EndpointError, match="not an address of this machine"):
+    with pytest.raises(LinkError, match="not an address of this machine"):
         open_transport("udpin:192.0.2.1:0", allow_unsigned=True)
 
 
 def test_a_device_that_does_not_exist() -> None:
-    with pytest.raises(EndpointError, match="no such device /dev/no-such-device"):
+    with pytest.raises(LinkError, match="no such device /dev/no-such-device"):
         open_transport("serial:/dev/no-such-device:57600")
 
 
 def test_a_file_that_is_no_serial_device() -> None:
-    with pytest.raises(EndpointError):
+    with pytest.raises(LinkError):
         open_transport("serial:/dev/null:57600")

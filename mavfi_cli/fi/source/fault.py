@@ -144,7 +144,7 @@ def require_bits(
     """Refuse a fault whose bits a value does not have.
 
     Raises:
-        BitOutsideWidth, FieldUnavailable: an exact bit or the field is missing.
+        FaultError: an exact bit or the field is missing.
         FaultSpecError: the field has too few bits.
     """
     if bits is not None:

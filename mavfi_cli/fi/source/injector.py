@@ -379,7 +379,7 @@ class MemoryInjector(Injector):
 
     Raises:
         UnknownName: there is no such array.
-        BitOutsideWidth, FieldUnavailable: the array's elements do not have these bits.
+        FaultError: the array's elements do not have these bits.
         FaultSpecError: the array has no elements, or the field too few bits.
     """
 

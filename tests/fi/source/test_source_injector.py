@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.core.errors import BitOutsideWidth, FaultSpecError, FieldUnavailable, UnknownName
+from mavfi_cli.core.errors import FaultError, FaultSpecError, UnknownName
 from mavfi_cli.core.types import (
     BY_NAME,
     STATES,
@@ -290,12 +290,12 @@ def test_the_listener_hears_before_the_message_goes_on():
     ("target", "options", "error", "message"),
     [
         ("waypoint_vq", {}, UnknownName, "did you mean 'waypoint_v"),
-        ("command_vx", {"bits": [64]}, BitOutsideWidth, "64"),
-        ("collision", {"bits": [1]}, BitOutsideWidth, "bool"),
+        ("command_vx", {"bits": [64]}, FaultError, "64"),
+        ("collision", {"bits": [1]}, FaultError, "bool"),
         (
             "future_collision_seq",
             {"corruption": {"field": Field.MANTISSA}},
-            FieldUnavailable,
+            FaultError,
             "int32",
         ),
         ("collision", {"corruption": {"bits": 2}}, FaultSpecError, "no 2 bits"),
@@ -339,7 +339,7 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
     [
         (Corruption(bits=2, field=Field.SIGN), None, FaultSpecError, "field sign has no 2 bits"),
         (Corruption(bits=65), None, FaultSpecError, "mean is float64: its field any has no 65"),
-        (Corruption(), [64], BitOutsideWidth, "64"),
+        (Corruption(), [64], FaultError, "64"),
     ],
 )
 def test_bits_that_a_memory_does_not_have_are_refused_before_the_flight(

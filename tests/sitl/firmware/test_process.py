@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from live_processes import gone
 
-from mavfi_cli.core.errors import EndpointError, VehicleProcessError
+from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from sitl.firmware import px4
 from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.px4 import Px4Link
@@ -105,7 +105,7 @@ def test_a_port_in_use_is_told(kind: str, family: int, port: int) -> None:
             holder.bind(("127.0.0.1", port))
         if family == socket.SOCK_STREAM:
             holder.listen()
-        with pytest.raises(EndpointError, match="in use"):
+        with pytest.raises(LinkError, match="in use"):
             _open(kind, None)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.core.errors import ConfigError, UnknownKey, UnknownName
+from mavfi_cli.core.errors import ConfigError, UnknownName
 from sitl.vehicle import profile as profile_module
 from sitl.vehicle.profile import GRAVITY_MPS2, PROFILES, load_profile
 
@@ -76,7 +76,7 @@ def test_missing_file():
 
 def test_unknown_key_names_file_line_and_nearest(tmp_path):
     path = variant(tmp_path, "diameter_m = 0.254", "diametr_m = 0.254")
-    with pytest.raises(UnknownKey, match=r"mine.toml:\d+: rotor.diametr_m.*'diameter_m'"):
+    with pytest.raises(ConfigError, match=r"mine.toml:\d+: rotor.diametr_m.*'diameter_m'"):
         load_profile(path)
 
 
