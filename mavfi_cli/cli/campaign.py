@@ -325,7 +325,6 @@ def _show(
     from mavfi_cli.core.files import plain
     from mavfi_cli.paper.status import progress_lines, short, shown
     from mavfi_cli.report.campaign import campaign_lines
-    from mavfi_cli.report.paper import as_text
 
     if as_json:
         told = _summary(ledger, by, confidence, more or {})
@@ -339,7 +338,7 @@ def _show(
         lines += campaign_lines(_summary(ledger, by, confidence, more or {}))
     else:
         table, _ = shown(ledger)
-        lines += ["", as_text(short(table)).rstrip()]
+        lines += ["", short(table).text().rstrip()]
     click.echo("\n".join(lines))
 
 

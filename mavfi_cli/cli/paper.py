@@ -40,7 +40,6 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     from mavfi_cli.paper.flying import reproduce as run
     from mavfi_cli.paper.items import FlightsPlan, items_named
     from mavfi_cli.paper.status import tables
-    from mavfi_cli.report.paper import as_text
 
     plan = FlightsPlan(
         items=items_named(names),
@@ -57,7 +56,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
         )
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
-        click.echo(as_text(table) if len(plan.items) == 1 else one_line, nl=False)
+        click.echo(table.text() if len(plan.items) == 1 else one_line, nl=False)
     if any(item.preset for item in plan.items):
         click.echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
         click.echo(f"The page            mavfi report {plan.out} -o report.html")

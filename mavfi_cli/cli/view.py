@@ -34,12 +34,8 @@ def view(run: Path, save: Path | None) -> None:
     flights = [
         ViewedFlight(name=name, run=each, recorder=_again(each)) for name, each in named.items()
     ]
-    if save is None:
-        from mavfi_cli.report.view.rerun_file import show
-
-        show(flights)
-    else:
-        viewers.save(flights, save)
+    viewers.save(flights, save)
+    if save is not None:
         click.echo(save)
 
 

@@ -23,7 +23,6 @@ from mavfi_cli.analysis.kernel_runs import outcome_share
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
-from mavfi_cli.report.paper import count_of
 from mavfi_cli.stats.bootstrap import Interval, interval
 from mavfi_cli.stats.effects import (
     Count,
@@ -92,7 +91,7 @@ class Claim:
 def _of_share(found: Share, what: str) -> Finding:
     if not found.total:
         return Finding()
-    return Finding(effect=as_interval(found), told=f"{count_of(found)} {what}")
+    return Finding(effect=as_interval(found), told=f"{found.counts} {what}")
 
 
 def _difference(shares: Sequence[Share], told: str) -> Finding:
@@ -112,7 +111,7 @@ def _success_lost(flights: Flights, **where: Any) -> Finding:
     if not len(both):
         return Finding()
     found = paired_difference(mcnemar(~both.flags("lost"), ~both.flags("own_lost")))
-    told = f"{count_of(both.share())} lost; golden {count_of(both.share('own_lost'))}"
+    told = f"{both.share().counts} lost; golden {both.share('own_lost').counts}"
     return Finding(effect=found, told=told)
 
 
@@ -130,7 +129,7 @@ def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
 def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
     shares = [flights.struck(**where).share("harmed") for where in groups.values()]
-    told = (f"{name} {count_of(each)}" for name, each in zip(groups, shares, strict=True))
+    told = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(told)}")
 
 
@@ -148,7 +147,7 @@ def _loss_difference(
         told: the counts, as a format of two texts.
     """
     shares = [flights.struck(**where, **each).share() for each in (first, second)]
-    return _difference(shares, f"lost: {told.format(*map(count_of, shares))}")
+    return _difference(shares, f"lost: {told.format(*(each.counts for each in shares))}")
 
 
 def _as_long(flights: Flights, ratio: float, **where: Any) -> Finding:
@@ -169,7 +168,7 @@ def _worst_as_long(flights: Flights, ratio: float, missions: int, **where: Any) 
     longest = 100.0 * (found.max() - 1.0)
     return Finding(
         effect=longest_reaches(beyond, missions),
-        told=f"{count_of(beyond)} as long; longest {longest:+.1f} %",
+        told=f"{beyond.counts} as long; longest {longest:+.1f} %",
     )
 
 
@@ -222,7 +221,7 @@ def _control_recovers_most(flights: Flights, detector: str, **where: Any) -> Fin
     if not all(each.total for each in shares.values()):
         return Finding()
     *others, control = shares.values()
-    told = ", ".join(f"{name} {count_of(each)}" for name, each in shares.items())
+    told = ", ".join(f"{name} {each.counts}" for name, each in shares.items())
     best = max(others, key=lambda each: each.share)
     return _difference((control, best), f"harm undone: {told}")
 
@@ -230,7 +229,7 @@ def _control_recovers_most(flights: Flights, detector: str, **where: Any) -> Fin
 def _all_stages_best(flights: Flights, detector: str, **where: Any) -> Finding:
     """Harm undone by watching all stages minus that by watching control."""
     shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
-    told = "harm undone: all stages {}, control {}".format(*map(count_of, shares))
+    told = "harm undone: all stages {}, control {}".format(*(each.counts for each in shares))
     return _difference(shares, told)
 
 
@@ -316,7 +315,7 @@ def _least_benign(kernels: Kernels, but: str) -> Finding:
     if not shares:
         return Finding()
     least = min(shares, key=lambda each: shares[each].share)
-    told = f"least: {kernels[least]['title']}, {count_of(shares[least])}"
+    told = f"least: {kernels[least]['title']}, {shares[least].counts}"
     return Finding(effect=as_interval(shares[least]), told=told)
 
 

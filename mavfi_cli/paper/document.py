@@ -28,7 +28,7 @@ from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, pr
 from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.paper.status import of_kernels, of_model
-from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, count_of, draw_strips
+from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, draw_strips
 from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
 from mavfi_cli.stats.shares import Share, wilson
 
@@ -223,7 +223,7 @@ def _sentence(parts: Sequence[str]) -> str:
 
 def _rate(found: Share) -> str:
     ends = f"{100 * found.low:.0f} to {100 * found.high:.0f}"
-    return f"{100 * found.share:.0f} % ({count_of(found)}; 95 % interval {ends} %)"
+    return f"{100 * found.share:.0f} % ({found.counts}; 95 % interval {ends} %)"
 
 
 # Worst cases and spreads --------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
@@ -27,9 +26,7 @@ from mavfi_cli.report.paper import (
     PaperTable,
     Printed,
 )
-from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import OWN, worst_case
-from mavfi_cli.stats.shares import Share
 
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
@@ -231,7 +228,7 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
     for detector in DETECTOR_TITLES:
         for title, (columns, keys) in _parts(detector).items():
             cells = (
-                mean_cell(
+                PaperCell.of_mean(
                     PERCENT * flights.faulty(detector, world=world).known(*columns),
                     printed("table5", *keys, world),
                 )
@@ -327,7 +324,7 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
         yield _row(stage, cells=[
             _maximum(struck.increases, printed("fig13", "increase_percent", stage)),
             _maximum(_with(struck, flights.faulty("aad", fault_target=stage))),
-            mean_cell(struck.increases),
+            PaperCell.of_mean(struck.increases),
         ])  # fmt: skip
 
 
@@ -384,35 +381,14 @@ _RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
 # Cells --------------------------------------------------------------------------------------------
 
 
-def share_cell(share: Share, paper: Printed = None) -> PaperCell:
-    """A share as per cent."""
-    if not share.total:
-        return PaperCell(paper=paper)
-    return PaperCell(
-        value=PERCENT * share.share,
-        low=PERCENT * share.low,
-        high=PERCENT * share.high,
-        count=share.total,
-        paper=paper,
-    )
-
-
 def _success(flights: Flights, paper: Printed = None) -> PaperCell:
     """Success rate of all flown missions, in per cent, as the paper counts."""
-    return share_cell(flights.share(value=False), paper)
-
-
-def mean_cell(values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
-    """A mean with its bootstrap interval."""
-    found = interval(values, resamples=RESAMPLES)
-    return PaperCell(
-        value=found.value, low=found.low, high=found.high, count=found.count, paper=paper
-    )
+    return PaperCell.of_share(flights.share(value=False), paper)
 
 
 def _mean(flights: Flights, name: str, paper: Printed = None, scale: float = 1.0) -> PaperCell:
     """Mean of a measure over the successful missions."""
-    return mean_cell(scale * _of_successes(flights, name), paper)
+    return PaperCell.of_mean(scale * _of_successes(flights, name), paper)
 
 
 def _of_successes(flights: Flights, name: str) -> FloatArray:

@@ -27,7 +27,7 @@ from mavfi_cli.paper.items import (
     items_named,
     printed,
 )
-from mavfi_cli.paper.layouts import mean_cell, of_flights, share_cell
+from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.report.campaign import SettingColumns
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.stats.shares import rate
@@ -123,7 +123,7 @@ def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
         name = kernel["kernel"]
         paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
         shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
-        cells = (share_cell(shares[0], paper), *map(share_cell, shares[1:]))
+        cells = (PaperCell.of_share(shares[0], paper), *map(PaperCell.of_share, shares[1:]))
         rows.append(PaperRow(labels=(kernel["title"],), cells=cells))
     table = BY_NAME["fig6"].table(rows)
     most = table.ranked(1)
@@ -181,7 +181,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
                 labels=tuple(settings.cells(group.labels, group.name)),
                 cells=(
                     _success(group),
-                    *(mean_cell(scale * group.successes(name))
+                    *(PaperCell.of_mean(scale * group.successes(name))
                       for name, (_, scale) in scales.items()),
                 ),
             )
@@ -196,7 +196,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
 
 def _success(group: Group) -> PaperCell:
     won = group.succeeded[group.counted]
-    return share_cell(rate(int(won.sum()), len(won)))
+    return PaperCell.of_share(rate(int(won.sum()), len(won)))
 
 
 def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:

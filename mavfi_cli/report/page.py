@@ -21,17 +21,8 @@ from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.columns import csv_text
-from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, svg
-from mavfi_cli.report.paper import (
-    DETECTOR_TITLES,
-    PALETTE,
-    SMALLEST,
-    as_csv,
-    cells_of,
-    count_of,
-    print_axes,
-    print_figure,
-)
+from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, new_figure, svg
+from mavfi_cli.report.paper import DETECTOR_TITLES, PALETTE, SMALLEST, WIDTHS_IN, print_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,13 +136,13 @@ def _item_chart(item: Any, shown: Mapping[str, Any]) -> _Chart:
         name=f"{name}-flights" if flights else name,
         title=f"{item.paper}, {shown['stack']}",
         figure=shown["figure"],
-        csv=csv_text(flights) if flights else as_csv(shown["table"]),
+        csv=csv_text(flights) if flights else shown["table"].csv(),
     )
 
 
 def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
     """Lost missions of each arm with their intervals."""
-    figure = print_figure("one", 0.6 + 0.17 * len(arms))
+    figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()
     print_axes(axes)
     rows = []
@@ -176,7 +167,7 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
     """What struck kernels did, a bar a kernel."""
-    figure = print_figure("one", 0.9 + 0.26 * len(flows))
+    figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)
     for place, flow in enumerate(flows):
@@ -260,8 +251,8 @@ def _link(text: str) -> str:
 
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "percent": _percent, "ends": _ends, "effect": _effect, "of": count_of, "p": _p_value,
+    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value,
     "detector": _detector, "hourly": _hourly, "shade": _shade, "csv": csv_text,
-    "cells": cells_of, "table_csv": as_csv, "link": _link, "toml": to_toml,
+    "link": _link, "toml": to_toml,
 }  # fmt: skip
 """By the names that page.html uses."""

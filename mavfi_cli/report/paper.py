@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavfi_cli.analysis.groups import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.columns import WIDTH, blocks, csv_text
 from mavfi_cli.report.drawing import GRID, INK, NOTE, new_figure, open_frame
+from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.shares import Share
 
 if TYPE_CHECKING:
@@ -40,6 +42,19 @@ class PaperCell:
     count: int = 0
     paper: Printed = None
 
+    @classmethod
+    def of_share(cls, share: Share, paper: Printed = None) -> PaperCell:
+        """A share as per cent."""
+        if not share.total:
+            return cls(paper=paper)
+        ends = {"value": share.share, "low": share.low, "high": share.high}
+        return cls(**{k: 100.0 * v for k, v in ends.items()}, count=share.total, paper=paper)
+
+    @classmethod
+    def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
+        """A mean with its bootstrap interval."""
+        return cls(**asdict(interval(values, resamples=RESAMPLES)), paper=paper)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperColumn:
@@ -61,6 +76,13 @@ class PaperColumn:
         """A number in the column's form; a dash if there is none."""
         shape = f"{'+' if self.sign else ''}.{self.digits if digits is None else digits}f"
         return f"{value:{shape}}" if math.isfinite(value) else "-"
+
+    def ours(self, cell: PaperCell) -> str:
+        """A number of ours with its interval."""
+        value = self.told(cell.value)
+        if math.isnan(cell.low) or math.isnan(cell.high):
+            return value
+        return f"{value} ({self.told(cell.low, self.ends)} to {self.told(cell.high, self.ends)})"
 
     def printed(self, paper: Printed) -> str:
         """A number of the paper in its own form."""
@@ -120,40 +142,45 @@ class PaperTable:
         rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
         return sorted(rows, key=lambda row: -row.cells[place].value)
 
+    def cells(self) -> list[list[str]]:
+        """The table as cells of text, headings first: labels, n, then ours and the paper's."""
+        head = [*self.labels, "n"]
+        for place, column in enumerate(self.columns):
+            head += [column.title, *(["paper"] if self.printed_in(place) else [])]
+        rows = [head]
+        for row in self.rows:
+            cells = [*row.labels, row.count]
+            for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True)):
+                cells.append(column.ours(cell))
+                if self.printed_in(place):
+                    cells.append(column.printed(cell.paper))
+            rows.append(cells)
+        return rows
 
-def _ours(column: PaperColumn, cell: PaperCell) -> str:
-    value = column.told(cell.value)
-    if math.isnan(cell.low) or math.isnan(cell.high):
-        return value
-    low, high = (column.told(end, column.ends) for end in (cell.low, cell.high))
-    return f"{value} ({low} to {high})"
+    def text(self) -> str:
+        """Aligned columns; those beyond the width continue below."""
+        lines = [self.title, *_in_pairs(self), *self.notes]
+        return "\n".join(line.rstrip() for line in lines) + "\n"
 
-
-def cells_of(table: PaperTable) -> list[list[str]]:
-    """The table as cells of text, headings first: labels, n, then ours and the paper's."""
-    head = [*table.labels, "n"]
-    for place, column in enumerate(table.columns):
-        head += [column.title, *(["paper"] if table.printed_in(place) else [])]
-    rows = [head]
-    for row in table.rows:
-        cells = [*row.labels, row.count]
-        for place, (column, cell) in enumerate(zip(table.columns, row.cells, strict=True)):
-            cells.append(_ours(column, cell))
-            if table.printed_in(place):
-                cells.append(column.printed(cell.paper))
-        rows.append(cells)
-    return rows
-
-
-def as_text(table: PaperTable) -> str:
-    """Aligned columns; those beyond the width continue below."""
-    lines = [table.title, *_in_pairs(table), *table.notes]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    def csv(self) -> str:
+        """One number a line, in full precision."""
+        return csv_text(
+            {
+                "item": self.name,
+                **dict(zip(self.labels, row.labels, strict=True)),
+                "quantity": column.title,
+                **{name: _plain(getattr(cell, name)) for name in ("value", "low", "high")},
+                "n": cell.count,
+                "paper": "" if cell.paper is None else cell.paper,
+            }
+            for row in self.rows
+            for column, cell in zip(self.columns, row.cells, strict=True)
+        )
 
 
 def _in_pairs(table: PaperTable) -> list[str]:
     """The aligned table, in which the paper's number is never cut off from ours."""
-    rows = cells_of(table)
+    rows = table.cells()
     labels = len(table.labels)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     together = [1, *(1 + table.printed_in(place) for place in range(len(table.columns)))]
@@ -166,7 +193,7 @@ def _in_pairs(table: PaperTable) -> list[str]:
 
 def _as_markdown(table: PaperTable) -> str:
     """A pipe table."""
-    head, *rows = cells_of(table)
+    head, *rows = table.cells()
     aligned = ["---"] * len(table.labels) + ["---:"] * (len(head) - len(table.labels))
     lines = [_piped(row) for row in (head, aligned, *rows)]
     return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]).rstrip() + "\n"
@@ -194,7 +221,7 @@ def _as_latex(table: PaperTable) -> str:
 
     It is as wide as a column of two, or as the page, in the largest size that fits.
     """
-    head, *rows = cells_of(table)
+    head, *rows = table.cells()
     form = "l" * len(table.labels) + "r" * (len(head) - len(table.labels))
     place, size, gap_pt = _latex_place([head, *rows])
     lines = [
@@ -233,38 +260,15 @@ def _latex(text: str) -> str:
     return "".join(_LATEX.get(each, each) for each in text)
 
 
-def as_csv(table: PaperTable) -> str:
-    """One number a line, in full precision."""
-    return csv_text(_long(table))
-
-
-def _long(table: PaperTable) -> Iterator[Mapping[str, object]]:
-    for row in table.rows:
-        for column, cell in zip(table.columns, row.cells, strict=True):
-            yield {
-                "item": table.name,
-                **dict(zip(table.labels, row.labels, strict=True)),
-                "quantity": column.title,
-                **{name: _plain(getattr(cell, name)) for name in ("value", "low", "high")},
-                "n": cell.count,
-                "paper": "" if cell.paper is None else cell.paper,
-            }
-
-
-def count_of(share: Share) -> str:
-    """The counts of a share, such as `3 of 98`."""
-    return f"{share.count:,} of {share.total:,}"
-
-
 def _plain(value: float) -> object:
     return "" if math.isnan(value) else value
 
 
 FORMATS: Mapping[str, Callable[[PaperTable], str]] = {
-    "text": as_text,
+    "text": PaperTable.text,
     "markdown": _as_markdown,
     "latex": _as_latex,
-    "csv": as_csv,
+    "csv": PaperTable.csv,
 }
 
 
@@ -274,16 +278,13 @@ WIDTHS_IN = {"one": 3.5, "two": 7.16}  # columns of an IEEE page
 SMALLEST = 7.0  # points
 PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; no two alike in grey
 MARKERS = ("o", "s", "^", "D")
-_PAPER = {"marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
-          "markeredgewidth": 0.9, "linestyle": "none"}  # fmt: skip
+_PAPER: dict[str, Any] = {
+    "marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
+    "markeredgewidth": 0.9, "linestyle": "none",
+}  # fmt: skip
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 _LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
 _NAME = 36  # characters in a line of a row's name
-
-
-def print_figure(columns: str, height_in: float) -> Figure:
-    """An empty figure as wide as one or two columns of a page."""
-    return new_figure(WIDTHS_IN[columns], height_in)
 
 
 def print_axes(axes: Axes, title: str = "") -> None:
@@ -310,47 +311,65 @@ def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
         for place in range(len(table.columns))
         if any(math.isfinite(row.cells[place].value) for row in table.rows)
     ] or [0]
-    across = min(len(shown), 4 if columns == "two" else 2)
-    down = math.ceil(len(shown) / across)
     whole = (", ".join(label for label in row.labels if label) for row in table.rows)
     names = [textwrap.fill(name, _NAME) for name in whole]
     row_in = _LINE_IN + _NEXT_LINE_IN * max(name.count("\n") for name in names)
-    height = down * (0.62 + row_in * max(2, len(table.rows)))
-    figure = print_figure(columns, height + 0.25)
-    grid = figure.subplots(down, across, squeeze=False, sharey=True)
-    for panel, place in zip(grid.flat, shown, strict=False):
-        _dots(panel, table, place)
-    for panel in grid.flat[len(shown) :]:
-        panel.set_visible(False)
-    grid[0, 0].set_yticks(range(len(table.rows)), names, fontsize=SMALLEST)
-    grid[0, 0].set_ylim(len(table.rows) - 0.5, -0.5)
-    _explain(figure, any(table.printed_in(place) for place in shown))
+    titles = [table.columns[place].title for place in shown]
+    figure, panels = _panels(titles, names, columns, 0.62 + row_in * max(2, len(names)), 0.25)
+    for panel, place in zip(panels, shown, strict=True):
+        panel.margins(x=0.08)
+        for y, row in enumerate(table.rows):
+            _dot(panel, y, row.cells[place])
+    ours = panels[0].plot(
+        [], [], "o-", color=PALETTE[0], markersize=4, linewidth=1.2, label="ours, 95 % interval"
+    )
+    _explain(figure, ours, "paper" if any(map(table.printed_in, shown)) else "", "lower")
     return figure
 
 
-def _dots(axes: Axes, table: PaperTable, place: int) -> None:
-    print_axes(axes, table.columns[place].title)
-    axes.margins(x=0.08)
-    for y, row in enumerate(table.rows):
-        cell = row.cells[place]
-        if isinstance(cell.paper, float):
-            axes.plot(cell.paper, y, **_PAPER)  # type: ignore[arg-type]
-        if not math.isfinite(cell.value):
-            continue
+def _panels(
+    titles: Iterable[str],
+    names: Sequence[str],
+    columns: str,
+    panel_in: float,
+    more_in: float,
+    *,
+    sharex: bool = False,
+) -> tuple[Figure, list[Axes]]:
+    """A figure with panels of equal rows.
+
+    Args:
+        names: of the rows.
+        panel_in, more_in: height of a panel, and of what the figure has beside panels.
+    """
+    told = list(titles)
+    across = min(len(told), 4 if columns == "two" else 2)
+    down = math.ceil(len(told) / across)
+    figure = new_figure(WIDTHS_IN[columns], down * panel_in + more_in)
+    grid = figure.subplots(down, across, squeeze=False, sharey=True, sharex=sharex)
+    for axes, title in zip(grid.flat, told, strict=False):
+        print_axes(axes, title)
+    for axes in grid.flat[len(told) :]:
+        axes.set_visible(False)
+    grid[0, 0].set_yticks(range(len(names)), names, fontsize=SMALLEST)
+    grid[0, 0].set_ylim(len(names) - 0.5, -0.5)
+    return figure, list(grid.flat[: len(told)])
+
+
+def _dot(axes: Axes, y: int, cell: PaperCell) -> None:
+    if isinstance(cell.paper, float):
+        axes.plot(cell.paper, y, **_PAPER)
+    if math.isfinite(cell.value):
         if math.isfinite(cell.low) and math.isfinite(cell.high):
             axes.hlines(y, cell.low, cell.high, color=PALETTE[0], linewidth=1.2)
         axes.plot(cell.value, y, "o", color=PALETTE[0], markersize=4)
 
 
-def _explain(figure: Figure, paper: bool) -> None:
-    axes = figure.axes[0]
-    handles = [axes.plot([], [], "o-", color=PALETTE[0], markersize=4, linewidth=1.2,
-                         label="ours, 95 % interval")[0]]  # fmt: skip
-    if paper:
-        handles += axes.plot([], [], label="paper", **_PAPER)  # type: ignore[arg-type]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALLEST
-    )
+def _explain(figure: Figure, ours: list[Any], paper: str, side: str, **spaces: Any) -> None:
+    """A legend of our mark and of the paper's, if it has a label."""
+    handles = ours + (figure.axes[0].plot([], [], label=paper, **_PAPER) if paper else [])
+    look = {"loc": f"outside {side} center", "ncols": 2, "frameon": False, "fontsize": SMALLEST}
+    figure.legend(handles=handles, **{**look, **spaces})
 
 
 # Flights as distributions ------------------------------------------------------------------------
@@ -381,30 +400,24 @@ def draw_strips(
         panels: the rows of each panel from top to bottom, by its title; all have the same labels.
         quantity: of the horizontal axis, with its unit.
     """
-    across = min(len(panels), 4 if columns == "two" else 2)
-    down = math.ceil(len(panels) / across)
-    rows = max(map(len, panels.values()))
-    figure = print_figure(columns, down * (0.45 + _LINE_IN * rows) + 0.45)
-    grid = figure.subplots(down, across, squeeze=False, sharey=True, sharex=True)
-    for axes, (title, strips) in zip(grid.flat, panels.items(), strict=False):
-        print_axes(axes, title)
+    names = [strip.label for strip in next(iter(panels.values()))]
+    height_in = 0.45 + _LINE_IN * len(names)
+    figure, drawn = _panels(panels, names, columns, height_in, 0.45, sharex=True)
+    for axes, strips in zip(drawn, panels.values(), strict=True):
         for y, strip in enumerate(strips):
             _strip(axes, y, strip)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_visible(False)
-    labels = [strip.label for strip in next(iter(panels.values()))]
-    grid[0, 0].set_yticks(range(rows), labels, fontsize=SMALLEST)
-    grid[0, 0].set_ylim(rows - 0.5, -0.5)
     figure.supxlabel(quantity, fontsize=SMALLEST + 0.5, color=INK)
     printed = any(strip.paper is not None for strips in panels.values() for strip in strips)
-    _explain_strips(figure, printed)
+    ours = drawn[0].plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
+    paper = "paper's longest" if printed else ""
+    _explain(figure, ours, paper, "upper", columnspacing=1.0, handletextpad=0.3)
     return figure
 
 
 def _strip(axes: Axes, y: int, strip: Strip) -> None:
     values, colour = strip.values, PALETTE[strip.style]
     if strip.paper is not None:
-        axes.plot(strip.paper, y, **_PAPER)  # type: ignore[arg-type]
+        axes.plot(strip.paper, y, **_PAPER)
     if not len(values):
         axes.text(0.02, y, "no flight", transform=axes.get_yaxis_transform(), va="center",
                   fontsize=SMALLEST, color=NOTE)  # fmt: skip
@@ -420,17 +433,6 @@ def _strip(axes: Axes, y: int, strip: Strip) -> None:
     axes.plot(values.max(), y, "|", color=INK, markersize=7, markeredgewidth=1.4)
 
 
-def _explain_strips(figure: Figure, paper: bool) -> None:
-    axes = figure.axes[0]
-    handles = axes.plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
-    if paper:
-        handles += axes.plot([], [], label="paper's longest", **_PAPER)  # type: ignore[arg-type]
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=min(len(handles), 3), frameon=False,
-        fontsize=SMALLEST, columnspacing=1.0, handletextpad=0.3,
-    )  # fmt: skip
-
-
 # Stacked shares ----------------------------------------------------------------------------------
 
 _HATCHES = ("", "////", "....", "")
@@ -439,7 +441,7 @@ _HATCHES = ("", "////", "....", "")
 def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
     """A bar of a hundred per cent for each row, cut into the table's columns."""
     rows = len(table.rows)
-    figure = print_figure(columns, 0.85 + 1.25 * _LINE_IN * rows)
+    figure = new_figure(WIDTHS_IN[columns], 0.85 + 1.25 * _LINE_IN * rows)
     axes = figure.subplots()
     print_axes(axes)
     left = np.zeros(rows)
@@ -467,7 +469,7 @@ def draw_histograms(
     """Two histograms for each row on one scale: values, and their deltas."""
     from matplotlib.ticker import NullFormatter
 
-    figure = print_figure(columns, 0.35 + 0.95 * len(rows))
+    figure = new_figure(WIDTHS_IN[columns], 0.35 + 0.95 * len(rows))
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (name, *both), panels in zip(rows, grid, strict=True):
         spans = [float(np.abs(each).max()) if len(each) else 1.0 for each in both]

@@ -23,6 +23,11 @@ class Share:
     low: float
     high: float
 
+    @property
+    def counts(self) -> str:
+        """Count and total, such as `3 of 98`."""
+        return f"{self.count:,} of {self.total:,}"
+
 
 def wilson(
     count: int, total: int, *, design_effect: float = 1.0, confidence_z: float = 1.959963984540054

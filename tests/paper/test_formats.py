@@ -16,8 +16,6 @@ from mavfi_cli.report.paper import (
     PaperColumn,
     PaperRow,
     PaperTable,
-    as_text,
-    cells_of,
 )
 
 WORLDS = ("factory", "farm", "sparse", "dense")
@@ -59,7 +57,7 @@ def laid_out(name):
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_the_text_is_one_screen(name):
-    lines = as_text(of_flights(name, FLIGHTS[name])).splitlines()
+    lines = of_flights(name, FLIGHTS[name]).text().splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 100
 
@@ -72,7 +70,7 @@ def test_every_layout_has_every_format(name, form):
 
 def test_the_formats_have_the_same_numbers():
     found = of_flights("table4", FLIGHTS["table4"])
-    ours = cells_of(found)[2]
+    ours = found.cells()[2]
     assert ours[:4] == ["injection", "3", "100.0 (44 to 100)", "91.7"]
     markdown = FORMATS["markdown"](found).splitlines()
     assert markdown[5].split(" | ")[1:4] == ours[1:4]

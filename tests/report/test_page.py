@@ -80,11 +80,11 @@ def test_every_lost_mission_has_its_command(told, page):
 
 
 def test_numbers_as_words():
-    count_of, percent, ends, p_value, hourly, effect = (
-        FILTERS[name] for name in ("of", "percent", "ends", "p", "hourly", "effect")
+    percent, ends, p_value, hourly, effect = (
+        FILTERS[name] for name in ("percent", "ends", "p", "hourly", "effect")
     )
     share = wilson(3, 98)
-    assert count_of(share) == "3 of 98"
+    assert share.counts == "3 of 98"
     assert percent(share.share, 1) == "3.1 %"
     assert percent(-0.0) == "0 %"
     assert percent(None) == percent(float("nan")) == "\N{EN DASH}"

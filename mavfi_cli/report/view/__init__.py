@@ -20,11 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.octree import occupied_leaves
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.core.files import require_output
-from mavfi_cli.core.types import DepthFrame, FloatArray
+from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.run_folder import Run
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 
 Orders = Mapping[str, Sequence[tuple[Any, float]]]  # input and start stamp of each invocation
 
-MARKED = {"fault": FAULT, "alarm": ALARM}  # events with a mark at their position
+_MARKED = {"fault": FAULT, "alarm": ALARM}  # events with a mark at their position
 _MAP = "#8b93a1"
 _FARTHEST_M = 1e5  # a corrupted position can be anywhere; viewers compute in single precision
 _MAP_EVERY_S = 1.0
@@ -48,81 +47,33 @@ _TALLEST_M = 15.0  # towers of generated worlds are 1000 m high, flights at most
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """The state of one thing from a moment on."""
+    """The state of one thing from a moment on.
+
+    Attributes:
+        kind, data: what is shown.
+            `boxes`: centres (n, 3) of solid boxes along the axes: obstacles, voxels of a map.
+            `marks`: centres (n, 3) of spheres: the goal, or where something happened.
+            `points`: a point cloud (n, 3).
+            `line`: a path, a plan or a setpoint through points (n, 3).
+            `depth`: a depth frame with the pose of its camera.
+            `pose`: position (3,) and yaw of the vehicle, which is level.
+            `note`: an event of the flight.
+            `values`: the numbers of a control tick by the trace's column names; None where there
+            is none yet.
+        size_m: sizes of boxes (n, 3), radius of marks, width of a line.
+    """
 
     path: str
     stamp_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Boxes(Entry):
-    """Solid boxes along the axes: obstacles, or the occupied voxels of a map."""
-
-    centres_enu_m: FloatArray  # (n, 3)
-    sizes_m: FloatArray  # (n, 3)
-    colour: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Marks(Entry):
-    """Spheres: the goal, or where something happened."""
-
-    centres_enu_m: FloatArray  # (n, 3)
-    radius_m: float
-    colour: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Points(Entry):
-    """A point cloud."""
-
-    points_enu_m: FloatArray  # (n, 3)
-    colour: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Line(Entry):
-    """A line through points: a path, a plan or a setpoint."""
-
-    points_enu_m: FloatArray  # (n, 3)
-    colour: str
-    width_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Depth(Entry):
-    """A depth frame with the pose of its camera."""
-
-    frame: DepthFrame
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pose(Entry):
-    """The vehicle, level."""
-
-    position_enu_m: FloatArray  # (3,)
-    yaw_rad: float
-    colour: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Note(Entry):
-    """One event of the flight in words."""
-
     kind: str
-    text: str
+    data: Any
+    colour: str = ""
+    size_m: Any = None
 
     @property
     def urgent(self) -> bool:
-        """True for faults, alarms and the deaths of nodes."""
-        return self.kind in ("fault", "alarm", "node")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Values(Entry):
-    """All numbers of one control tick by the trace's column names; None where there is none yet."""
-
-    values: Mapping[str, float | int | bool | None]
+        """Whether a note is of a fault, an alarm or the death of a node."""
+        return self.data["kind"] in ("fault", "alarm", "node")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,12 +94,27 @@ class ViewedFlight:
         """Colour of vehicle, path and setpoints, as in all pictures."""
         return FLIGHTS[1 if self.run.record.fault else 0]
 
+    def entry(
+        self,
+        name: str,
+        stamp_s: float,
+        kind: str,
+        data: Any,
+        colour: str = "",
+        size_m: Any = None,
+    ) -> Entry:
+        """An entry of this name below the flight's."""
+        return Entry(
+            path=f"{self.name}/{name}", stamp_s=stamp_s, kind=kind, data=data, colour=colour,
+            size_m=size_m,
+        )  # fmt: skip
+
 
 def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
     """Yield the world and the entries of at least one flight in the order of their stamps."""
     streams: list[Iterable[Entry]] = [_world(flights[0].run.record)]
     for flight in flights:
-        streams += [_plans(flight), _notes(flight), *(_marks(flight, kind) for kind in MARKED)]
+        streams += [_plans(flight), _notes(flight), *(_marks(flight, kind) for kind in _MARKED)]
         if flight.run.trace is not None:
             streams += [_ticks(flight, flight.run.trace), _path(flight, flight.run.trace)]
         if flight.recorder is not None:
@@ -160,22 +126,16 @@ def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
 def _world(record: FlightRecord) -> Iterator[Entry]:
     stamp_s = record.events[0]["stamp_s"] if record.events else 0.0
     boxes = np.array(record.world.get("boxes", ()), dtype=np.float64).reshape(-1, 6)
-    boxes = boxes.clip(max=[math.inf] * 5 + [_TALLEST_M])
-    yield Boxes(
-        path="world/obstacles",
-        stamp_s=stamp_s,
-        centres_enu_m=(boxes[:, :3] + boxes[:, 3:]) / 2.0,
-        sizes_m=boxes[:, 3:] - boxes[:, :3],
-        colour=OBSTACLE,
-    )
+    low, high = np.split(boxes.clip(max=[math.inf] * 5 + [_TALLEST_M]), 2, axis=1)
+    yield Entry(
+        path="world/obstacles", stamp_s=stamp_s, kind="boxes", data=(low + high) / 2.0,
+        size_m=high - low, colour=OBSTACLE,
+    )  # fmt: skip
     if record.goal_enu_m is not None:
-        yield Marks(
-            path="world/goal",
-            stamp_s=stamp_s,
-            centres_enu_m=np.array([record.goal_enu_m]),
-            radius_m=_MARK_M,
-            colour=GOAL,
-        )
+        yield Entry(
+            path="world/goal", stamp_s=stamp_s, kind="marks", data=np.array([record.goal_enu_m]),
+            size_m=_MARK_M, colour=GOAL,
+        )  # fmt: skip
 
 
 # From the record -------------------------------------------------------------------------------
@@ -188,50 +148,35 @@ def _plans(flight: ViewedFlight) -> Iterator[Entry]:
 
 def _notes(flight: ViewedFlight) -> Iterator[Entry]:
     for event in flight.run.record.events:
-        yield Note(
-            path=f"{flight.name}/events",
-            stamp_s=event["stamp_s"],
-            kind=event["kind"],
-            text=event["text"],
-        )
+        yield flight.entry("events", event["stamp_s"], "note", event)
 
 
 def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
-    """Yield the positions of all events of a kind so far, at each of them."""
+    """The positions of all events of a kind so far, at each of them."""
     places: list[Sequence[float]] = []
     for event in flight.run.record.events:
         if event["kind"] == kind and event["position_enu_m"]:
             places.append(event["position_enu_m"])
-            yield Marks(
-                path=f"{flight.name}/{kind}s",
-                stamp_s=event["stamp_s"],
-                centres_enu_m=np.array(places),
-                radius_m=_MARK_M,
-                colour=MARKED[kind],
+            yield flight.entry(
+                f"{kind}s", event["stamp_s"], "marks", np.array(places), _MARKED[kind], _MARK_M
             )
 
 
 def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
-    """Yield pose, setpoint and all states of each control tick."""
+    """Pose, setpoint and all states of each control tick."""
     for row in trace.drop_columns(["phase"]).to_pylist():
         stamp_s = row.pop("stamp_s")
         position = np.array([row["x_m"], row["y_m"], row["z_m"]])
-        yield Pose(
-            path=f"{flight.name}/vehicle",
-            stamp_s=stamp_s,
-            position_enu_m=position,
-            yaw_rad=row["yaw_rad"],
-            colour=flight.colour,
-        )
+        yield flight.entry("vehicle", stamp_s, "pose", (position, row["yaw_rad"]), flight.colour)
         if row["command_vx"] is not None:
             velocity = np.array([row[f"command_v{axis}"] for axis in "xyz"])
             way = np.stack([position, position + _SETPOINT_S * velocity])
             yield _line(flight, "setpoint", stamp_s, way, flight.colour, 0.1)
-        yield Values(path=f"{flight.name}/states", stamp_s=stamp_s, values=row)
+        yield flight.entry("states", stamp_s, "values", row)
 
 
 def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
-    """Yield the path flown so far, again and again."""
+    """The path flown so far, again and again."""
     stamps = trace["stamp_s"].to_numpy()
     places = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
     last = len(stamps) - 1
@@ -247,15 +192,8 @@ def _line(
     points_enu_m: FloatArray,
     colour: str,
     width_m: float,
-) -> Line:
-    """Return a line through those points (n, 3) that are numbers."""
-    return Line(
-        path=f"{flight.name}/{name}",
-        stamp_s=stamp_s,
-        points_enu_m=_drawable(points_enu_m),
-        colour=colour,
-        width_m=width_m,
-    )
+) -> Entry:
+    return flight.entry(name, stamp_s, "line", _drawable(points_enu_m), colour, width_m)
 
 
 def _drawable(points: FloatArray) -> FloatArray:
@@ -269,40 +207,26 @@ def _drawable(points: FloatArray) -> FloatArray:
 
 def _frames(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
     for frame, start_s in orders.get("point_cloud", ()):
-        yield Depth(path=f"{flight.name}/camera", stamp_s=start_s, frame=frame)
+        yield flight.entry("camera", start_s, "depth", frame)
 
 
 def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
     for cloud, start_s in orders.get("octomap", ()):
         points = _drawable(cloud.points_enu_m)
-        yield Points(
-            path=f"{flight.name}/cloud", stamp_s=start_s, points_enu_m=points, colour=flight.colour
-        )
+        yield flight.entry("cloud", start_s, "points", points, flight.colour)
 
 
 def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
-    """Yield every map that a plan was made on, and in between one a second of those checked."""
+    """Every map that a plan was made on, and in between one a second of those checked."""
     planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
     checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
     told_s = -math.inf
     for start_s, snapshot, wanted in sorted(planned + checked, key=itemgetter(0)):
         if wanted or start_s >= told_s + _MAP_EVERY_S:
             told_s = start_s
-            centres, sizes = _voxels(snapshot)
-            yield Boxes(
-                path=f"{flight.name}/map",
-                stamp_s=start_s,
-                centres_enu_m=centres,
-                sizes_m=sizes,
-                colour=_MAP,
-            )
-
-
-def _voxels(snapshot: MapSnapshot) -> tuple[FloatArray, FloatArray]:
-    """Return centres and sizes (n, 3) of the occupied cubes of a map."""
-    leaves = occupied_leaves(snapshot.payload) * snapshot.resolution_m
-    sizes = np.repeat(leaves[:, 3:], 3, axis=1)
-    return leaves[:, :3] + sizes / 2.0, sizes
+            leaves = occupied_leaves(snapshot.payload) * snapshot.resolution_m
+            sizes = np.repeat(leaves[:, 3:], 3, axis=1)
+            yield flight.entry("map", start_s, "boxes", leaves[:, :3] + sizes / 2.0, _MAP, sizes)
 
 
 # Writing ------------------------------------------------------------------------------------------
@@ -336,8 +260,10 @@ def require_viewer(path: Path | None) -> None:
         raise MavfiError("there is no display for rerun's window: use --save FILE.rrd")
 
 
-def save(flights: Sequence[ViewedFlight], path: Path) -> None:
+def save(flights: Sequence[ViewedFlight], path: Path | None) -> None:
     """Write flights for a viewer, atomically, in the format of the file's suffix.
+
+    None opens rerun's viewer, which stays open.
 
     Raises:
         ConfigError: The name has another suffix.
@@ -345,11 +271,11 @@ def save(flights: Sequence[ViewedFlight], path: Path) -> None:
         MavfiError: A package is not installed. Says how to install it.
     """
     require_viewer(path)
-    if path.suffix.lower() == ".rrd":
-        from mavfi_cli.report.view.rerun_file import write_rrd
-
-        write_rrd(flights, path)
-    else:
+    if path is not None and path.suffix.lower() == ".mcap":
         from mavfi_cli.report.view.mcap_file import write_mcap
 
         write_mcap(flights, path)
+    else:
+        from mavfi_cli.report.view.rerun_file import write_rrd
+
+        write_rrd(flights, path)

@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -39,19 +40,7 @@ from mavfi_cli.core.files import plain, write_atomically
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
 from mavfi_cli.report.drawing import rgb
-from mavfi_cli.report.view import (
-    Boxes,
-    Depth,
-    Entry,
-    Line,
-    Marks,
-    Note,
-    Points,
-    Pose,
-    Values,
-    ViewedFlight,
-    entries_of,
-)
+from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _STATES = "mavfi.States"  # schema of the states of a tick
 _WORLD = "world"  # the frame of all positions
@@ -125,36 +114,30 @@ def _schema(message: dict[str, Any]) -> bytes:
 
 
 def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
-    """Yield what an MCAP file holds of an entry, each with its topic."""
-    topic = f"/{entry.path}"
-    match entry:
-        case Boxes():
-            yield topic, _scene(entry, cubes=_cubes(entry))
-        case Marks():
-            size = Vector3(**dict.fromkeys("xyz", 2.0 * entry.radius_m))
-            colour = _colour(entry.colour)
-            spheres = [
-                SpherePrimitive(pose=_pose(centre), size=size, color=colour)
-                for centre in entry.centres_enu_m
-            ]
-            yield topic, _scene(entry, spheres=spheres)
-        case Line():
+    """What an MCAP file holds of an entry, each message with its topic."""
+    topic, data, stamp = f"/{entry.path}", entry.data, _timestamp(entry)
+    match entry.kind:
+        case "boxes":
+            cubes = _solids(CubePrimitive, entry, map(_vector, entry.size_m))
+            yield topic, _scene(entry, cubes=cubes)
+        case "marks":
+            size = Vector3(**dict.fromkeys("xyz", 2.0 * entry.size_m))
+            yield topic, _scene(entry, spheres=_solids(SpherePrimitive, entry, repeat(size)))
+        case "line":
             yield topic, _scene(entry, lines=[_strip(entry)])
-        case Points():
+        case "points":
             yield topic, _cloud(entry)
-        case Pose():
-            half = entry.yaw_rad / 2.0
-            pose = _pose(entry.position_enu_m, (math.cos(half), 0.0, 0.0, math.sin(half)))
-            yield topic, PoseInFrame(timestamp=_timestamp(entry), frame_id=_WORLD, pose=pose)
-        case Note():
+        case "pose":
+            position, half = data[0], data[1] / 2.0
+            pose = _pose(position, (math.cos(half), 0.0, 0.0, math.sin(half)))
+            yield topic, PoseInFrame(timestamp=stamp, frame_id=_WORLD, pose=pose)
+        case "note":
             level = Log.WARNING if entry.urgent else Log.INFO
-            yield (
-                topic,
-                Log(timestamp=_timestamp(entry), level=level, message=entry.text, name=entry.kind),
-            )
-        case Values():
-            yield topic, dict(entry.values)
-        case Depth():
+            log = Log(timestamp=stamp, level=level, message=data["text"], name=data["kind"])
+            yield topic, log
+        case "values":
+            yield topic, data
+        case "depth":
             yield from _camera(entry)
 
 
@@ -198,38 +181,38 @@ def _scene(entry: Entry, **primitives: Any) -> SceneUpdate:
     return SceneUpdate(entities=[entity])
 
 
-def _cubes(entry: Boxes) -> list[CubePrimitive]:
+def _solids(kind: Any, entry: Entry, sizes: Iterable[Vector3]) -> list[Any]:
     colour = _colour(entry.colour)
     return [
-        CubePrimitive(pose=_pose(centre), size=_vector(size), color=colour)
-        for centre, size in zip(entry.centres_enu_m, entry.sizes_m, strict=True)
+        kind(pose=_pose(centre), size=size, color=colour)
+        for centre, size in zip(entry.data, sizes, strict=False)
     ]
 
 
-def _strip(entry: Line) -> LinePrimitive:
+def _strip(entry: Entry) -> LinePrimitive:
     return LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=_pose(np.zeros(3)),
-        thickness=entry.width_m,
-        points=[Point3(x=x, y=y, z=z) for x, y, z in entry.points_enu_m.tolist()],
+        thickness=entry.size_m,
+        points=[Point3(x=x, y=y, z=z) for x, y, z in entry.data.tolist()],
         color=_colour(entry.colour),
     )
 
 
-def _cloud(entry: Points) -> PointCloud:
+def _cloud(entry: Entry) -> PointCloud:
     return PointCloud(
         timestamp=_timestamp(entry),
         frame_id=_WORLD,
         pose=_pose(np.zeros(3)),
         point_stride=12,
         fields=_AXES,
-        data=entry.points_enu_m.astype("<f4").tobytes(),
+        data=entry.data.astype("<f4").tobytes(),
     )
 
 
-def _camera(entry: Depth) -> Iterator[tuple[str, Message]]:
+def _camera(entry: Entry) -> Iterator[tuple[str, Message]]:
     """Yield the frame in metres, the lens, and the pose of the optical frame."""
-    frame, stamp = entry.frame, _timestamp(entry)
+    frame, stamp = entry.data, _timestamp(entry)
     name = entry.path
     rows, columns = frame.depth_m.shape
     focal = columns / 2.0 / math.tan(frame.hfov_rad / 2.0)

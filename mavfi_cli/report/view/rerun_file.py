@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage, of_stage
 from mavfi_cli.report.drawing import rgb
-from mavfi_cli.report.view import (
-    Boxes,
-    Depth,
-    Entry,
-    Line,
-    Marks,
-    Note,
-    Points,
-    Pose,
-    Values,
-    ViewedFlight,
-    entries_of,
-)
+from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _TIME = "simulated_time"
 _BODY_M = (0.25, 0.25, 0.08)  # half sizes of the box that stands for the vehicle
@@ -37,35 +27,25 @@ _VEHICLE = {  # plots of columns that are no states
 }
 
 
-def write_rrd(flights: Sequence[ViewedFlight], path: Path) -> None:
-    """Write flights as an .rrd file, atomically.
+def write_rrd(flights: Sequence[ViewedFlight], path: Path | None) -> None:
+    """Write flights as an .rrd file, atomically, or open them in rerun's viewer.
 
     Raises:
         RecordError: The file could not be written.
     """
-    recording = _recording(flights)
+    name = flights[-1].run.folder.path.resolve().name
+    recording = rr.RecordingStream("mavfi", recording_id=name)
+    if path is None:
+        recording.spawn()
+        _log(recording, flights)
+        recording.flush()
+        return
     stream = recording.binary_stream()
     _log(recording, flights)
     write_atomically(path, lambda file: file.write(stream.read(flush=True) or b""))
 
 
-def show(flights: Sequence[ViewedFlight]) -> None:
-    """Open flights in rerun's viewer, which stays open."""
-    recording = _recording(flights)
-    recording.spawn()
-    _log(recording, flights)
-    recording.flush()
-
-
-def _recording(flights: Sequence[ViewedFlight]) -> Any:
-    import rerun as rr
-
-    return rr.RecordingStream("mavfi", recording_id=flights[-1].run.folder.path.resolve().name)
-
-
 def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
-    import rerun as rr
-
     recording.send_blueprint(_blueprint(flights))
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for flight in flights:
@@ -82,19 +62,17 @@ def _log_entries(
     Args:
         drawn: The flight of each path of numbers; its colour is that of the lines.
     """
-    import rerun as rr
-
-    numbers: dict[str, list[Values]] = {}
+    numbers: dict[str, list[Entry]] = {}
     for entry in entries:
-        if isinstance(entry, Values):
+        if entry.kind == "values":
             numbers.setdefault(entry.path, []).append(entry)
             continue
         recording.set_time(_TIME, duration=entry.stamp_s)
         for path, archetype in _archetypes(entry):
             recording.log(path, archetype)
     for path, ticks in numbers.items():
-        for name in ticks[0].values:
-            told = [(tick.stamp_s, tick.values[name]) for tick in ticks]
+        for name in ticks[0].data:
+            told = [(tick.stamp_s, tick.data[name]) for tick in ticks]
             known = [(stamp_s, float(value)) for stamp_s, value in told if value is not None]
             if known:
                 stamps, values = zip(*known, strict=True)
@@ -108,70 +86,55 @@ def _log_entries(
                 recording.send_columns(f"{path}/{name}", [time], rr.Scalars.columns(scalars=values))
 
 
-def _archetypes(entry: Entry) -> list[tuple[str, Any]]:
-    """Return what rerun logs of an entry, with the path of each part."""
-    import rerun as rr
-
-    match entry:
-        case Boxes():
-            shown: Any = rr.Boxes3D(
-                centers=entry.centres_enu_m,
-                half_sizes=entry.sizes_m / 2.0,
-                colors=[rgb(entry.colour)],
-                fill_mode="solid",
+def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
+    """What rerun logs of an entry, with the path of each part."""
+    data, colours = entry.data, [rgb(entry.colour)] if entry.colour else None
+    shown: Any
+    match entry.kind:
+        case "boxes":
+            shown = rr.Boxes3D(
+                centers=data, half_sizes=entry.size_m / 2.0, colors=colours, fill_mode="solid"
             )
-        case Marks():
-            shown = rr.Points3D(
-                entry.centres_enu_m, radii=[entry.radius_m], colors=[rgb(entry.colour)]
-            )
-        case Points():
-            shown = rr.Points3D(entry.points_enu_m, radii=[0.03], colors=[rgb(entry.colour)])
-        case Line():
-            shown = rr.LineStrips3D(
-                [entry.points_enu_m], radii=[entry.width_m / 2.0], colors=[rgb(entry.colour)]
-            )
-        case Pose():
-            turn = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=entry.yaw_rad)
-            shown = rr.Transform3D(translation=entry.position_enu_m, rotation=turn)
-        case Note():
-            shown = rr.TextLog(
-                f"{entry.kind}: {entry.text}", level="WARN" if entry.urgent else "INFO"
-            )
-        case Depth():
-            return _camera(entry)
-        case _:
-            raise TypeError(entry)
-    return [(entry.path, shown)]
+        case "marks":
+            shown = rr.Points3D(data, radii=[entry.size_m], colors=colours)
+        case "points":
+            shown = rr.Points3D(data, radii=[0.03], colors=colours)
+        case "line":
+            shown = rr.LineStrips3D([data], radii=[entry.size_m / 2.0], colors=colours)
+        case "pose":
+            turn = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=data[1])
+            shown = rr.Transform3D(translation=data[0], rotation=turn)
+        case "note":
+            level = "WARN" if entry.urgent else "INFO"
+            shown = rr.TextLog(f"{data['kind']}: {data['text']}", level=level)
+        case "depth":
+            yield from _camera(entry)
+            return
+    yield entry.path, shown
 
 
-def _camera(entry: Depth) -> list[tuple[str, Any]]:
-    """Return the camera's pose and lens, and the frame; pixels without a measurement are 0."""
-    import rerun as rr
-
-    frame = entry.frame
+def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
+    """The camera's pose and lens, and the frame; pixels without a measurement are 0."""
+    frame = entry.data
     rows, columns = frame.depth_m.shape
     w, x, y, z = frame.quaternion
     depth_m = np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0).astype(np.float32)
-    return [
-        (entry.path, rr.Transform3D(translation=frame.position_enu_m, quaternion=[x, y, z, w])),
-        (
-            entry.path,
-            rr.Pinhole(
-                focal_length=columns / 2.0 / math.tan(frame.hfov_rad / 2.0),
-                width=columns,
-                height=rows,
-                camera_xyz=rr.ViewCoordinates.FLU,
-                image_plane_distance=1.0,
-            ),
+    yield entry.path, rr.Transform3D(translation=frame.position_enu_m, quaternion=[x, y, z, w])
+    yield (
+        entry.path,
+        rr.Pinhole(
+            focal_length=columns / 2.0 / math.tan(frame.hfov_rad / 2.0),
+            width=columns,
+            height=rows,
+            camera_xyz=rr.ViewCoordinates.FLU,
+            image_plane_distance=1.0,
         ),
-        (f"{entry.path}/depth", rr.DepthImage(depth_m, meter=1.0)),
-    ]
+    )
+    yield f"{entry.path}/depth", rr.DepthImage(depth_m, meter=1.0)
 
 
 def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
     """Return the layout: world, cameras and events on the left, a tab of plots a stage beside."""
-    import rerun.blueprint as rrb
-
     names = [flight.name for flight in flights]
 
     def plots(groups: dict[str, Sequence[str]]) -> list[Any]:
@@ -202,8 +165,6 @@ def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
 
 def _eye(flight: ViewedFlight) -> Any:
     """Look at the middle of the way from the south-west, from above; None without a way."""
-    import rerun.blueprint as rrb
-
     record = flight.run.record
     start, goal = record.world.get("start"), record.goal_enu_m
     if start is None or goal is None:

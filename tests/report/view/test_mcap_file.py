@@ -78,10 +78,10 @@ def test_every_entry_is_a_message_at_its_time(messages, entries):
 
 def test_states_are_numbers_and_what_json_cannot_hold_is_null(messages, entries):
     for (_, told), entry in zip(messages["/faulty/states"], entries["faulty/states"], strict=True):
-        for name, value in entry.values.items():
+        for name, value in entry.data.items():
             number = value is not None and math.isfinite(value)
             assert told[name] == (value if number else None)
-    assert any(math.isinf(e.values["time_to_collision"] or 0) for e in entries["golden/states"])
+    assert any(math.isinf(e.data["time_to_collision"] or 0) for e in entries["golden/states"])
 
 
 def test_a_depth_frame_is_whole_and_its_camera_looks_where_it_looked(messages, entries):
@@ -90,32 +90,32 @@ def test_a_depth_frame_is_whole_and_its_camera_looks_where_it_looked(messages, e
         messages[f"/golden/camera/{name}"][-1] for name in ("depth", "calibration", "pose")
     )
     depth_m = np.frombuffer(image.data, "<f4").reshape(image.height, image.width)
-    np.testing.assert_array_equal(depth_m, entry.frame.depth_m.astype(np.float32))
+    np.testing.assert_array_equal(depth_m, entry.data.depth_m.astype(np.float32))
     assert image.encoding == "32FC1"
     assert lens.K[0] == pytest.approx(image.width / 2.0)  # 90 degrees wide
     turn = pose.rotation
     optical = rotation_matrix(np.array([turn.w, turn.x, turn.y, turn.z]))
-    body = rotation_matrix(entry.frame.quaternion)
+    body = rotation_matrix(entry.data.quaternion)
     np.testing.assert_allclose(optical[:, 2], body[:, 0], atol=1e-12)  # depth goes forward
     np.testing.assert_allclose(optical[:, 0], -body[:, 1], atol=1e-12)  # columns go right
     np.testing.assert_allclose(optical[:, 1], -body[:, 2], atol=1e-12)  # rows go down
     assert pose.child_frame_id == image.frame_id == lens.frame_id
     place = [pose.translation.x, pose.translation.y, pose.translation.z]
-    assert place == entry.frame.position_enu_m.tolist()
+    assert place == entry.data.position_enu_m.tolist()
 
 
 def test_clouds_boxes_lines_and_events_are_those_of_the_entries(messages, entries):
     (_, cloud), entry = messages["/faulty/cloud"][-1], entries["faulty/cloud"][-1]
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
-    np.testing.assert_array_equal(points, entry.points_enu_m.astype(np.float32))
+    np.testing.assert_array_equal(points, entry.data.astype(np.float32))
     ((_, world),), (entry,) = messages["/world/obstacles"], entries["world/obstacles"]
     cubes = world.entities[0].cubes
-    assert [[c.size.x, c.size.y, c.size.z] for c in cubes] == entry.sizes_m.tolist()
+    assert [[c.size.x, c.size.y, c.size.z] for c in cubes] == entry.size_m.tolist()
     (_, plan), entry = messages["/faulty/plan"][0], entries["faulty/plan"][0]
     (line,) = plan.entities[0].lines
-    assert [[p.x, p.y, p.z] for p in line.points] == entry.points_enu_m.tolist()
+    assert [[p.x, p.y, p.z] for p in line.points] == entry.data.tolist()
     texts = [(told.name, told.message) for _, told in messages["/faulty/events"]]
-    assert texts == [(entry.kind, entry.text) for entry in entries["faulty/events"]]
+    assert texts == [(entry.data["kind"], entry.data["text"]) for entry in entries["faulty/events"]]
 
 
 def test_equal_flights_give_equal_bytes(pair, file, tmp_path):

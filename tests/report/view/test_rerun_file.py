@@ -8,7 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.report.view import Values, entries_of
+from mavfi_cli.report.view import entries_of
 from mavfi_cli.report.view.rerun_file import write_rrd
 
 
@@ -39,9 +39,9 @@ def stamps_of(column):
 def test_every_entry_is_there_at_its_time(columns, pair):
     expected = {}
     for entry in entries_of(pair):
-        names = entry.values if isinstance(entry, Values) else [""]
+        names = entry.data if entry.kind == "values" else [""]
         for name in names:
-            if name == "" or entry.values[name] is not None:
+            if name == "" or entry.data[name] is not None:
                 path = f"/{entry.path}/{name}".rstrip("/")
                 expected.setdefault(path, []).append(round(entry.stamp_s, 6))
     for path, stamps in expected.items():
