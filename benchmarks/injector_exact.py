@@ -53,7 +53,7 @@ from mavfi_cli.fi.tracer.fault import (
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.clusters import estimated_total
+from mavfi_cli.stats.shares import estimated_total
 
 ROUNDS, FACTOR, WORD = 500, 6364136223846793005, 1 << 64
 SOURCE = f"""

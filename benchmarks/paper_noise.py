@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 
 from mavfi_cli.paper.items import printed
-from mavfi_cli.stats.effects import fisher, recovered_share
+from mavfi_cli.stats.paired import fisher, recovered_share
 
 GOLDEN, FAULTY = 100, 300  # missions a world
 WORLDS = ("factory", "farm", "sparse", "dense")

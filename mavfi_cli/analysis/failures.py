@@ -7,6 +7,8 @@ the same population.
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,13 +16,50 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.groups import Group
-from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, silent_of_all
+from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import cross_layer, failures_per_hour, rate
+from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour, rate
+
+KERNELS = "kernels.json"
+
+
+def kernel_summary(path: Path) -> Mapping[str, Any]:
+    """Read a summary.
+
+    Raises:
+        RecordError: the file cannot be read, or is no such summary.
+    """
+    try:
+        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]
+        for each in found["kernels"]:
+            each["kernel"], silent_of_all(each)
+    except OSError as error:
+        raise RecordError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({error!r})") from None
+    return found
+
+
+def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
+    """The share of an outcome in a kernel of a summary, with the interval of the summary.
+
+    That interval is wider than one of independent runs, because runs of one input are alike.
+    """
+    told = kernel["outcomes"][outcome]
+    low, high = told["wilson95"]
+    share = math.nan if told["share"] is None else told["share"]
+    return Share(count=told["count"], total=told["of"], share=share, low=low, high=high)
+
+
+def silent_of_all(kernel: Mapping[str, Any]) -> tuple[int, int]:
+    """Silent corruptions of a kernel, and faults that were injected into it."""
+    sdc = kernel["outcomes"]["sdc"]
+    return sdc["count"], sdc["of"]
+
 
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults

@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +23,17 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
+    PlannedMission,
     ResultState,
     canonical,
     changes_of,
 )
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
+from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.measures import (
     QUALITY,
@@ -34,6 +43,7 @@ from mavfi_cli.mission.measures import (
     measures_of,
     record_of,
 )
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
@@ -65,6 +75,31 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     rows = [_row(entry, labels) for entry in ledger.results(among)]
     names = _names(labels)
     return pa.table({name: _column([row[name] for row in rows]) for name in names})
+
+
+def fly(
+    missions: Sequence[PlannedMission],
+    folder: Path,
+    keep: Keep,
+    options: Options,
+    spectator: Spectator,
+) -> pa.Table:
+    """Fly the missions that the folder lacks; return the table of all of them.
+
+    Others that an interrupted larger plan has left in the folder's list are not flown.
+
+    Raises:
+        CampaignStopped, RecordError, Interrupted: as `run_campaign`.
+    """
+    wanted = {
+        (canonical(dict(each.labels)), canonical(changes_of(each.config))) for each in missions
+    }
+    with Ledger(folder, writing=True) as ledger:
+        store_plan(ledger, missions, append=True)
+        mine = [number for number, labels, _, changes in ledger.rows()
+                if (labels, changes) in wanted]  # fmt: skip
+        fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
+        return flights(ledger, mine)
 
 
 def _names(labels: Sequence[str]) -> list[str]:
@@ -231,3 +266,45 @@ def changed(
         return found
     value, low, high = (math.exp(each) for each in (found.value, found.low, found.high))
     return Interval(value=value, low=low, high=high, count=found.count)
+
+
+# One mission --------------------------------------------------------------------------------------
+
+_COMPARED = frozenset(measures_of({})) | {"outcome"}
+
+
+def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
+    """One mission by its number, and the measures that it had.
+
+    Args:
+        campaign: its folder, or an exported .parquet file.
+
+    Raises:
+        RecordError: there is no campaign, or it cannot be read.
+        ConfigError: no such mission has flown.
+    """
+    if campaign.is_file():
+        table = read_parquet(campaign, "export of a campaign")
+        if missing := {"number", "outcome", "changes"} - {*table.column_names}:
+            told = f"no export of a campaign: it has no column {', '.join(sorted(missing))}"
+            raise RecordError(f"{campaign}: {told}")
+        for row in chosen(table, number=number).to_pylist():
+            if row["outcome"] is not None:
+                return structure(json.loads(row["changes"]), MissionConfig), row
+    else:
+        with Ledger(campaign) as ledger:
+            for entry in ledger.results([number]):
+                if entry.outcome is not None:
+                    row = {**measures_of(entry.result), "outcome": entry.outcome}
+                    return entry.mission.config, row
+    raise ConfigError(f"has no mission {number} that has flown", path=campaign)
+
+
+def differing(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
+    """The columns in which a repetition differs; mixed columns of an export are text."""
+    again = {**measures_of(result), "outcome": record_of(result).outcome}
+    return [
+        name
+        for name, value in row.items()
+        if name in _COMPARED and value != again[name] and str(value) != str(again[name])
+    ]

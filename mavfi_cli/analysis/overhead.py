@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.groups import RESAMPLES, Group
+from mavfi_cli.analysis.summary import RESAMPLES, Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage

@@ -30,7 +30,7 @@ from mavfi_cli.analysis.flights import (
     numbers,
     paired,
 )
-from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, mean, median

@@ -1,13 +1,12 @@
-"""Replay traces of unprotected flights through the detectors: one score per flight.
+"""Recorded flights as detectors see them: samples to fit to, and one score per replayed flight.
 
-The score is the highest of the flight's messages, in units of the detector's threshold. Above 1 the
-gate would have raised an alarm. Nothing is withheld during the replay, so the scores do not depend
-on the threshold. They include the checks of the plan in flight.
+The score of a flight without protection is the highest of its messages, in units of the detector's
+threshold. Above 1 the gate would have raised an alarm. Nothing is withheld during the replay, so
+the scores do not depend on the threshold. They include the checks of the plan in flight.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -16,16 +15,20 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.detector_pairs import NONE, harmful
-from mavfi_cli.analysis.detectors import Scored
+from mavfi_cli.analysis.detectors import Scored, harmful
 from mavfi_cli.analysis.flights import chosen
+from mavfi_cli.campaigns.detector_plans import NONE, model_digest
+from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.types import BY_NAME, Stage, Trajectory
+from mavfi_cli.core.types import BY_NAME, Outcome, StackMark, Stage, Trajectory
 from mavfi_cli.detect.base import Model
-from mavfi_cli.detect.offline import Columns, PlanStrike, columns_of, replay
+from mavfi_cli.detect.offline import Columns, FlightSamples, PlanStrike, columns_of, replay
+from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.run_folder import load_run
+from mavfi_cli.mission.run_folder import RESULT, Run, load_run
 from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
+from mavfi_cli.spec.mission import OWN_AUTOPILOT
+from mavfi_cli.spec.stack import load_stack
 
 SCORES = "scores.json"
 _WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these
@@ -158,12 +161,6 @@ class Scores:
         return highest / fresh.threshold
 
 
-def model_digest(detector: DetectorConfig, stack: str) -> str:
-    """Digest of a detector's model file; `none` without one."""
-    path = model_path(detector, stack)
-    return "none" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _read(path: Path) -> dict[str, dict[str, float | None]]:
     """The stored scores; empty if the file is damaged or missing."""
     try:
@@ -171,3 +168,47 @@ def _read(path: Path) -> dict[str, dict[str, float | None]]:
     except (OSError, ValueError):
         return {}
     return kept
+
+
+def samples_of(run: Run, name: str) -> FlightSamples:
+    """The samples of a flight with a trace."""
+    assert run.trace is not None
+    columns, plans = columns_of(run.trace), run.folder.read_plans()
+    return FlightSamples.of_trace(
+        columns, name, run.record.config["seed"], PreprocessParams(), plans
+    )
+
+
+def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:
+    """Collect the samples of the error-free flights among the run folders of a folder.
+
+    Returns:
+        The samples, the number of other flights, and the autopilots that flew. A flight has the
+        name of its world, or that of its run folder if the world and the seed have been flown
+        before.
+    """
+    runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
+    usable = [run for run in runs if _is_error_free(run, stack)]
+    if not usable:
+        told = f"no error-free flight of the stack {stack.name!r} among {len(runs)} runs"
+        raise ModelError(told, path=flown)
+    flights: dict[tuple[str, int], FlightSamples] = {}
+    for run in usable:
+        config = run.record.config
+        world = config["world"]
+        name = run.folder.path.name if (world, config["seed"]) in flights else world
+        flights[name, config["seed"]] = samples_of(run, name)
+    autopilots = {run.record.config.get("autopilot", OWN_AUTOPILOT) for run in usable}
+    return list(flights.values()), len(runs) - len(usable), autopilots
+
+
+def _is_error_free(run: Run, stack: StackMark) -> bool:
+    """Return True for a flight of the stack that reached the goal without fault and alarm."""
+    record = run.record
+    asked = (record.config["fault"], record.config["instruction"])
+    return (
+        record.outcome == Outcome.SUCCESS.value
+        and asked == (None, None)
+        and not (record.detection or {}).get("alarm_count")
+        and load_stack(record.config["stack"]).mark.digest == stack.digest
+    )

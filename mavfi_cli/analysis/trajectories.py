@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from mavfi_cli.analysis.groups import TREATMENT, untreated
+from mavfi_cli.analysis.summary import TREATMENT, untreated
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError

@@ -22,7 +22,7 @@ from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
-from mavfi_cli.stats.clusters import Total, estimated_total
+from mavfi_cli.stats.shares import Total, estimated_total
 
 Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
 # Called with the instructions stepped since the last call, or with what goes on, in words.

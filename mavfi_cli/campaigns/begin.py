@@ -20,10 +20,15 @@ from mavfi_cli.campaigns.missions import (
     naming,
 )
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, require_unchanged, run_campaign, store_plan
+from mavfi_cli.campaigns.run import (
+    BatchLimiter,
+    Options,
+    require_unchanged,
+    run_campaign,
+    store_plan,
+)
 from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec, differences
 from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced, to_toml
-from mavfi_cli.campaigns.stopping import BatchLimiter
 from mavfi_cli.core.errors import (
     ConfigError,
     FaultSpecError,

@@ -12,7 +12,7 @@ from typing import Any
 
 from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError, nearest
+from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream, derive
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
@@ -430,3 +430,21 @@ def _of_setting(setting: Setting) -> _Choices:
 
 def _told(values: Sequence[Any]) -> str:
     return ", ".join(map(str, values)) if values else "none"
+
+
+def require_named(
+    key: str, names: Sequence[str], known: Sequence[str] | None = None, least: int = 1
+) -> None:
+    """Require some names, each once and each known.
+
+    Raises:
+        ConfigError: too few, or one twice.
+        UnknownName: a name is not among the known ones, if they are given.
+    """
+    if len(names) < least:
+        raise ConfigError("name at least one", key=key)
+    for place, name in enumerate(names):
+        if known is not None and name not in known:
+            raise UnknownName(key, name, known)
+        if name in names[:place]:
+            raise ConfigError(f"{name} is named twice", key=key)

@@ -363,9 +363,8 @@ def _more(
 ) -> dict[str, Any]:
     """The results of --quality, --overhead and --failures, as plain values."""
     from mavfi_cli.analysis.failures import failures
-    from mavfi_cli.analysis.groups import groups
     from mavfi_cli.analysis.overhead import flight_overheads
-    from mavfi_cli.analysis.summary import qualities
+    from mavfi_cli.analysis.summary import groups, qualities
 
     told: dict[str, Any] = {}
     found = groups(ledger, by) if any(map(asked.get, ("quality", "overhead", "failures"))) else []

@@ -155,10 +155,10 @@ def _attacked(
 
 def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
+    from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets
     from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.kernel_plot import draw_kernel_plot
-    from mavfi_cli.studies.kernels import kernel_flight, kernel_targets
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
     config = kernel_flight(options["world"], options["world_seed"])

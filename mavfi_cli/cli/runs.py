@@ -129,25 +129,25 @@ def _repeat_run(path: Path, out: Path, *, with_fault: bool, gdb: bool) -> _Compa
 
 
 def _repeat_mission(campaign: Path, number: int, out: Path, *, with_fault: bool) -> _Comparison:
+    from mavfi_cli.analysis.flights import differing, mission_of
     from mavfi_cli.mission.run import fly_to_end
     from mavfi_cli.report.summary import outcome_line
-    from mavfi_cli.studies.again import mission_of
 
-    mission = mission_of(campaign, number)
-    config = mission.config if with_fault else mission.config.golden
+    config, row = mission_of(campaign, number)
+    config = config if with_fault else config.golden
     _note(f"flying mission {number}: {config.world}, seed {config.seed}")
     again = fly_to_end(config, out)
-    differing = mission.differing(again.result)
+    changed = differing(row, again.result)
     comparison = {
         "campaign": str(campaign),
         "mission": number,
         "again": str(again.folder.path),
-        "identical": not differing,
-        "outcomes": [mission.row["outcome"], again.record.outcome],
-        "differing_measures": differing,
+        "identical": not changed,
+        "outcomes": [row["outcome"], again.record.outcome],
+        "differing_measures": changed,
     }
     same = "identical in every measure"
-    told = f"DIFFERENT in {', '.join(differing)}" if differing else same
+    told = f"DIFFERENT in {', '.join(changed)}" if changed else same
     return comparison, [outcome_line(again.result), told, f"Run folder  {again.folder.path}"]
 
 

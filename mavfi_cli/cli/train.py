@@ -65,6 +65,7 @@ def train(
     The same command resumes an interrupted training. Fitting the autoencoder needs torch:
     pip install 'mavfi[train]'.
     """
+    from mavfi_cli.campaigns.detector_plans import TRAINING_WORLDS, TrainingPlan
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.detect.fit import KINDS
@@ -72,14 +73,13 @@ def train(
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
     from mavfi_cli.studies.train import train as run
-    from mavfi_cli.studies.training_flights import WORLDS, TrainingPlan
 
     if autopilot == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     if flown is not None:
         refuse_given(_FLYING, "means nothing with --flown")
     plan = TrainingPlan(
-        worlds=worlds or WORLDS,
+        worlds=worlds or TRAINING_WORLDS,
         flights=flights,
         first_seed=first_seed,
         seed=seed,

@@ -97,9 +97,8 @@ def vpm(
     from mavfi_cli.core.errors import ConfigError
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.model import model_csv, model_lines, redundancy_csv
-    from mavfi_cli.vpm.model import schemes_with
+    from mavfi_cli.vpm.model import ModelVehicle, schemes_with
     from mavfi_cli.vpm.report import report
-    from mavfi_cli.vpm.vehicle import ModelVehicle
 
     if as_json and as_csv:
         raise click.UsageError("--json and --csv exclude each other")
@@ -173,10 +172,10 @@ def _flown(
     out: Path,
     options: dict[str, Any],
 ) -> dict[str, Any]:
+    from mavfi_cli.analysis.beside_model import WORLDS, RedundancyPlan
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.studies.redundancy import fly_and_report
-    from mavfi_cli.studies.redundancy_plan import WORLDS, RedundancyPlan
 
     plan = RedundancyPlan(
         vehicles=vehicles,
@@ -195,8 +194,8 @@ def _flown(
 
 def _choices(options: dict[str, Any]) -> Any:
     from mavfi_cli.spec.platform import load_platform
+    from mavfi_cli.vpm.model import Board
     from mavfi_cli.vpm.report import Choices
-    from mavfi_cli.vpm.vehicle import Board
 
     platform, board = options["platform"], options["board"]
     return Choices(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +15,7 @@ from mavfi_cli.attack.kernels.inputs import (
     load_inputs,
     save_inputs,
 )
+from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.autonomy import collision, tracking
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
@@ -179,6 +180,22 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
     sha256 = save_inputs(path, inputs)
     return {"inputs": path, "inputs_sha256": sha256, "flight": _flight_name(config)}
+
+
+def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
+    """The golden flight whose inputs `mavfi kernels` attacks.
+
+    Collision check, planner and control have the parameters of `hardened`.
+    """
+    return MissionConfig(world=world, seed=seed, stack="hardened")
+
+
+def kernel_targets(
+    kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
+) -> list[KernelTarget]:
+    """The kernels of these names, with the inputs of a flight. Raises as `inputs_of_flight`."""
+    fed = inputs_of_flight(config, folder)
+    return [KernelTarget(kernel=each, tolerance=tolerance, **fed) for each in kernels]
 
 
 def _flight_name(config: MissionConfig) -> str:

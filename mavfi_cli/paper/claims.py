@@ -17,25 +17,25 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS
-from mavfi_cli.analysis.groups import RESAMPLES
-from mavfi_cli.analysis.kernel_runs import outcome_share
+from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
 from mavfi_cli.stats.bootstrap import Interval, interval
-from mavfi_cli.stats.effects import (
+from mavfi_cli.stats.paired import (
     Count,
     as_interval,
     correlation,
     effect_difference,
     fisher,
     longest_reaches,
+    mcnemar,
     paired_difference,
     rate_difference,
     recovered_share,
 )
-from mavfi_cli.stats.paired import mcnemar
 from mavfi_cli.stats.shares import Share, wilson
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.kernel_runs import silent_of_all
+from mavfi_cli.analysis.failures import silent_of_all
 from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.paper.beyond import (
@@ -29,7 +29,7 @@ from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.paper.status import of_kernels, of_model
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, draw_strips
-from mavfi_cli.stats.effects import ClaimVerdict, excess_over_mean, judge
+from mavfi_cli.stats.paired import ClaimVerdict, excess_over_mean, judge
 from mavfi_cli.stats.shares import Share, wilson
 
 if TYPE_CHECKING:

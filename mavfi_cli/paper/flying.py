@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
+from mavfi_cli.analysis.failures import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.begin import check_kinds
@@ -263,7 +263,10 @@ class _KernelRuns:
 
     def forecast_s(self) -> float:
         """Wall time of the missing runs, from a few runs of the quickest kernel."""
-        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+        from mavfi_cli.mission.kernel_inputs import (  # loads the mission
+            kernel_flight,
+            kernel_targets,
+        )
 
         with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
             targets = kernel_targets(select([_QUICKEST]), kernel_flight(), Path(scratch))
@@ -279,7 +282,10 @@ class _KernelRuns:
         Raises:
             MavfiError: as `attack.campaign.run_campaign`.
         """
-        from mavfi_cli.studies.kernels import kernel_flight, kernel_targets  # loads the mission
+        from mavfi_cli.mission.kernel_inputs import (  # loads the mission
+            kernel_flight,
+            kernel_targets,
+        )
 
         plan = Plan(runs=self.runs, seed=_SEED)
         targets = kernel_targets(select(()), kernel_flight(), self.folder)

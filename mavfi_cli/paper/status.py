@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.flights import flights
-from mavfi_cli.analysis.groups import METRICS, Group, groups
-from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary, outcome_share
+from mavfi_cli.analysis.summary import METRICS, Group, groups
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import presets
@@ -31,9 +30,8 @@ from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.report.campaign import SettingColumns
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.stats.shares import rate
-from mavfi_cli.vpm.model import schemes_with
+from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 _ROWS = 14  # of a table on one screen
 _WIDE = 2  # columns of settings on one screen

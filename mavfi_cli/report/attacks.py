@@ -8,14 +8,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.kernel_runs import KERNELS
+from mavfi_cli.analysis.failures import KERNELS
 from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.report.columns import blocks, csv_text
-from mavfi_cli.stats.clusters import Cluster, clustered_share
+from mavfi_cli.stats.shares import Cluster, clustered_share
 
 SCHEMA = 2
 _OF_EVERY_RUN = (

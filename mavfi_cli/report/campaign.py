@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.groups import INACTIVE, METRICS
+from mavfi_cli.analysis.summary import INACTIVE, METRICS
 from mavfi_cli.campaigns.missions import label_text, label_value, ordered
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_atomically

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.analysis.groups import RESAMPLES
+from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.columns import WIDTH, blocks, csv_text
 from mavfi_cli.report.drawing import GRID, INK, NOTE, new_figure, open_frame

@@ -1,19 +1,26 @@
-"""Two treatments of the same missions: McNemar's test, sign flips, Holm's correction, worst case.
+"""Two treatments: tests, the worst case, effects with intervals, and what they say about a claim.
 
 The worst case and its recovery are those of the paper's section VII-A. It gives, for Factory, a
 worst-case flight time with faults 73.8 % above the golden run's, recovered by 64.2 % in section
 VII-A and by 87.1 % in Fig. 14: 64.2 / 73.8 = 87.0 %. So the first is in points of the golden run
 and the second is a share of the increase. Both are given here.
+
+An effect is one number of a comparison: a difference of two rates, or the share of a loss that
+protection recovers. A claim gives the range in which the effect lies. `judge` compares the two.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mavfi_cli.stats.bootstrap import Interval
+from mavfi_cli.stats.shares import Share, z_of
 
 BoolArray = NDArray[np.bool_]
 _EXACT = 16  # all signs are tried up to this many differences
@@ -174,3 +181,161 @@ def worst_case(
         recovered=recovered,
         recovered_share=recovered / increase if beyond else math.nan,
     )
+
+
+DRAWS = 100_000  # of the three rates in `recovered_share`
+Count = tuple[int, int]  # successes, missions
+
+
+class ClaimVerdict(Enum):
+    """What the data say about a claim."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not reproduced"
+    OPEN = "not distinguishable"  # at this number of missions
+    NOT_FLOWN = "not flown"
+    NOT_JUDGED = "not judged"  # flown, but no number came of it
+
+
+def judge(effect: Interval | None, low: float = -math.inf, high: float = math.inf) -> ClaimVerdict:
+    """Compare the interval of an effect with the range that a claim gives.
+
+    The claim is reproduced if the whole interval is in the range, and not reproduced if no part of
+    it is. If the interval has a part on either side, the missions do not tell. The ends of a
+    direction are open: an interval that ends at 0 is not above 0.
+
+    Args:
+        effect: with its 95 % interval; None, or an interval without ends, if there are no data.
+        low, high: ends of the claimed range. Only finite ends are open.
+    """
+    if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
+        return ClaimVerdict.NOT_FLOWN
+    if low < effect.low and effect.high < high:
+        return ClaimVerdict.REPRODUCED
+    if effect.high <= low or effect.low >= high:
+        return ClaimVerdict.NOT_REPRODUCED
+    return ClaimVerdict.OPEN
+
+
+def fisher(first: Count, second: Count) -> float:
+    """Two-sided p-value of Fisher's exact test of two independent rates."""
+    from scipy.stats import fisher_exact
+
+    table = [[wins, missions - wins] for wins, missions in (first, second)]
+    return float(fisher_exact(table).pvalue)
+
+
+def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:
+    """Pearson's correlation with Fisher's interval; NaN if one of the two does not vary.
+
+    Args:
+        pairs: at least four.
+    """
+    from scipy.stats import pearsonr
+
+    first, second = (np.array(each) for each in zip(*pairs, strict=True))
+    if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=len(pairs))
+    found = pearsonr(first, second)
+    ends = found.confidence_interval()
+    return Interval(
+        value=float(found.statistic), low=float(ends.low), high=float(ends.high), count=len(pairs)
+    )
+
+
+def as_interval(share: Share) -> Interval:
+    """A rate as an effect."""
+    return Interval(value=share.share, low=share.low, high=share.high, count=share.total)
+
+
+def rate_difference(first: Share, second: Share) -> Interval:
+    """First minus second of two independent rates, with the hybrid score interval.
+
+    R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the two
+    Wilson intervals, added in squares. NaN if one has no observations.
+    """
+    if not (first.total and second.total):
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
+    found = effect_difference(as_interval(first), as_interval(second))
+    return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
+
+
+def effect_difference(first: Interval, second: Interval) -> Interval:
+    """First minus second of two independent effects: their distances added in squares (MOVER)."""
+    value = first.value - second.value
+    below = math.hypot(first.value - first.low, second.high - second.value)
+    above = math.hypot(first.high - first.value, second.value - second.low)
+    count = min(first.count, second.count)
+    return Interval(value=value, low=value - below, high=value + above, count=count)
+
+
+def paired_difference(test: McNemar) -> Interval:
+    """Success of the second treatment minus that of the first, of the same missions.
+
+    D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
+    added to each kind of pair that differs, so 0 of n differences still has a width.
+    """
+    if not test.pairs:
+        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
+    gained, lost = ((each + 1) / (test.pairs + 2) for each in (test.only_second, test.only_first))
+    centre = gained - lost
+    half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (test.pairs + 2))
+    return Interval(
+        value=test.difference,
+        low=max(-1.0, centre - half),
+        high=min(1.0, centre + half),
+        count=test.pairs,
+    )
+
+
+def recovered_share(
+    golden: Count, faulty: Count, protected: Count, *, draws: int = DRAWS, seed: int = 1
+) -> Interval:
+    """Share of the lost success that protection recovers, of three independent rates.
+
+    A ratio of two differences. The three rates are drawn from their posterior distributions under
+    Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as well.
+    The interval is that of the percentiles of the ratio. Draws in which the faults cost nothing
+    belong to it.
+
+    Args:
+        golden, faulty, protected: successes and missions of each.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = [
+        rng.beta(wins + 0.5, missions - wins + 0.5, draws)
+        for wins, missions in (golden, faulty, protected)
+    ]
+    low, high = np.percentile((drawn[2] - drawn[1]) / (drawn[0] - drawn[1]), [2.5, 97.5])
+    rates = [wins / missions for wins, missions in (golden, faulty, protected)]
+    loss = rates[0] - rates[1]
+    value = (rates[2] - rates[1]) / loss if loss else math.nan
+    return Interval(value=value, low=float(low), high=float(high), count=faulty[1])
+
+
+def longest_reaches(beyond: Share, flights: int) -> Interval:
+    """Probability that the longest of so many flights is at least as long as a given one.
+
+    1 - (1 - p)^n, where p is the share of flights that are as long. The ends are those of p.
+
+    Args:
+        beyond: share of our flights that are as long.
+        flights: number of flights of which the longest is taken.
+    """
+    value, low, high = (
+        -math.expm1(flights * math.log1p(-each)) if each < 1.0 else 1.0
+        for each in (beyond.share, beyond.low, beyond.high)
+    )
+    return Interval(value=value, low=low, high=high, count=beyond.total)
+
+
+def excess_over_mean(golden: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
+    """The longest of the golden and of the other flights over the mean golden one, minus 1.
+
+    Unpaired: the reading that the paper's words allow. The first number is what the flights differ
+    by without any fault. NaN if either has no flight.
+    """
+    if not golden or not others:
+        return math.nan, math.nan
+    reference = math.fsum(golden) / len(golden)
+    return max(golden) / reference - 1.0, max(others) / reference - 1.0

@@ -10,21 +10,20 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.flights import errors, flights
+from mavfi_cli.analysis.flights import errors, flights, fly
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaigns.begin import begin, resumed
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, fly_missing
-from mavfi_cli.campaigns.specification import Keep, Setting, Spec
+from mavfi_cli.campaigns.specification import Keep, Setting, Spec, require_named
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import DEFAULT
-from mavfi_cli.studies.flying import fly, require_named
 
 FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings

@@ -14,11 +14,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.detector_pairs import NONE, harmful, pairs_of
-from mavfi_cli.analysis.detectors import Scored, found
-from mavfi_cli.analysis.flights import errors, flown
-from mavfi_cli.analysis.scores import Scores, model_digest
+from mavfi_cli.analysis.detectors import Scored, found, harmful, pairs_of
+from mavfi_cli.analysis.flights import errors, flown, fly
+from mavfi_cli.analysis.scores import Scores
 from mavfi_cli.campaigns.begin import check_names
+from mavfi_cli.campaigns.detector_plans import NONE, EvaluationPlan, model_digest
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
@@ -26,8 +26,6 @@ from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.detect.base import Model
 from mavfi_cli.spec.detector import detector_of, model_path
-from mavfi_cli.studies.evaluation_plan import EvaluationPlan
-from mavfi_cli.studies.flying import fly
 
 SCHEMA = 1
 BARE, PROTECTED = "bare", "protected"

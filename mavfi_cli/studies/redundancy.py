@@ -8,10 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.beside_model import BASE, Beside, Key, side_by_side
-from mavfi_cli.analysis.flights import chosen, errors, flown
+from mavfi_cli.analysis.beside_model import (
+    BASE,
+    Beside,
+    FlightPlan,
+    Key,
+    RedundancyPlan,
+    flight_plan,
+    side_by_side,
+)
+from mavfi_cli.analysis.flights import chosen, errors, flown, fly
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
+from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
@@ -21,14 +30,9 @@ from mavfi_cli.core.errors import CannotLift, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.flight_plan import FlightPlan, flight_plan
-from mavfi_cli.studies.flying import fly
-from mavfi_cli.studies.redundancy_plan import RedundancyPlan
 from mavfi_cli.studies.train import train
-from mavfi_cli.studies.training_flights import TrainingPlan
-from mavfi_cli.vpm.model import DETECTORS, Scheme, schemes_with
+from mavfi_cli.vpm.model import DETECTORS, ModelVehicle, Scheme, schemes_with
 from mavfi_cli.vpm.report import CHAINS, report, setting_of
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default

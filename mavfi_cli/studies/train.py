@@ -1,21 +1,24 @@
-"""Training of detectors: the data set of error-free flights, and the models fitted to it."""
+"""`mavfi train`: error-free flights, the data set of their samples, and the models fitted to it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mavfi_cli.analysis.scores import flown_samples, samples_of
+from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.detect.base import Model
+from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect.fit import check, fit
-from mavfi_cli.detect.offline import Dataset
+from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
-from mavfi_cli.studies.training_flights import TrainingPlan, collect_flown, fly_training
 
 DATASET = "dataset.parquet"
 
@@ -50,10 +53,10 @@ def train(
     if plan.flown is None:
         check(plan.kinds, len(plan.missions()), plan.n_sigma)
         plan = replace(plan, base=plan.base.with_firmware())
-        flights, failed = fly_training(plan, folder, options, spectator)
+        flights, failed = _fly(plan, folder, options, spectator)
         autopilots = {plan.base.autopilot}
     else:
-        flights, failed, autopilots = collect_flown(plan.flown, stack)
+        flights, failed, autopilots = flown_samples(plan.flown, stack)
         check(plan.kinds, len(flights), plan.n_sigma)
     if not flights:
         raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
@@ -63,19 +66,25 @@ def train(
     fitted = {}
     for kind in plan.kinds:
         spectator.on_note(f"fitting {kind}")
-        model = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
-        fitted[kind] = _flown_by(autopilots, model)
-    models = {}
-    for kind, model in fitted.items():  # all of them, or none
-        path = folder / f"{kind}.json"
+        fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
+        if autopilots != {OWN_AUTOPILOT}:
+            told = {"autopilot": ", ".join(sorted(autopilots))}
+            fitted[kind] = replace(fitted[kind], provenance={**fitted[kind].provenance, **told})
+    models = {kind: (model, folder / f"{kind}.json") for kind, model in fitted.items()}
+    for model, path in models.values():  # all of them, or none
         model.save(path)
-        models[kind] = (model, path)
     return _TrainedDetectors(dataset=dataset, models=models, failed=failed)
 
 
-def _flown_by(autopilots: Collection[str], model: Model) -> Model:
-    """Return the model with the autopilots in its provenance, unless only ours has flown."""
-    if {*autopilots} == {OWN_AUTOPILOT}:
-        return model
-    told = ", ".join(sorted(autopilots))
-    return replace(model, provenance={**model.provenance, "autopilot": told})
+def _fly(
+    plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
+) -> tuple[list[FlightSamples], int]:
+    """Fly the missing flights; return samples of the successful ones, and how many others."""
+    missions, options = plan.missions(), replace(options, keep=Keep.ALL)
+    with run_campaign(missions, folder / "flights", options, spectator) as ledger:
+        flights = [
+            samples_of(load_run(entry.path), entry.mission.config.world)
+            for entry in ledger.results()
+            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None
+        ]
+    return flights, len(missions) - len(flights)

@@ -18,15 +18,17 @@ from mavfi_cli.vpm.model import (
     KNEE_SHARE,
     REFERENCE,
     SCHEMES,
+    SMALLEST,
     TABLE_V,
+    Board,
     ModelInputs,
+    ModelVehicle,
     Scheme,
     SchemePerformance,
     named,
     outcome,
     safe_velocity_mps,
 )
-from mavfi_cli.vpm.vehicle import SMALLEST, Board, ModelVehicle
 
 # How the latencies of a platform's kernels add up to one response time, and the words for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {

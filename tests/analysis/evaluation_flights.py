@@ -2,7 +2,7 @@
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.detector_pairs import KEY, SCHEMA, pairs_of
+from mavfi_cli.analysis.detectors import KEY, SCHEMA, pairs_of
 from mavfi_cli.campaigns.missions import Injected
 
 

@@ -7,17 +7,15 @@ import re
 import pyarrow as pa
 import pytest
 
-from mavfi_cli.analysis.beside_model import Beside, side_by_side
+from mavfi_cli.analysis.beside_model import Beside, flight_plan, side_by_side
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model import draw_flight_plot, model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.flight_plan import flight_plan
-from mavfi_cli.vpm.model import SCHEMES
+from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report, setting_of
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
 STRAIGHT_M = 40.0 - 1.0

@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner
 from plain_values import named
 
-from mavfi_cli.analysis.groups import groups
 from mavfi_cli.analysis.overhead import flight_overheads
+from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
 from mavfi_cli.report.campaign import campaign_lines

@@ -8,8 +8,7 @@ import pytest
 from plain_values import named
 
 from mavfi_cli.analysis.failures import failures
-from mavfi_cli.analysis.groups import METRICS, groups
-from mavfi_cli.analysis.summary import qualities, summarise
+from mavfi_cli.analysis.summary import METRICS, groups, qualities, summarise
 from mavfi_cli.campaigns.begin import stopped
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName

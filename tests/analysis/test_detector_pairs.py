@@ -3,7 +3,7 @@
 import pytest
 from evaluation_flights import flown, labelled, pair, paired, struck
 
-from mavfi_cli.analysis.detector_pairs import WANTED, Harm
+from mavfi_cli.analysis.detectors import WANTED, Harm
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.mission.measures import measures_of
 

@@ -5,7 +5,7 @@ import pyarrow as pa
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.analysis.groups import METRICS, Group, matched
+from mavfi_cli.analysis.summary import METRICS, Group, matched
 from mavfi_cli.campaigns.missions import Injected
 
 FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)

@@ -13,10 +13,9 @@ from killing import results_of
 from missions import SHORT_WAY
 from plans import planned
 
-from mavfi_cli.campaigns.cluster import Cluster
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.campaigns.workers import CampaignStopped
+from mavfi_cli.campaigns.workers import CampaignStopped, Cluster
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 START_S = 90.0

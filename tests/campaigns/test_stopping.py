@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from plans import planned
 
 from mavfi_cli.campaigns.missions import Injected
+from mavfi_cli.campaigns.run import BatchLimiter, Queue
 from mavfi_cli.campaigns.specification import Stop
-from mavfi_cli.campaigns.stopping import BatchLimiter, Queue
 from mavfi_cli.stats.shares import rate
 
 STOP = Stop(margin=0.12, batch=10)

@@ -12,7 +12,7 @@ from mavfi_cli.paper import claims, items
 from mavfi_cli.paper.claims import CLAIMS
 from mavfi_cli.paper.flights import WORLDS
 from mavfi_cli.paper.items import BY_NAME, printed
-from mavfi_cli.stats.effects import ClaimVerdict, judge
+from mavfi_cli.stats.paired import ClaimVerdict, judge
 from mavfi_cli.stats.shares import wilson
 
 BY_CLAIM = {claim.name: claim for claim in CLAIMS}

@@ -9,7 +9,7 @@ from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.sources import CampaignSource, Evidence
-from mavfi_cli.stats.effects import ClaimVerdict
+from mavfi_cli.stats.paired import ClaimVerdict
 
 
 def evidence(rows, name="mine", problems=()):

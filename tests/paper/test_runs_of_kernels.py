@@ -6,16 +6,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from mavfi_cli.analysis.kernel_runs import KERNELS, kernel_summary
+from mavfi_cli.analysis.failures import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.campaigns.progress import Spectator, duration
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission import kernel_inputs
 from mavfi_cli.paper import flying
 from mavfi_cli.paper.items import FlightsPlan, items_named
 from mavfi_cli.paper.status import of_kernels, tables
-from mavfi_cli.studies import kernels as study
 
 RESULTS = Path(__file__).parents[2] / "docs/results"
 RUNS = 6
@@ -78,8 +78,8 @@ class _Forecast(Exception):
 
 
 def test_the_forecast_is_of_what_is_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "kernel_flight", lambda: None)
-    monkeypatch.setattr(study, "kernel_targets", lambda *given: [])
+    monkeypatch.setattr(kernel_inputs, "kernel_flight", lambda: None)
+    monkeypatch.setattr(kernel_inputs, "kernel_targets", lambda *given: [])
 
     def stop(forecast):
         raise _Forecast(forecast)

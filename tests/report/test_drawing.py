@@ -18,9 +18,8 @@ from mavfi_cli.report.drawing import (
     write_figure,
 )
 from mavfi_cli.report.model import draw_redundancy_plot
-from mavfi_cli.vpm.model import SCHEMES
+from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 
 def test_no_two_things_look_alike():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from mavfi_cli.stats.clusters import _student, clustered_share, design_effect, estimated_total
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.shares import _student, clustered_share, design_effect, estimated_total, wilson
 
 
 def test_runs_of_a_window_count_less_the_more_they_are_alike():

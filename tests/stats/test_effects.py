@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mavfi_cli.stats.bootstrap import Interval
-from mavfi_cli.stats.effects import (
+from mavfi_cli.stats.paired import (
     ClaimVerdict,
     correlation,
     effect_difference,
@@ -17,11 +17,11 @@ from mavfi_cli.stats.effects import (
     fisher,
     judge,
     longest_reaches,
+    mcnemar,
     paired_difference,
     rate_difference,
     recovered_share,
 )
-from mavfi_cli.stats.paired import mcnemar
 from mavfi_cli.stats.shares import wilson
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavfi_cli.analysis.detector_pairs import NONE
+from mavfi_cli.campaigns.detector_plans import INTEGER, NONE, EvaluationPlan
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.detect.base import Model
@@ -15,8 +15,6 @@ from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.preprocess import EXTENDED
 from mavfi_cli.spec.stack import load_stack
 from mavfi_cli.studies.evaluate import require_held_out
-from mavfi_cli.studies.evaluation_plan import EvaluationPlan
-from mavfi_cli.studies.evaluation_sites import INTEGER
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,

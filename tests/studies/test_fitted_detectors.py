@@ -2,20 +2,19 @@
 
 import pytest
 
+from mavfi_cli.analysis.beside_model import RedundancyPlan, flight_plan
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies import redundancy, redundancy_plan
-from mavfi_cli.studies.flight_plan import flight_plan
-from mavfi_cli.vpm.model import SCHEMES, named
+from mavfi_cli.studies import redundancy
+from mavfi_cli.vpm.model import SCHEMES, ModelVehicle, named
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 
 @pytest.fixture
 def ask(tmp_path):
     def of(train):
-        return redundancy_plan.RedundancyPlan(
+        return RedundancyPlan(
             vehicles=[ModelVehicle.load("spark")], choices=Choices(), worlds=("sparse",),
             missions=1, first_seed=1, folder=tmp_path, train=train,
         )  # fmt: skip

@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.vpm.model import SCHEMES
+from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
-from mavfi_cli.vpm.vehicle import ModelVehicle
 
 DOCS = Path(__file__).parents[2] / "docs"
 

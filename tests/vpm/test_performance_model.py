@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from mavfi_cli.vpm.model import (
     GRAVITY_MPS2,
     KNEE_SHARE,
+    Board,
+    ModelVehicle,
     acceleration_mps2,
     hover_power_w,
     knee_hz,
     roof_mps,
     safe_velocity_mps,
 )
-from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 ACCELERATIONS = st.floats(0.01, 200.0)
 RESPONSES = st.floats(1e-4, 50.0)

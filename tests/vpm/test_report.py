@@ -9,9 +9,8 @@ from mavfi_cli import vpm
 from mavfi_cli.core.config import Shipped
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, schemes_with
+from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, Board, ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, calibrated, report
-from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 VPM = Path(vpm.__file__).parent
 

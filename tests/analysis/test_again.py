@@ -8,11 +8,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from mavfi_cli import library
+from mavfi_cli.analysis.flights import mission_of
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.fault import FaultConfig
-from mavfi_cli.studies.again import mission_of
 
 FAULT = FaultConfig(target="waypoint_position", together=True, field="sign", seed=3)
 
@@ -46,8 +46,8 @@ def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
 
 
 def test_without_the_fault_it_is_the_golden_one(folder, export):
-    assert mission_of(folder, 1).config.golden == mission_of(export, 0).config
-    assert mission_of(export, 1).config.fault == FAULT
+    assert mission_of(folder, 1)[0].golden == mission_of(export, 0)[0]
+    assert mission_of(export, 1)[0].fault == FAULT
 
 
 def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):

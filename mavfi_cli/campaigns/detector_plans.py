@@ -1,4 +1,9 @@
-"""The missions of `mavfi detect evaluate`: golden, with faults, and with detectors."""
+"""The missions of detectors: those to which they are fitted, and those that evaluate them.
+
+Models are fitted to the paper's training set (section VI): two obstacle densities times two
+obstacle sizes, 25 error-free flights each. Every flight has its own world seed. An evaluation flies
+golden missions, the same with faults, and the same with faults and detectors.
+"""
 
 from __future__ import annotations
 
@@ -6,26 +11,94 @@ import itertools
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from mavfi_cli.analysis.detector_pairs import ERROR_FREE, FAULT, NONE
-from mavfi_cli.analysis.scores import model_digest
 from mavfi_cli.campaigns.missions import Label, PlannedMission, changes_of
+from mavfi_cli.campaigns.specification import require_named
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import file_digest
+from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.types import DType, Stage
 from mavfi_cli.detect.base import detector_names
-from mavfi_cli.spec.detector import STAGES, DetectorConfig, detector_of, detector_with_model
-from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.studies.evaluation_sites import (
-    FIELDS,
-    INSTRUCTION,
-    SOURCE,
-    InjectionSite,
-    fault_at,
-    sites,
+from mavfi_cli.detect.fit import KINDS
+from mavfi_cli.fi.bits import Field
+from mavfi_cli.spec.detector import (
+    STAGES,
+    DetectorConfig,
+    detector_of,
+    detector_with_model,
+    model_path,
 )
-from mavfi_cli.studies.flying import require_named
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
-WORLDS = ("sparse", "dense", "factory", "farm")
+TRAINING_WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
+WORLDS = ("sparse", "dense", "factory", "farm")  # of an evaluation
+NONE = "none"  # no detector: the reference of all others
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
+ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingPlan:
+    """Plan of the flights and of the fit.
+
+    Attributes:
+        flights: number per world.
+        first_seed: seed of the first flight; each further flight of any world adds 1.
+        seed: seed of the split and of the initial weights.
+        n_sigma: threshold of the Gaussian model; None takes the default.
+        flown: folder of run folders to fit to; None flies the missions.
+    """
+
+    worlds: tuple[str, ...] = TRAINING_WORLDS
+    flights: int = 25
+    first_seed: int = 10_000  # far from the usual seeds of flights and evaluations
+    seed: int = 1
+    n_sigma: float | None = None
+    kinds: tuple[str, ...] = KINDS
+    base: MissionConfig = field(default_factory=MissionConfig)
+    flown: Path | None = None
+
+    def missions(self) -> list[PlannedMission]:
+        """The flights, world by world."""
+        return [
+            PlannedMission(
+                config=replace(
+                    self.base, world=world, seed=self.first_seed + place * self.flights + number
+                ),
+                labels={"world": world},
+            )
+            for place, world in enumerate(self.worlds)
+            for number in range(self.flights)
+        ]
+
+
+INTEGER = "integer"  # all bits of states that have no sign, exponent and mantissa
+FIELDS = (Field.SIGN.value, Field.EXPONENT.value, Field.MANTISSA.value, INTEGER)
+_NODES = {
+    "octomap": Stage.PERCEPTION,
+    "collision_check": Stage.PERCEPTION,
+    "point_cloud": Stage.PERCEPTION,
+    "planner": Stage.PLANNING,
+    "control": Stage.CONTROL,
+}
+SOURCE, INSTRUCTION = "source", "instruction"
+_DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
+
+
+class _Site(NamedTuple):
+    """Injection site of one kind of fault."""
+
+    stage: str  # of the corrupted kernel or of its output
+    target: str  # a stage, or a node
+    field: str  # a bit field, `integer`, or `any`
+
+
+def model_digest(detector: DetectorConfig, stack: str) -> str:
+    """Digest of a detector's model file; `none` without one."""
+    path = model_path(detector, stack)
+    return "none" if path is None else file_digest(path)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,9 +183,15 @@ class EvaluationPlan:
                                                       "golden_flights", "first_seed", "seed")},
         }  # fmt: skip
 
-    def places(self) -> list[InjectionSite]:
-        """Injection sites: stages by bit field, or nodes."""
-        return sites(self.level, self.fields)
+    def places(self) -> list[_Site]:
+        """Stages by bit field at source level, nodes at instruction level."""
+        if self.level == INSTRUCTION:
+            return [_Site(stage.value, node, Field.ANY.value) for node, stage in _NODES.items()]
+        return [
+            _Site(stage.value, stage.value, name)
+            for stage, name in itertools.product(Stage, self.fields)
+            if stage is not Stage.CONTROL or name != INTEGER  # its states are all float64
+        ]
 
     def missions(
         self, detector: str = NONE, harmful: Collection[tuple[Any, ...]] = ()
@@ -131,18 +210,32 @@ class EvaluationPlan:
             if detector == NONE or self.complete(seed) or (world, seed, *place) in harmful
         ]
 
-    def _mission(
-        self, world: str, seed: int, place: InjectionSite | None, detector: str
-    ) -> PlannedMission:
+    def _mission(self, world: str, seed: int, place: _Site | None, detector: str) -> PlannedMission:
         kind = ERROR_FREE if place is None else FAULT
         labels: dict[str, Label] = {
             "kind": kind, "world": world, "seed": seed, "detector": detector
         }  # fmt: skip
         config = replace(self.base, world=world, seed=seed)
         if place is not None:
-            fault = fault_at(place, self.level, self.seed, world, seed)
-            config = replace(config, **fault)
+            config = replace(config, **self._fault(place, world, seed))
             labels |= {"level": self.level, **place._asdict()}
         if detector != NONE:
             config = replace(config, detector=self.detector_config(detector))
         return PlannedMission(config=config, labels=labels)
+
+    def _fault(self, site: _Site, world: str, seed: int) -> dict[str, Any]:
+        """Draw the fault of a mission, as settings of the mission."""
+        drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, site.target, site.field)
+        if self.level == INSTRUCTION:
+            return {"instruction": InstructionConfig(target=site.target, seed=derive(*drawn))}
+        whole = site.field == INTEGER
+        for number in range(_DRAWS):
+            fault = FaultConfig(
+                target=site.target,
+                field=Field.ANY.value if whole else site.field,
+                seed=derive(*drawn, number),
+            )
+            # Draw again until the state has the required type: all of them are equally likely.
+            if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
+                return {"fault": fault}
+        raise ConfigError(f"no state of {site.target} has a bit field {site.field}")

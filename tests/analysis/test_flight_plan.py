@@ -5,13 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from mavfi_cli.analysis.beside_model import RedundancyPlan, flight_plan
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.studies.flight_plan import flight_plan
-from mavfi_cli.studies.redundancy_plan import RedundancyPlan
-from mavfi_cli.vpm.model import SCHEMES, hover_power_w, named, outcome
+from mavfi_cli.vpm.model import SCHEMES, Board, ModelVehicle, hover_power_w, named, outcome
 from mavfi_cli.vpm.report import Choices, setting_of
-from mavfi_cli.vpm.vehicle import Board, ModelVehicle
 
 X86 = load_platform("x86")
 SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())
