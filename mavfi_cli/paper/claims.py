@@ -1,7 +1,7 @@
 """Every claim of the paper: its words, the number that decides it, and what the paper's n can tell.
 
 claims.toml has the claims. A claim is decided by one number, its effect, and by the range that the
-claim gives for it; `stats.effects.judge` does the rest. A measure finds the effect: it takes a
+claim gives for it; `stats.paired.judge` does the rest. A measure finds the effect: it takes a
 stack's flights, and the values of columns that choose some of
 them. Of faults without a detector it counts those that flipped a bit.
 """
