@@ -31,8 +31,8 @@ from mavfi_cli.spec.detector import detector_with_model
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT
-from mavfi_cli.stats.bootstrap import Interval, interval
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.shares import Interval, rate
 from mavfi_cli.vpm.model import (
     DETECTORS,
     REFERENCE,

@@ -24,10 +24,10 @@ from mavfi_cli.campaigns.detector_plans import ERROR_FREE, FAULT, NONE
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
-from mavfi_cli.stats.bootstrap import Interval, interval, interval_of_rows, median
+from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, holm, mcnemar, worst_case
 from mavfi_cli.stats.roc import curves
-from mavfi_cli.stats.shares import Share, mixture, rate
+from mavfi_cli.stats.shares import Interval, Share, mixture, rate
 
 LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
 KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
@@ -455,10 +455,10 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
 
     worst = worst_case(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
     return {
-        "faulty": worst.increase,
-        "protected": worst.protected_worst - 1.0,
+        "faulty": worst["increase"],
+        "protected": worst["protected_worst"] - 1.0,
         "recovered": asdict(interval_of_rows(len(faulty), recovered, resamples=RESAMPLES)),
-        "recovered_share": worst.recovered_share if worst.increase > LONGER else math.nan,
+        "recovered_share": worst["recovered_share"] if worst["increase"] > LONGER else math.nan,
     }
 
 

@@ -44,7 +44,8 @@ from mavfi_cli.mission.measures import (
     record_of,
 )
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.bootstrap import RESAMPLES, Interval, interval
+from mavfi_cli.stats.bootstrap import RESAMPLES, interval
+from mavfi_cli.stats.shares import Interval
 
 CONFIG = ("world", "seed", "world_seed", "planner", "platform", "stack", "vehicle")
 FAULT = ("target", "seed", "bits", "field")

@@ -112,7 +112,7 @@ def cost_row(found: _Struck, faults: _Struck, *, protected: bool) -> dict[str, A
         "over_own": {
             "p95": _over(count, lambda drawn: _late(over_own[drawn])),
             "largest": worst,
-            "recovered_share": worst_case(OWN, [bare], [worst]).recovered_share
+            "recovered_share": worst_case(OWN, [bare], [worst])["recovered_share"]
             if protected
             else math.nan,
         },
@@ -162,10 +162,10 @@ def _worst_row(
     case = worst_case(golden_s, faulty_s, times_s if protected else ())
     return {
         "flights": len(times_s),
-        "golden_mean_s": found.golden,
-        "worst_s": found.faulty_worst,
-        "over_mean_ratio": 1.0 + found.increase,
-        "over_mean_recovered_share": case.recovered_share,
+        "golden_mean_s": found["golden"],
+        "worst_s": found["faulty_worst"],
+        "over_mean_ratio": 1.0 + found["increase"],
+        "over_mean_recovered_share": case["recovered_share"],
     }
 
 

@@ -20,7 +20,7 @@ from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical, label_tex
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.paired import OWN, WorstCase, holm, mcnemar, worst_case
+from mavfi_cli.stats.paired import OWN, holm, mcnemar, worst_case
 from mavfi_cli.stats.shares import rate
 
 RESAMPLES = 1999
@@ -222,7 +222,7 @@ class _Match:
         change = self.second.metrics[metric][self.at_second]
         return known((change - self.first.metrics[metric][self.at_first])[first & second])
 
-    def worst(self) -> tuple[WorstCase, WorstCase]:
+    def worst(self) -> tuple[dict[str, float], dict[str, float]]:
         """Worst cases over own golden flights, and over the mean of these, within the pairs.
 
         A pair counts only if its golden flight succeeded.
@@ -331,8 +331,8 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[dict[str, An
                     )
                     for name in METRICS
                 },
-                "over_own": asdict(over_own),
-                "over_mean": asdict(over_mean),
+                "over_own": over_own,
+                "over_mean": over_mean,
             }
         )
     return rows

@@ -22,7 +22,7 @@ from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
-from mavfi_cli.stats.shares import Total, estimated_total
+from mavfi_cli.stats.shares import Interval, estimated_total
 
 Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
 # Called with the instructions stepped since the last call, or with what goes on, in words.
@@ -123,7 +123,7 @@ class TargetProfile:
         return stepped if self.counted is None else self.counted.executed
 
     @property
-    def instructions(self) -> Total:
+    def instructions(self) -> Interval:
         """Number of executed instructions in scope; estimated if the profile is not complete."""
         if self.counted is not None:
             return estimated_total([([self.counted.executed], 1)])
@@ -201,7 +201,7 @@ class TargetProfile:
             parts.insert(0, "the beginning")
         found = self.instructions
         return (
-            f"about {found.total:.3g} executed instructions in scope (95 % interval "
+            f"about {found.value:.3g} executed instructions in scope (95 % interval "
             f"{found.low:.3g} to {found.high:.3g}), by sample: {', '.join(parts)}; "
             f"{self.executed} stepped"
         )

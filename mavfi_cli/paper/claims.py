@@ -23,20 +23,16 @@ from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
-from mavfi_cli.stats.bootstrap import Interval, interval
+from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import (
     Count,
-    as_interval,
     correlation,
-    effect_difference,
     fisher,
     longest_reaches,
     mcnemar,
-    paired_difference,
-    rate_difference,
     recovered_share,
 )
-from mavfi_cli.stats.shares import Share, wilson
+from mavfi_cli.stats.shares import Interval, Share, wilson
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
@@ -91,7 +87,7 @@ class Claim:
 def _of_share(found: Share, what: str) -> Finding:
     if not found.total:
         return Finding()
-    return Finding(effect=as_interval(found), told=f"{found.counts} {what}")
+    return Finding(effect=found.effect, told=f"{found.counts} {what}")
 
 
 def _difference(shares: Sequence[Share], told: str) -> Finding:
@@ -99,7 +95,7 @@ def _difference(shares: Sequence[Share], told: str) -> Finding:
     first, second = shares
     if not (first.total and second.total):
         return Finding()
-    return Finding(effect=rate_difference(first, second), told=told)
+    return Finding(effect=first.minus(second), told=told)
 
 
 # Faults without a detector ------------------------------------------------------------------------
@@ -110,7 +106,7 @@ def _success_lost(flights: Flights, **where: Any) -> Finding:
     both = flights.struck(**where).chosen(own_lost=(True, False))
     if not len(both):
         return Finding()
-    found = paired_difference(mcnemar(~both.flags("lost"), ~both.flags("own_lost")))
+    found = mcnemar(~both.flags("lost"), ~both.flags("own_lost")).effect
     told = f"{both.share().counts} lost; golden {both.share('own_lost').counts}"
     return Finding(effect=found, told=told)
 
@@ -242,7 +238,7 @@ def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
         return Finding()
     test = mcnemar([gad[key] for key in both], [aad[key] for key in both])
     told = f"{test.only_second} missions by AAD only, {test.only_first} by GAD only"
-    return Finding(effect=paired_difference(test), told=f"{told}, of {test.pairs:,}")
+    return Finding(effect=test.effect, told=f"{told}, of {test.pairs:,}")
 
 
 # Costs of detectors -------------------------------------------------------------------------------
@@ -306,7 +302,8 @@ def _outcome_beside(
     other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
     shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
     told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
-    return Finding(effect=rate_difference(*shares.values()), told=", ".join(told))
+    effect = shares[kernel].minus(shares[other])
+    return Finding(effect=effect, told=", ".join(told))
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
@@ -316,7 +313,7 @@ def _least_benign(kernels: Kernels, but: str) -> Finding:
         return Finding()
     least = min(shares, key=lambda each: shares[each].share)
     told = f"least: {kernels[least]['title']}, {shares[least].counts}"
-    return Finding(effect=as_interval(shares[least]), told=told)
+    return Finding(effect=shares[least].effect, told=told)
 
 
 MEASURES: Mapping[str, Callable[..., Finding]] = {
@@ -374,8 +371,8 @@ def _spread(counts: Sequence[Count]) -> Interval:
     if len(counts) == 3:
         return recovered_share(*counts)
     first, second, *others = (wilson(*each) for each in counts)
-    loss = rate_difference(first, second)
-    return effect_difference(loss, rate_difference(*others)) if others else loss
+    loss = first.minus(second)
+    return loss.minus(others[0].minus(others[1])) if others else loss
 
 
 def _arguments(given: Mapping[str, Any], sets: Mapping[str, Any]) -> dict[str, Any]:

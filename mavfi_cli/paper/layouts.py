@@ -419,8 +419,8 @@ def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     the longest is longer.
 
     Args:
-        measure: field of `WorstCase`.
+        measure: key of `worst_case`.
     """
     bare, own = protected.known("bare_over_own"), protected.ratios
-    value = PERCENT * getattr(worst_case(OWN, bare.tolist(), own.tolist()), measure)
+    value = PERCENT * worst_case(OWN, bare.tolist(), own.tolist())[measure]
     return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

@@ -154,7 +154,7 @@ def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
     return {
         "population": "moments of one call" if profile is None else profile.in_words(),
         "complete": None if profile is None else profile.complete,
-        "instructions": None if length is None else length.total,
+        "instructions": None if length is None else length.value,
         "instructions95": None if length is None else [length.low, _finite(length.high)],
         "golden": {"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
         "outcomes": _counted(entry["outcome"] for entry in records),

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.stats.shares import z_of
+from mavfi_cli.stats.shares import Interval, z_of
 
 RESAMPLES = 9999
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
@@ -24,16 +23,6 @@ BLOCKS = 2000  # with more values whole blocks are left out in turn
 _CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interval:
-    """A statistic with its interval; NaN if there are too few values."""
-
-    value: float
-    low: float
-    high: float
-    count: int
 
 
 def mean(values: FloatArray) -> FloatArray:

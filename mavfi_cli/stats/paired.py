@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.stats.bootstrap import Interval
-from mavfi_cli.stats.shares import Share, z_of
+from mavfi_cli.stats.shares import NO_INTERVAL, Interval, Share, z_of
 
 BoolArray = NDArray[np.bool_]
 _EXACT = 16  # all signs are tried up to this many differences
@@ -55,6 +54,27 @@ class McNemar:
     def difference(self) -> float:
         """Success rate of the second minus that of the first; NaN without pairs."""
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
+
+    @property
+    def effect(self) -> Interval:
+        """The difference with its interval; NaN without pairs.
+
+        D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
+        added to each kind of pair that differs, so 0 of n differences still has a width.
+        """
+        if not self.pairs:
+            return NO_INTERVAL
+        gained, lost = (
+            (each + 1) / (self.pairs + 2) for each in (self.only_second, self.only_first)
+        )
+        centre = gained - lost
+        half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (self.pairs + 2))
+        return Interval(
+            value=self.difference,
+            low=max(-1.0, centre - half),
+            high=min(1.0, centre + half),
+            count=self.pairs,
+        )
 
 
 def mcnemar(first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArray) -> McNemar:
@@ -129,58 +149,38 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorstCase:
-    """Worst values of successful flights, compared with the golden ones.
-
-    Attributes:
-        golden: the reference, the mean of the golden flights.
-        golden_worst, faulty_worst, protected_worst: the largest values.
-        increase: faulty worst case over the reference, minus 1; 0.738 in the example.
-        recovered: reduction by protection, in the same unit; 0.642.
-        recovered_share: recovered part of the increase, 0.87; NaN unless the faulty worst case
-            exceeds the worst golden one.
-    """
-
-    golden: float
-    golden_worst: float
-    faulty_worst: float
-    protected_worst: float
-    increase: float
-    recovered: float
-    recovered_share: float
-
-
 def worst_case(
     golden: Sequence[float], faulty: Sequence[float], protected: Sequence[float] = ()
-) -> WorstCase:
-    """The worst case and its recovery.
+) -> dict[str, float]:
+    """Worst values of successful flights, compared with the golden ones.
 
     Args:
         golden, faulty, protected: flight times, or energies, of the successful missions of each
-            setting. Without protected missions, the recovery is NaN. Where each value is over that
-            of the same mission's golden flight, `golden` is OWN.
+            setting. Where each value is over that of the same mission's golden flight, `golden` is
+            OWN.
+
+    Returns:
+        `golden`: the reference, the mean of the golden flights. `golden_worst`, `faulty_worst`,
+        `protected_worst`: the largest values. `increase`: faulty worst case over the reference,
+        minus 1; 0.738 in the example. `recovered`: reduction by protection, in the same unit;
+        0.642. `recovered_share`: recovered part of the increase, 0.87; NaN unless the faulty worst
+        case exceeds the worst golden one. NaN where flights are missing.
     """
-    if not golden or not faulty:
-        nan = math.nan
-        return WorstCase(
-            golden=nan, golden_worst=nan, faulty_worst=nan, protected_worst=nan, increase=nan,
-            recovered=nan, recovered_share=nan,
-        )  # fmt: skip
-    reference = math.fsum(golden) / len(golden)
-    worst = max(protected) if protected else math.nan
-    increase = max(faulty) / reference - 1.0
-    recovered = (max(faulty) - worst) / reference
-    beyond = max(faulty) > max(golden)
-    return WorstCase(
-        golden=reference,
-        golden_worst=max(golden),
-        faulty_worst=max(faulty),
-        protected_worst=worst,
-        increase=increase,
-        recovered=recovered,
-        recovered_share=recovered / increase if beyond else math.nan,
-    )
+    reference = math.fsum(golden) / len(golden) if golden and faulty else math.nan
+    worst = [max(each, default=math.nan) for each in (golden, faulty, protected)]
+    if not (golden and faulty):
+        worst = [math.nan] * 3
+    increase = worst[1] / reference - 1.0
+    recovered = (worst[1] - worst[2]) / reference
+    return {
+        "golden": reference,
+        "golden_worst": worst[0],
+        "faulty_worst": worst[1],
+        "protected_worst": worst[2],
+        "increase": increase,
+        "recovered": recovered,
+        "recovered_share": recovered / increase if worst[1] > worst[0] else math.nan,
+    }
 
 
 DRAWS = 100_000  # of the three rates in `recovered_share`
@@ -240,51 +240,6 @@ def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:
     ends = found.confidence_interval()
     return Interval(
         value=float(found.statistic), low=float(ends.low), high=float(ends.high), count=len(pairs)
-    )
-
-
-def as_interval(share: Share) -> Interval:
-    """A rate as an effect."""
-    return Interval(value=share.share, low=share.low, high=share.high, count=share.total)
-
-
-def rate_difference(first: Share, second: Share) -> Interval:
-    """First minus second of two independent rates, with the hybrid score interval.
-
-    R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the two
-    Wilson intervals, added in squares. NaN if one has no observations.
-    """
-    if not (first.total and second.total):
-        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
-    found = effect_difference(as_interval(first), as_interval(second))
-    return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
-
-
-def effect_difference(first: Interval, second: Interval) -> Interval:
-    """First minus second of two independent effects: their distances added in squares (MOVER)."""
-    value = first.value - second.value
-    below = math.hypot(first.value - first.low, second.high - second.value)
-    above = math.hypot(first.high - first.value, second.value - second.low)
-    count = min(first.count, second.count)
-    return Interval(value=value, low=value - below, high=value + above, count=count)
-
-
-def paired_difference(test: McNemar) -> Interval:
-    """Success of the second treatment minus that of the first, of the same missions.
-
-    D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
-    added to each kind of pair that differs, so 0 of n differences still has a width.
-    """
-    if not test.pairs:
-        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
-    gained, lost = ((each + 1) / (test.pairs + 2) for each in (test.only_second, test.only_first))
-    centre = gained - lost
-    half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (test.pairs + 2))
-    return Interval(
-        value=test.difference,
-        low=max(-1.0, centre - half),
-        high=min(1.0, centre + half),
-        count=test.pairs,
     )
 
 

@@ -10,13 +10,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
 
 _LEAST = 1e-6  # margins and differences below take more missions than anybody flies
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interval:
+    """A statistic with its interval; NaN if there are too few values."""
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+    def minus(self, other: Interval) -> Interval:
+        """The difference of two independent effects: their distances added in squares (MOVER)."""
+        value = self.value - other.value
+        below = math.hypot(self.value - self.low, other.high - other.value)
+        above = math.hypot(self.high - self.value, other.value - other.low)
+        count = min(self.count, other.count)
+        return Interval(value=value, low=value - below, high=value + above, count=count)
+
+
+NO_INTERVAL = Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +54,22 @@ class Share:
     def counts(self) -> str:
         """Count and total, such as `3 of 98`."""
         return f"{self.count:,} of {self.total:,}"
+
+    @property
+    def effect(self) -> Interval:
+        """The proportion as an effect."""
+        return Interval(value=self.share, low=self.low, high=self.high, count=self.total)
+
+    def minus(self, other: Share) -> Interval:
+        """The difference of two independent rates, with the hybrid score interval.
+
+        R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the
+        two Wilson intervals, added in squares. NaN if one has no observations.
+        """
+        if not (self.total and other.total):
+            return NO_INTERVAL
+        found = self.effect.minus(other.effect)
+        return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
 
 
 def wilson(
@@ -254,16 +291,7 @@ def _spread(
     return alone, spread
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Total:
-    """A total that is estimated from samples, with its 95 % interval."""
-
-    total: float
-    low: float
-    high: float
-
-
-def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Total:
+def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
     """The total over strata, of each of which some members were drawn uniformly.
 
     The interval has the correction for a finite population (Cochran, section 5.4). It is that of
@@ -274,7 +302,7 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Total:
         strata: the values of the drawn members, all above 0, and the number of all members.
     """
     total = seen = 0.0
-    variances, freedom = [], []
+    variances, freedom, drawn = [], [], sum(len(values) for values, _ in strata)
     for values, members in strata:
         n, own = len(values), math.fsum(values)
         total, seen = total + own / n * members, seen + own
@@ -284,9 +312,9 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Total:
             variances.append(members * (members - n) / n * spread)
             freedom.append(n - 1)
     if math.inf in variances:
-        return Total(total=total, low=seen, high=math.inf)
+        return Interval(value=total, low=seen, high=math.inf, count=drawn)
     factor = math.exp(_student(variances, freedom) * math.sqrt(sum(variances)) / total)
-    return Total(total=total, low=max(seen, total / factor), high=total * factor)
+    return Interval(value=total, low=max(seen, total / factor), high=total * factor, count=drawn)
 
 
 def _student(variances: Sequence[float], freedom: Sequence[int]) -> float:

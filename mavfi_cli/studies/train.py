@@ -13,6 +13,7 @@ from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.types import Outcome
+from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.fit import check, fit
 from mavfi_cli.detect.offline import Dataset, FlightSamples
 from mavfi_cli.detect.preprocess import PreprocessParams

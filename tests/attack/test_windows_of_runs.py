@@ -120,7 +120,7 @@ def test_windows_of_several_markers_share_the_run_without_gap_or_overlap(recursi
     for stratum in cut.strata:
         counts[stratum.marker] += stratum.windows_in_run
     assert list(counts.values()) == [1, 4 + 7, 15]
-    assert cut.instructions.total == cut.executed == whole.executed
+    assert cut.instructions.value == cut.executed == whole.executed
 
     def addresses(profile):
         found = Counter()

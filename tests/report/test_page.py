@@ -11,8 +11,7 @@ from committed import everything
 
 from mavfi_cli.paper.claims import CLAIMS
 from mavfi_cli.report.page import FILTERS, render
-from mavfi_cli.stats.bootstrap import Interval
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.shares import Interval, wilson
 
 PHONE, DESKTOP = 390, 1280
 VERDICTS = {"✓ reproduced", "✗ not reproduced", "≈ not distinguishable", "· not flown",

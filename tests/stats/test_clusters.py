@@ -63,7 +63,7 @@ def test_intervals_of_share_and_size_contain_the_error_of_the_weights():
         inside += share.low <= true <= share.high
         plain += alone.low <= true <= alone.high
         total += found.low <= size <= found.high
-        estimates.append(found.total)
+        estimates.append(found.value)
     assert 0.91 <= inside / 300 <= 0.99
     assert 0.91 <= total / 300 <= 0.99
     assert plain / 300 < 0.85
@@ -72,12 +72,12 @@ def test_intervals_of_share_and_size_contain_the_error_of_the_weights():
 
 def test_a_stratum_that_was_seen_whole_has_no_error():
     found = estimated_total([([3.0, 9.0], 2), ([5.0], 1)])
-    assert (found.low, found.total, found.high) == (17.0, 17.0, 17.0)
+    assert (found.low, found.value, found.high) == (17.0, 17.0, 17.0)
 
 
 def test_one_member_out_of_several_does_not_tell_its_error():
     found = estimated_total([([3.0], 4)])
-    assert (found.low, found.total, found.high) == (3.0, 12.0, math.inf)
+    assert (found.low, found.value, found.high) == (3.0, 12.0, math.inf)
 
 
 def test_clusters_that_no_run_hit_count_as_sampled():

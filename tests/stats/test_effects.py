@@ -8,21 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mavfi_cli.stats.bootstrap import Interval
 from mavfi_cli.stats.paired import (
     ClaimVerdict,
     correlation,
-    effect_difference,
     excess_over_mean,
     fisher,
     judge,
     longest_reaches,
     mcnemar,
-    paired_difference,
-    rate_difference,
     recovered_share,
 )
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.shares import Interval, wilson
 
 
 def between(low, high):
@@ -55,7 +51,7 @@ def test_fishers_test_of_the_papers_table_iv():
 
 def test_newcombes_interval_of_his_own_example():
     """Table II of Newcombe (1998), method 10: 56/70 against 48/80 is 0.0524 to 0.3339."""
-    found = rate_difference(wilson(56, 70), wilson(48, 80))
+    found = wilson(56, 70).minus(wilson(48, 80))
     assert (found.low, found.high) == pytest.approx((0.0524, 0.3339), abs=5e-5)
     assert found.value == pytest.approx(0.2)
 
@@ -63,24 +59,22 @@ def test_newcombes_interval_of_his_own_example():
 @given(st.integers(1, 300), st.integers(0, 300), st.integers(0, 300))
 def test_a_difference_turns_its_sign_with_its_order(total, first, second):
     one, other = (wilson(min(each, total), total) for each in (first, second))
-    there, back = rate_difference(one, other), rate_difference(other, one)
+    there, back = one.minus(other), other.minus(one)
     assert (there.low, there.high) == pytest.approx((-back.high, -back.low))
     assert there.low <= there.value <= there.high
 
 
 def test_a_difference_of_effects_adds_distances_in_squares():
-    found = effect_difference(between(0.1, 0.3), between(-0.1, 0.1))
+    found = between(0.1, 0.3).minus(between(-0.1, 0.1))
     half = math.hypot(0.1, 0.1)
     assert (found.value, found.low, found.high) == pytest.approx((0.2, 0.2 - half, 0.2 + half))
 
 
 def test_a_paired_difference_narrows_with_the_pairs_and_keeps_a_width():
-    few, many = (
-        paired_difference(mcnemar([True] * n, [True] * n)) for n in (20, 2000)
-    )  # nothing differs
+    few, many = (mcnemar([True] * n, [True] * n).effect for n in (20, 2000))  # nothing differs
     assert few.value == many.value == 0.0
     assert few.low < many.low < 0.0 < many.high < few.high
-    worse = paired_difference(mcnemar([True] * 100, [False] * 30 + [True] * 70))
+    worse = mcnemar([True] * 100, [False] * 30 + [True] * 70).effect
     assert worse.value == pytest.approx(-0.3)
     assert -0.42 < worse.low < -0.3 < worse.high < -0.2
 
@@ -91,7 +85,7 @@ def test_a_paired_difference_covers_the_truth():
     for _ in range(400):
         first = rng.random(80) < 0.9
         second = first & (rng.random(80) < 0.9)
-        found = paired_difference(mcnemar(first, second))
+        found = mcnemar(first, second).effect
         inside += found.low <= -0.09 <= found.high
     assert inside >= 370
 
