@@ -177,11 +177,11 @@ def estimates(
                 for some, all_ in zip(traces, profile.strata, strict=True)
             ]
         )
-        if found.low == found.high or found.total > MOST_HITS:
+        if found.low == found.high or found.value > MOST_HITS:
             continue
         count = counted(place, address)
         inside += found.low <= count <= found.high
-        ratios.append(count / found.total)
+        ratios.append(count / found.value)
         if len(ratios) == number:
             break
     return (

@@ -153,7 +153,7 @@ def test_a_sample_estimates_the_run(known_length):
     ]
     assert len({sample.executed for sample in samples}) > 30
     found = [sample.instructions for sample in samples]
-    estimates = np.array([each.total for each in found])
+    estimates = np.array([each.value for each in found])
     error = estimates.std(ddof=1) / np.sqrt(len(estimates))
     assert error < 0.05 * length
     assert abs(estimates.mean() - length) < 3.0 * error
