@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -23,14 +22,10 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
-    PlannedMission,
     ResultState,
     canonical,
     changes_of,
 )
-from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
-from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import read_parquet
@@ -76,31 +71,6 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     rows = [_row(entry, labels) for entry in ledger.results(among)]
     names = _names(labels)
     return pa.table({name: _column([row[name] for row in rows]) for name in names})
-
-
-def fly(
-    missions: Sequence[PlannedMission],
-    folder: Path,
-    keep: Keep,
-    options: Options,
-    spectator: Spectator,
-) -> pa.Table:
-    """Fly the missions that the folder lacks; return the table of all of them.
-
-    Others that an interrupted larger plan has left in the folder's list are not flown.
-
-    Raises:
-        CampaignStopped, RecordError, Interrupted: as `run_campaign`.
-    """
-    wanted = {
-        (canonical(dict(each.labels)), canonical(changes_of(each.config))) for each in missions
-    }
-    with Ledger(folder, writing=True) as ledger:
-        store_plan(ledger, missions, append=True)
-        mine = [number for number, labels, _, changes in ledger.rows()
-                if (labels, changes) in wanted]  # fmt: skip
-        fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
-        return flights(ledger, mine)
 
 
 def _names(labels: Sequence[str]) -> list[str]:

@@ -1,1 +1,41 @@
 """Studies: the missions that answer a question, and their analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+
+from mavfi_cli.analysis.flights import flights
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
+from mavfi_cli.campaigns.specification import Keep
+
+
+def fly(
+    missions: Sequence[PlannedMission],
+    folder: Path,
+    keep: Keep,
+    options: Options,
+    spectator: Spectator,
+) -> pa.Table:
+    """Fly the missions that the folder lacks; return the table of all of them.
+
+    Others that an interrupted larger plan has left in the folder's list are not flown.
+
+    Raises:
+        CampaignStopped, RecordError, Interrupted: as `run_campaign`.
+    """
+    wanted = {
+        (canonical(dict(each.labels)), canonical(changes_of(each.config))) for each in missions
+    }
+    with Ledger(folder, writing=True) as ledger:
+        store_plan(ledger, missions, append=True)
+        mine = [number for number, labels, _, changes in ledger.rows()
+                if (labels, changes) in wanted]  # fmt: skip
+        fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
+        return flights(ledger, mine)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.flights import errors, flights, fly
+from mavfi_cli.analysis.flights import errors, flights
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaigns.begin import begin, resumed
@@ -24,6 +24,7 @@ from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.stack import DEFAULT
+from mavfi_cli.studies import fly
 
 FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings

@@ -15,7 +15,7 @@ from typing import Any
 import pyarrow as pa
 
 from mavfi_cli.analysis.detectors import Scored, found, harmful, pairs_of
-from mavfi_cli.analysis.flights import errors, flown, fly
+from mavfi_cli.analysis.flights import errors, flown
 from mavfi_cli.analysis.scores import Scores
 from mavfi_cli.campaigns.begin import check_names
 from mavfi_cli.campaigns.detector_plans import NONE, EvaluationPlan, model_digest
@@ -26,6 +26,7 @@ from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.detect.base import Model
 from mavfi_cli.spec.detector import detector_of, model_path
+from mavfi_cli.studies import fly
 
 SCHEMA = 1
 BARE, PROTECTED = "bare", "protected"

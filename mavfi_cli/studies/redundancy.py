@@ -17,7 +17,7 @@ from mavfi_cli.analysis.beside_model import (
     flight_plan,
     side_by_side,
 )
-from mavfi_cli.analysis.flights import chosen, errors, flown, fly
+from mavfi_cli.analysis.flights import chosen, errors, flown
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
@@ -30,6 +30,7 @@ from mavfi_cli.core.errors import CannotLift, VehicleProcessError
 from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.studies import fly
 from mavfi_cli.studies.train import train
 from mavfi_cli.vpm.model import DETECTORS, ModelVehicle, Scheme, schemes_with
 from mavfi_cli.vpm.report import CHAINS, report, setting_of

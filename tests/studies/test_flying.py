@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.analysis.flights import fly
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.studies import fly
 
 OPTIONS = Options(jobs=1, keep=Keep.NONE, task="fake_task")
 
