@@ -19,7 +19,7 @@ from typing import Any
 from exported import arguments
 
 from mavfi_cli.paper.beyond import PLAIN, arms
-from mavfi_cli.paper.sources import gather
+from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.stats.shares import Share
 
 
@@ -78,7 +78,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--picture", type=Path, help="where to draw, as SVG")
     given = parser.parse_args()
-    found = arms(gather([Path(each) for each in given.parts]).flights())
+    found = arms(Evidence.gather([Path(each) for each in given.parts]).flights())
     print("\n".join(lines(found)))
     if given.picture is not None:
         draw(found, given.picture)

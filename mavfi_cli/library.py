@@ -55,7 +55,6 @@ def fly(
 
 
 def _mission(config: MissionConfig | None, settings: dict[str, Any]) -> MissionConfig:
-    """Return the mission with the settings in place."""
     from mavfi_cli.core.config import structure
     from mavfi_cli.spec.mission import MissionConfig
 

@@ -206,18 +206,18 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     from mavfi_cli.campaigns.ledger import Ledger
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.top_view import draw_trajectories, lines, panels_of
+    from mavfi_cli.report.top_view import Trajectories
 
     with Ledger(folder_of(what)) as ledger:
         chosen = pair(ledger, number)
-    panels = panels_of(chosen)
-    write_figure(draw_trajectories(panels), output)
+    flown = Trajectories.of(chosen)
+    write_figure(flown.draw(), output)
     if as_json:
         told = {**chosen, "picture": output}
         click.echo(json.dumps(plain(told), indent=2, default=str))
     else:
         absent = [f"not in the picture: {text}" for text in chosen["absent"]]
-        click.echo("\n".join([*lines(panels), *absent, f"Picture  {output}"]))
+        click.echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
 
 
 @campaign.command(cls=CheckedCommand)

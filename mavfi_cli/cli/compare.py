@@ -54,7 +54,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
-    from mavfi_cli.report.compare_plot import draw_compare_plot, draw_timeline
+    from mavfi_cli.report.compare_plot import PICTURES
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.platforms import platform_csv, platform_lines
     from mavfi_cli.studies.compare import compare as run
@@ -66,8 +66,8 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
         told = run(plan, out, Options(jobs=options["jobs"] or 0), view)
     write_json(out / "compare.json", told)
     write_text(out / "compare.csv", platform_csv(told))
-    write_figure(draw_compare_plot(told), out / "compare.svg")
-    write_figure(draw_timeline(told), out / "timeline.svg")
+    for name, draw in PICTURES.items():
+        write_figure(draw(told), out / name)
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:

@@ -91,10 +91,9 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain, write_json, write_text
     from mavfi_cli.report.detectors import (
+        PICTURES,
         detector_csv,
         detector_lines,
-        draw_recovery_plot,
-        draw_roc_plot,
     )
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.studies.evaluate import evaluate as run
@@ -106,8 +105,8 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
         evaluation, pairs = run(plan, out, Options(jobs=options["jobs"] or 0), view)
     write_json(out / "evaluation.json", evaluation)
     write_text(out / "evaluation.csv", detector_csv(*pairs))
-    write_figure(draw_roc_plot(evaluation), out / "roc.svg")
-    write_figure(draw_recovery_plot(evaluation), out / "recovery.svg")
+    for name, draw in PICTURES.items():
+        write_figure(draw(evaluation), out / name)
     if as_json:
         click.echo(json.dumps(plain(evaluation), indent=2, sort_keys=True))
     elif as_csv:

@@ -82,9 +82,9 @@ def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
     require_page(output)  # before what takes long, and before what needs scipy
     from mavfi_cli.core.files import write_text
     from mavfi_cli.paper.document import document
-    from mavfi_cli.paper.sources import gather
+    from mavfi_cli.paper.sources import Evidence
 
-    evidence = gather(places)
+    evidence = Evidence.gather(places)
     for problem in evidence.problems:
         click.echo(f"note: {problem}", err=True)
     page = render(document(evidence, upsets))

@@ -212,23 +212,18 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
     """Write all files; return their names."""
     from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.model import (
-        draw_flight_plot,
-        draw_redundancy_plot,
-        draw_roofline_plot,
-        model_csv,
-        redundancy_csv,
-    )
+    from mavfi_cli.report.model import PICTURES, model_csv, redundancy_csv
 
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / "vpm.json", told)
     write_text(out / "vpm.csv", model_csv(told))
-    write_figure(draw_roofline_plot(told), out / "roofline.svg")
-    write_figure(draw_redundancy_plot(told), out / "redundancy.svg")
-    names = ["vpm.json", "vpm.csv", "roofline.svg", "redundancy.svg"]
+    tables, pictures = ["vpm.json", "vpm.csv"], [*PICTURES]
     if "flights" in told:
         write_text(out / "flights.csv", redundancy_csv(told["flights"]))
-        write_figure(draw_flight_plot(told), out / "flights.svg")
-        names += ["flights.csv", "flights.svg"]
-    return names
+        tables.append("flights.csv")
+    else:
+        pictures.remove("flights.svg")
+    for name in pictures:
+        write_figure(PICTURES[name](told), out / name)
+    return [*tables, *pictures]

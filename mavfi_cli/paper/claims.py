@@ -25,9 +25,11 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import (
+    ClaimVerdict,
     Count,
     correlation,
     fisher,
+    judge,
     longest_reaches,
     mcnemar,
     recovered_share,
@@ -36,13 +38,14 @@ from mavfi_cli.stats.shares import Interval, Share, wilson
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
+ISOLATED = "isolated kernels"
 _FEWEST = 4  # flights for a correlation with an interval
 _FILE = Path(__file__).parent / "claims.toml"
 _AS_PRINTED = "paper"  # an end of the range that the paper's own interval has
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class _Finding:
     """What our missions say about a claim.
 
     Attributes:
@@ -55,7 +58,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
+class _Claim:
     """A claim of the paper.
 
     Attributes:
@@ -75,7 +78,7 @@ class Claim:
     item: str
     words: str
     effect: str
-    find: Callable[[Any], Finding]
+    find: Callable[[Any], _Finding]
     paper: str = "no number printed"
     low: float = -math.inf
     high: float = math.inf
@@ -83,60 +86,76 @@ class Claim:
     paper_tells: str = "drawn only, without counts"
     isolated: bool = False
 
+    def judged(self, flights: Mapping[str, Flights], kernels: Kernels) -> dict[str, Any]:
+        """The claim as plain values, with its verdict on each stack.
 
-def _of_share(found: Share, what: str) -> Finding:
+        Args:
+            flights: of each stack.
+        """
+        sources = {ISOLATED: kernels} if self.isolated else flights
+        cells = {name: self._cell(self.find(source)) for name, source in sources.items()}
+        return {**{x: getattr(self, x) for x in self.__slots__ if x != "find"}, "cells": cells}
+
+    def _cell(self, found: _Finding) -> dict[str, Any]:
+        verdict = judge(found.effect, self.low, self.high)
+        if verdict is ClaimVerdict.NOT_FLOWN and found.told:
+            verdict = ClaimVerdict.NOT_JUDGED
+        known = found.effect is not None and not math.isnan(found.effect.low)
+        return {"verdict": verdict, "effect": found.effect if known else None, "told": found.told}
+
+
+def _of_share(found: Share, what: str) -> _Finding:
     if not found.total:
-        return Finding()
-    return Finding(effect=found.effect, told=f"{found.counts} {what}")
+        return _Finding()
+    return _Finding(effect=found.effect, told=f"{found.counts} {what}")
 
 
-def _difference(shares: Sequence[Share], told: str) -> Finding:
+def _difference(shares: Sequence[Share], told: str) -> _Finding:
     """The first minus the second of two shares; nothing unless both have flights."""
     first, second = shares
     if not (first.total and second.total):
-        return Finding()
-    return Finding(effect=first.minus(second), told=told)
+        return _Finding()
+    return _Finding(effect=first.minus(second), told=told)
 
 
 # Faults without a detector ------------------------------------------------------------------------
 
 
-def _success_lost(flights: Flights, **where: Any) -> Finding:
+def _success_lost(flights: Flights, **where: Any) -> _Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
     both = flights.struck(**where).chosen(own_lost=(True, False))
     if not len(both):
-        return Finding()
+        return _Finding()
     found = mcnemar(~both.flags("lost"), ~both.flags("own_lost")).effect
     told = f"{both.share().counts} lost; golden {both.share('own_lost').counts}"
-    return Finding(effect=found, told=told)
+    return _Finding(effect=found, told=told)
 
 
-def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
+def _most_lost_kernel(flights: Flights, **where: Any) -> _Finding:
     """Success lost by faults in the kernel that loses most."""
     hit = flights.struck(**where).by("struck_kernel")
     kernels = {name: those.share().share for (name,), those in hit.items() if name}
     if not kernels:
-        return Finding()
+        return _Finding()
     most = max(kernels, key=lambda name: kernels[name])
     found = _success_lost(flights, **where, struck_kernel=most)
-    return Finding(effect=found.effect, told=f"most in {most}: {found.told}")
+    return _Finding(effect=found.effect, told=f"most in {most}: {found.told}")
 
 
-def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
+def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> _Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
     shares = [flights.struck(**where).share("harmed") for where in groups.values()]
     told = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(told)}")
 
 
-def _harmful(flights: Flights, **where: Any) -> Finding:
-    """The share of harmful faults."""
+def _harmful(flights: Flights, **where: Any) -> _Finding:
     return _of_share(flights.struck(**where).share("harmed"), "harmful")
 
 
 def _loss_difference(
     flights: Flights, first: Where, second: Where, told: str, **where: Any
-) -> Finding:
+) -> _Finding:
     """Share of lost missions in one group of faults minus that in another.
 
     Args:
@@ -146,8 +165,7 @@ def _loss_difference(
     return _difference(shares, f"lost: {told.format(*(each.counts for each in shares))}")
 
 
-def _as_long(flights: Flights, ratio: float, **where: Any) -> Finding:
-    """The share of flights that take at least so many times as long as their golden flights."""
+def _as_long(flights: Flights, ratio: float, **where: Any) -> _Finding:
     return _of_share(_at_least(ratio, flights.struck(**where).ratios), "as long")
 
 
@@ -155,40 +173,40 @@ def _at_least(ratio: float, found: FloatArray) -> Share:
     return wilson(int((found >= ratio).sum()), len(found))
 
 
-def _worst_as_long(flights: Flights, ratio: float, missions: int, **where: Any) -> Finding:
+def _worst_as_long(flights: Flights, ratio: float, missions: int, **where: Any) -> _Finding:
     """The probability that the longest of so many flights reaches a ratio to its golden flight."""
     found = flights.struck(**where).ratios
     if not len(found):
-        return Finding()
+        return _Finding()
     beyond = _at_least(ratio, found)
     longest = 100.0 * (found.max() - 1.0)
-    return Finding(
+    return _Finding(
         effect=longest_reaches(beyond, missions),
         told=f"{beyond.counts} as long; longest {longest:+.1f} %",
     )
 
 
-def _energy_follows_time(flights: Flights, **where: Any) -> Finding:
+def _energy_follows_time(flights: Flights, **where: Any) -> _Finding:
     """Correlation of energy with flight time over successful golden flights."""
     won = flights.golden.chosen(lost=False, **where)
     pairs = np.stack([won.numbers(name) for name in ("flight_time_s", "energy_regression_j")], 1)
     pairs = pairs[(pairs > 0.0).all(axis=1)]
     if len(pairs) < _FEWEST:
-        return Finding()
-    return Finding(effect=correlation(pairs.tolist()), told=f"{len(pairs):,} golden flights")
+        return _Finding()
+    return _Finding(effect=correlation(pairs.tolist()), told=f"{len(pairs):,} golden flights")
 
 
 # The same faults without and with a detector ------------------------------------------------------
 
 
-def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
+def _recovered(flights: Flights, detector: str, **where: Any) -> _Finding:
     """The share of lost missions that a detector saves."""
     seen = flights.protected(detector, **where)
     lost = seen.chosen(bare_lost=True)
     return _of_some(lost, "lost", "lost missions saved") or _none_of(seen, "lost")
 
 
-def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
+def _shortened(flights: Flights, detector: str, **where: Any) -> _Finding:
     """The share of longer flights that a detector brings back within 5 %."""
     seen = flights.protected(detector, **where)
     longer = seen.chosen(bare_lost=False, bare_harmed=True)
@@ -196,13 +214,13 @@ def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
     return _of_some(longer, "harmed", told) or _none_of(seen, "over 5 % longer")
 
 
-def _of_some(flights: Flights, column: str, told: str) -> Finding | None:
+def _of_some(flights: Flights, column: str, told: str) -> _Finding | None:
     return _of_share(flights.share(column, value=False), told) if len(flights) else None
 
 
-def _none_of(seen: Flights, what: str) -> Finding:
+def _none_of(seen: Flights, what: str) -> _Finding:
     """What is told if none of the faults, flown without the detector, had an effect."""
-    return Finding(told=f"without it 0 of {len(seen):,} {what}") if len(seen) else Finding()
+    return _Finding(told=f"without it 0 of {len(seen):,} {what}") if len(seen) else _Finding()
 
 
 def _undone(flights: Flights, detector: str, protect: str, where: Where) -> Share:
@@ -211,49 +229,49 @@ def _undone(flights: Flights, detector: str, protect: str, where: Where) -> Shar
     return seen.chosen(bare_harmed=True).share("harmed", value=False)
 
 
-def _control_recovers_most(flights: Flights, detector: str, **where: Any) -> Finding:
+def _control_recovers_most(flights: Flights, detector: str, **where: Any) -> _Finding:
     """Harm undone by watching control minus that by the better single other stage."""
     shares = {stage: _undone(flights, detector, stage, where) for stage in STAGES}
     if not all(each.total for each in shares.values()):
-        return Finding()
+        return _Finding()
     *others, control = shares.values()
     told = ", ".join(f"{name} {each.counts}" for name, each in shares.items())
     best = max(others, key=lambda each: each.share)
     return _difference((control, best), f"harm undone: {told}")
 
 
-def _all_stages_best(flights: Flights, detector: str, **where: Any) -> Finding:
+def _all_stages_best(flights: Flights, detector: str, **where: Any) -> _Finding:
     """Harm undone by watching all stages minus that by watching control."""
     shares = [_undone(flights, detector, each, where) for each in (EVERY_STAGE, "control")]
     told = "harm undone: all stages {}, control {}".format(*(each.counts for each in shares))
     return _difference(shares, told)
 
 
-def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
+def _autoencoder_better(flights: Flights, **where: Any) -> _Finding:
     """Success with the autoencoder minus success with the Gaussian detector."""
     seen = [flights.protected(name, **where) for name in ("gad", "aad")]
     gad, aad = (dict(zip(x.faults, ~x.flags("lost"), strict=True)) for x in seen)
     both = sorted(gad.keys() & aad.keys())
     if not both:
-        return Finding()
+        return _Finding()
     test = mcnemar([gad[key] for key in both], [aad[key] for key in both])
     told = f"{test.only_second} missions by AAD only, {test.only_first} by GAD only"
-    return Finding(effect=test.effect, told=f"{told}, of {test.pairs:,}")
+    return _Finding(effect=test.effect, told=f"{told}, of {test.pairs:,}")
 
 
 # Costs of detectors -------------------------------------------------------------------------------
 
-_NO_COSTS = Finding(told="flown, but this export does not hold these times; a new one does")
+_NO_COSTS = _Finding(told="flown, but this export does not hold these times; a new one does")
 
 
-def _overhead_of(flights: Flights, detector: str, **where: Any) -> Finding:
+def _overhead_of(flights: Flights, detector: str, **where: Any) -> _Finding:
     """The mean share of the flight time that detection and recovery take."""
     seen, shares = _overheads(flights, detector, where)
     told = "time of the computer that flew, and simulated recovery"
     return _mean_cost(seen, shares, told)
 
 
-def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
+def _gaussian_dearer(flights: Flights, **where: Any) -> _Finding:
     """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
     gad, aad = (
         dict(zip(*_overheads(flights, name, where), strict=True)) for name in ("gad", "aad")
@@ -271,16 +289,16 @@ def _overheads(
     return seen.faults, np.sum([seen.numbers(name) for name in COSTS], axis=0).tolist()
 
 
-def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> Finding:
+def _mean_cost(seen: Collection[Any], costs: Sequence[float], told: str) -> _Finding:
     known = [each for each in costs if not math.isnan(each)]
     if not known:
-        return _NO_COSTS if seen else Finding()
-    return Finding(effect=interval(known, resamples=RESAMPLES), told=told)
+        return _NO_COSTS if seen else _Finding()
+    return _Finding(effect=interval(known, resamples=RESAMPLES), told=told)
 
 
-def _calibrated(_: Flights) -> Finding:
+def _calibrated(_: Flights) -> _Finding:
     """No finding: the model takes this number from the paper."""
-    return Finding(told="our model is calibrated with this number, so it tells nothing")
+    return _Finding(told="our model is calibrated with this number, so it tells nothing")
 
 
 # Isolated kernels ---------------------------------------------------------------------------------
@@ -288,7 +306,7 @@ def _calibrated(_: Flights) -> Finding:
 
 def _outcome_beside(
     kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
-) -> Finding:
+) -> _Finding:
     """The share of an outcome in one kernel minus that in the most extreme of others.
 
     Args:
@@ -297,26 +315,26 @@ def _outcome_beside(
     """
     there = [each for each in others or kernels if each in kernels and each != kernel]
     if kernel not in kernels or not there:
-        return Finding()
+        return _Finding()
     choose = max if extreme == "most" else min
     other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
     shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
     told = (f"{kernels[each]['title']} {100 * found.share:.1f} %" for each, found in shares.items())
     effect = shares[kernel].minus(shares[other])
-    return Finding(effect=effect, told=", ".join(told))
+    return _Finding(effect=effect, told=", ".join(told))
 
 
-def _least_benign(kernels: Kernels, but: str) -> Finding:
+def _least_benign(kernels: Kernels, but: str) -> _Finding:
     """The least share of benign runs of all kernels but one."""
     shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
     if not shares:
-        return Finding()
+        return _Finding()
     least = min(shares, key=lambda each: shares[each].share)
     told = f"least: {kernels[least]['title']}, {shares[least].counts}"
-    return Finding(effect=shares[least].effect, told=told)
+    return _Finding(effect=shares[least].effect, told=told)
 
 
-MEASURES: Mapping[str, Callable[..., Finding]] = {
+MEASURES: Mapping[str, Callable[..., _Finding]] = {
     "success_lost": _success_lost,
     "most_lost_kernel": _most_lost_kernel,
     "harm_difference": _harm_difference,
@@ -341,14 +359,14 @@ MEASURES: Mapping[str, Callable[..., Finding]] = {
 # The claims of claims.toml ------------------------------------------------------------------------
 
 
-def _read(path: Path) -> Iterator[Claim]:
+def _read(path: Path) -> Iterator[_Claim]:
     data, _ = read_toml(path)
     for told in data["claim"]:
         measure, given = told.pop("measure"), told.pop("given", {})
         counts = [(wins, missions) for wins, missions in told.pop("paper_counts", ())]
         if counts:
             told |= _in_the_paper(told, counts)
-        yield Claim(
+        yield _Claim(
             item=told["name"].partition("-")[0],
             find=partial(MEASURES[measure], **_arguments(given, data["flights"])),
             **told,
@@ -356,7 +374,6 @@ def _read(path: Path) -> Iterator[Claim]:
 
 
 def _in_the_paper(told: Mapping[str, Any], counts: Sequence[Count]) -> dict[str, Any]:
-    """The parts of a claim that follow from the paper's counts."""
     spread = _spread(counts)
     ends = {end: getattr(spread, end) for end in ("low", "high")}
     chance = fisher(counts[0], counts[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from mavfi_cli.paper.beyond import (
     kernel_flows,
     state_map,
 )
-from mavfi_cli.paper.claims import CLAIMS, Claim, Finding, Kernels
+from mavfi_cli.paper.claims import CLAIMS, ISOLATED
 from mavfi_cli.paper.figures import OVER_GOLDEN, draw, panel
 from mavfi_cli.paper.flights import LONGER, Flights
 from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
@@ -29,7 +28,7 @@ from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.paper.status import of_kernels, of_model
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, draw_strips
-from mavfi_cli.stats.paired import ClaimVerdict, excess_over_mean, judge
+from mavfi_cli.stats.paired import ClaimVerdict, excess_over_mean
 from mavfi_cli.stats.shares import Share, wilson
 
 if TYPE_CHECKING:
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
 
 _DETECTORS = {None: "no detector"} | DETECTOR_TITLES
 _LONGEST = 5  # flights of a campaign that are listed although they succeed
-_ISOLATED = "isolated kernels"
 _Cells = Mapping[tuple[str, str, str], Mapping[str, Share]]  # by state, class of bits and phase
 
 
@@ -52,7 +50,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
     flights = {stack: those.chosen(at=(None, "random")) for stack, those in as_paper.items()}
     kernels = evidence.isolated
     silent = {name: silent_of_all(each) for name, each in kernels.items()}
-    claims = [_judged(claim, flights, kernels) for claim in CLAIMS]
+    claims = [claim.judged(flights, kernels) for claim in CLAIMS]
     maps = {stack: state_map(as_paper[stack]) for stack in STACKS}
     return {
         "version": __version__,
@@ -61,7 +59,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "summary": _summary(flights, claims),
         "problems": evidence.problems,
         "claims": claims,
-        "verdicts": {where: _counted(claims, where) for where in (*STACKS, _ISOLATED)},
+        "verdicts": {where: _counted(claims, where) for where in (*STACKS, ISOLATED)},
         "worst": [row for stack in STACKS for row in _worst_flights(stack, flights[stack])],
         "spreads": {stack: _spread(flights[stack]) for stack in STACKS},
         "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
@@ -69,7 +67,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
         "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
-        "items": [*shown_items(evidence, flown)],
+        "items": [*_shown_items(evidence, flown)],
         "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", *DETECTOR_TITLES),
         "upsets_per_hour": upsets_per_hour,
@@ -88,23 +86,6 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
 # Claims -------------------------------------------------------------------------------------------
 
 
-def _judged(claim: Claim, flights: Mapping[str, Flights], kernels: Kernels) -> dict[str, Any]:
-    if claim.isolated:
-        found = {_ISOLATED: claim.find(kernels)}
-    else:
-        found = {stack: claim.find(those) for stack, those in flights.items()}
-    told = {name: getattr(claim, name) for name in claim.__slots__ if name != "find"}
-    return {**told, "cells": {name: _cell(claim, each) for name, each in found.items()}}
-
-
-def _cell(claim: Claim, found: Finding) -> dict[str, Any]:
-    verdict = judge(found.effect, claim.low, claim.high)
-    if verdict is ClaimVerdict.NOT_FLOWN and found.told:
-        verdict = ClaimVerdict.NOT_JUDGED
-    known = found.effect is not None and not math.isnan(found.effect.low)
-    return {"verdict": verdict, "effect": found.effect if known else None, "told": found.told}
-
-
 def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdict, int]:
     found = Counter(each["cells"][where]["verdict"] for each in claims if where in each["cells"])
     return {verdict: found[verdict] for verdict in ClaimVerdict}
@@ -114,7 +95,7 @@ def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdi
 
 
 def _extent(
-    flights: Mapping[str, Flights], kernels: Kernels, claims: Sequence[Mapping[str, Any]]
+    flights: Mapping[str, Flights], kernels: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]
 ) -> str:
     """What the page judges, and by how much."""
     missions = sum(len(those) for those in flights.values())
@@ -135,11 +116,11 @@ def _summary(flights: Mapping[str, Flights], claims: Sequence[Mapping[str, Any]]
 
 def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
     parts = []
-    for name in (*STACKS, _ISOLATED):
+    for name in (*STACKS, ISOLATED):
         found = _counted(claims, name)
         known = sum(found[each] for each, _ in _VERDICTS)
         if known:
-            place = f"about {name}" if name == _ISOLATED else f"flown on {name}"
+            place = f"about {name}" if name == ISOLATED else f"flown on {name}"
             verdicts = [f"{_are(found[each])} {told}" for each, told in _VERDICTS if found[each]]
             claims_told = f"of {known} claim{'s'[known == 1 :]} {place}"
             parts.append(f"{claims_told}, {_listed_in_words(verdicts)}")
@@ -182,7 +163,6 @@ def _cost_sentence(flights: Mapping[str, Flights]) -> str:
 
 
 def _instruction_faults(flights: Flights) -> Flights:
-    """Unprotected flights on the host's computer with a fault in an instruction."""
     return flights.struck(level="instruction", platform="x86")
 
 
@@ -305,7 +285,6 @@ def _map_rows(stack: str, cells: _Cells) -> Iterator[dict[str, Any]]:
 
 
 def _worth_a_look(source: CampaignSource) -> dict[str, Any]:
-    """The lost missions of a campaign, and the longest of the others."""
     flights = source.flights
     longest = sorted(flights.timed.rows(), key=lambda each: -each["over_own"])[:_LONGEST]
     return {
@@ -341,7 +320,7 @@ _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "faul
 _SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
-def shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[dict[str, Any]]:
+def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[dict[str, Any]]:
     """Every item of the paper in its order: the stacks that show it, and those that do not.
 
     A stack, or what else an item is computed from, has the table, the figure, and of flights their
@@ -358,7 +337,7 @@ def shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[
             parts = {"performance model": _drawn(of_model())}
         else:
             kernels = [*evidence.isolated.values()]
-            parts = {_ISOLATED: _drawn(of_kernels({"kernels": kernels})) if kernels else None}
+            parts = {ISOLATED: _drawn(of_kernels({"kernels": kernels})) if kernels else None}
         yield {
             "item": item,
             "shown": [{"stack": stack, **part} for stack, part in parts.items() if part],

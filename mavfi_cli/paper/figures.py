@@ -27,7 +27,7 @@ from mavfi_cli.report.paper import (
     draw_stack,
     draw_strips,
 )
-from mavfi_cli.report.top_view import draw_trajectories, panels_of
+from mavfi_cli.report.top_view import Trajectories
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,7 +98,6 @@ def _by_value(column: str) -> Callable[[Flights, str], Figure]:
 
 
 def _beside_detectors(flights: Flights, paper: float | None) -> list[Strip]:
-    """A row for the flights with faults, and one for those with each detector."""
     rows: list[_Row] = [("fault", None, flights.faulty())]
     rows += [(f"fault, {name.upper()}", name, flights.faulty(name)) for name in DETECTOR_TITLES]
     return panel(rows, paper)
@@ -156,8 +155,8 @@ def _fig13(flights: Flights, columns: str) -> Figure:
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
     with Ledger(kept[0].parents[1]) as ledger:
-        panels = panels_of(pair(ledger, among=frozenset(flights["number"])))
-    figure = draw_trajectories(panels, across=1 if columns == "one" else 2)
+        flown = Trajectories.of(pair(ledger, among=frozenset(flights["number"])))
+    figure = flown.draw(across=1 if columns == "one" else 2)
     for axes in figure.axes:  # room for the legend below the smaller panel
         axes.tick_params(labelsize=SMALLEST, pad=1)
         axes.set_xlabel(axes.get_xlabel(), fontsize=SMALLEST, labelpad=0)

@@ -202,7 +202,6 @@ class Flights:
 
 
 def _flown(table: pa.Table) -> pa.Table:
-    """The missions that flew, with the columns that follow from their own configuration."""
     table = tables.flown(table)
     configs = [json.loads(each) for each in table["changes"].to_pylist()]
     flips = pc.is_in(table["injected"], pa.array([each.value for each in _STRUCK]))

@@ -138,7 +138,6 @@ def _opened(plan: FlightsPlan) -> Ledger:
 
 
 def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
-    """Refuse a folder that cannot grow to the plan."""
     if stored is None:
         raise ConfigError(
             "holds a campaign that is not a reproduction; choose another --out", path=plan.folder

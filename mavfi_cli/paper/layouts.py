@@ -70,7 +70,6 @@ _PLANNERS = {"rrtstar": "RRT*", "rrt": "RRT", "rrtconnect": "RRTConnect"}
 
 
 def _effects(flights: Flights) -> list[PaperCell]:
-    """Success, mean time, and the longest flight of those with a fault."""
     longest = _maximum(flights.faulty().increases)
     return [_success(flights), _mean(flights, "flight_time_s"), longest]
 
@@ -382,7 +381,6 @@ _RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
 
 
 def _success(flights: Flights, paper: Printed = None) -> PaperCell:
-    """Success rate of all flown missions, in per cent, as the paper counts."""
     return PaperCell.of_share(flights.share(value=False), paper)
 
 
@@ -392,12 +390,10 @@ def _mean(flights: Flights, name: str, paper: Printed = None, scale: float = 1.0
 
 
 def _of_successes(flights: Flights, name: str) -> FloatArray:
-    """A measure of the successful missions that have it."""
     return flights.chosen(lost=False).known(name)
 
 
 def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
-    """The largest value; it has no interval."""
     if not len(values):
         return PaperCell(paper=paper)
     return PaperCell(value=float(np.max(values)), count=len(values), paper=paper)

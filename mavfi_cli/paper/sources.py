@@ -89,6 +89,39 @@ class Evidence:
     kernels: Sequence[_KernelSource]
     problems: Sequence[str]
 
+    @classmethod
+    def gather(cls, places: Sequence[Path]) -> Evidence:
+        """Read what the places hold.
+
+        Args:
+            places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
+
+        Raises:
+            RecordError: a place does not exist, or nothing in them can be read.
+        """
+        campaigns: list[CampaignSource] = []
+        kernels: list[_KernelSource] = []
+        problems: list[str] = []
+        for place in places:
+            before = len(campaigns) + len(kernels) + len(problems)
+            for path in _found(place):
+                try:
+                    each = _read(path)
+                except (MavfiError, OSError) as error:
+                    problems.append(f"Not read: {error}.")
+                    continue
+                if isinstance(each, _KernelSource):
+                    kernels.append(each)
+                else:
+                    campaigns.append(each)
+            if len(campaigns) + len(kernels) + len(problems) == before:
+                problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
+        if not any(len(each.flights) for each in campaigns) and not kernels:
+            none = (f"{each.path}: no mission has flown yet" for each in campaigns)
+            raise RecordError("; ".join(each.rstrip(".") for each in problems or none))
+        problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
+        return cls(campaigns=campaigns, kernels=kernels, problems=problems)
+
     @property
     def isolated(self) -> Mapping[str, Mapping[str, Any]]:
         """The summary of each attacked kernel; of several, that of the last source."""
@@ -97,38 +130,6 @@ class Evidence:
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
         return Flights.pooled([each.flights for each in self.campaigns], stack)
-
-
-def gather(places: Sequence[Path]) -> Evidence:
-    """Read what the places hold.
-
-    Args:
-        places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
-
-    Raises:
-        RecordError: a place does not exist, or nothing in them can be read.
-    """
-    campaigns: list[CampaignSource] = []
-    kernels: list[_KernelSource] = []
-    problems: list[str] = []
-    for place in places:
-        before = len(campaigns) + len(kernels) + len(problems)
-        for path in _found(place):
-            try:
-                each = _read(path)
-            except (MavfiError, OSError) as error:
-                problems.append(f"Not read: {error}.")
-                continue
-            if isinstance(each, _KernelSource):
-                kernels.append(each)
-            else:
-                campaigns.append(each)
-        if len(campaigns) + len(kernels) + len(problems) == before:
-            problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
-    if not any(len(each.flights) for each in campaigns) and not kernels:
-        raise RecordError("; ".join(each.rstrip(".") for each in problems) or _nothing(campaigns))
-    problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
-    return Evidence(campaigns=campaigns, kernels=kernels, problems=problems)
 
 
 def _found(place: Path) -> Iterator[Path]:
@@ -219,10 +220,6 @@ def _spec_beside(path: Path) -> Spec | None:
 
 
 # What is missing ----------------------------------------------------------------------------------
-
-
-def _nothing(campaigns: Sequence[CampaignSource]) -> str:
-    return "; ".join(f"{each.path}: no mission has flown yet" for each in campaigns)
 
 
 def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:

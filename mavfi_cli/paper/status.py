@@ -74,7 +74,6 @@ def _item_of(ledger: Ledger, name: str | None) -> Item | None:
 
 
 def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
-    """The flights of an item among those of a reproduction."""
     keys = set(plan.keys(item))
     return flights.where([changes in keys for changes in flights["changes"]])
 
@@ -161,7 +160,6 @@ def of_model() -> PaperTable:
 
 
 def _settings_table(ledger: Ledger) -> PaperTable:
-    """Success and quality of flight of each setting."""
     scales = {"flight_time_s": ("time, s", 1.0), "distance_m": ("distance, m", 1.0),
               "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip
     assert tuple(scales) == METRICS
@@ -199,7 +197,6 @@ def _success(group: Group) -> PaperCell:
 
 
 def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
-    """How much of each item of a reproduction is flown."""
     over = {number for number, _ in ledger.fates()}
     rows = []
     for item in plan.items:

@@ -129,7 +129,6 @@ def _cells(labels: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
 
 
 def _summary(summary: Row) -> list[str]:
-    """The settings and the comparisons."""
     settings = SettingColumns.of([cell["labels"] for cell in summary["cells"]])
     fates = [(cell["labels"], cell["name"], _fate_cells(cell)) for cell in summary["cells"]]
     means = [(cell["labels"], cell["name"], _mean_cells(cell)) for cell in summary["cells"]]
@@ -174,7 +173,6 @@ def _mean_cells(cell: Row) -> list[str]:
 
 
 def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[str]:
-    """One line per comparison, without empty columns."""
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
     cells = [_comparison_cells(each) for each in found]
@@ -213,7 +211,6 @@ def _worst(worst: Row) -> str:
 
 
 def _quality(found: Sequence[Row], confidence: float) -> list[str]:
-    """One table per metric."""
     if not found:
         return []
     first = [each["labels"] for each in found if each["metric"] == METRICS[0]]
@@ -244,7 +241,6 @@ def _quality_cells(each: Row, scale: float) -> list[str]:
 
 
 def _overhead(found: Sequence[Row], confidence: float) -> list[str]:
-    """A table of detection, measured on the host, and a table of recovery, simulated."""
     if not found:
         return ["", "overhead: no flight with a detector"]
     settings = SettingColumns.of([each["labels"] for each in found])

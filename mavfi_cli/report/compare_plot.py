@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, PLATFORMS, new_figure, open_frame
@@ -26,7 +26,7 @@ _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministi
 Row = Mapping[str, Any]
 
 
-def draw_compare_plot(comparison: Row) -> Figure:
+def _draw_comparison(comparison: Row) -> Figure:
     """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
     figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
@@ -75,7 +75,6 @@ def _frame(axes: Axes, title: str, grid: str) -> None:
 
 
 def _places(comparison: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
-    """Return the position of each platform's mark of a setting, and the mark's width."""
     platforms = [row["platform"] for row in comparison["plan"]["platforms"]]
     width = 0.76 / len(platforms)
     return {
@@ -92,7 +91,6 @@ def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
 
 
 def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
-    """Draw each successful flight as a dot, the median with its interval, and the worst flight."""
     settings = comparison["plan"]["settings"]
     places, width = _places(comparison, settings)
     flown = [f["flight_time_s"] for f in comparison["flights"] if _shown(f)] or [1.0]
@@ -129,7 +127,6 @@ def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
 
 
 def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
-    """Write the mean number of replans and the number of failed flights below a setting."""
     replans, failed = row["quantities"]["replans"]["mean"]["value"], row["counted"] - succeeded
     lines = [f"{failed} failed"] if failed else []
     if not math.isnan(replans):
@@ -291,7 +288,6 @@ def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
 def _recovered(
     axes: Axes, rows: Sequence[Row], settings: Sequence[str], colours: Mapping[str, str]
 ) -> None:
-    """Write the share of the faults' increase that each detector recovers, per platform."""
     lines = {name: place for place, name in enumerate(colours)}
     style: dict[str, Any] = {
         "transform": axes.get_xaxis_transform(), "va": "top", "fontsize": 8.5, "ha": "center",
@@ -328,7 +324,7 @@ _ROOM = 0.085  # minimum bar length for a text inside, as a fraction of the wind
 _LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go to the left
 
 
-def draw_timeline(comparison: Row) -> Figure:
+def _draw_timeline(comparison: Row) -> Figure:
     """Draw a figure with simulated time since the frame on x and a lane per kernel.
 
     All platforms share the time axis, so equal lengths are equal times.
@@ -388,7 +384,6 @@ def _length(span: list[float], width_s: float) -> float:
 
 
 def _others(axes: Axes, lane: int, spans: list[list[float]], colour: str, width_s: float) -> None:
-    """Draw all invocations of a kernel, with gaps between neighbours if there is room."""
     low = lane - _HEIGHT / 2
     axes.broken_barh(
         [(span[0], _length(span, width_s)) for span in spans], (low, _HEIGHT), color=colour,
@@ -403,7 +398,6 @@ def _bar(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) 
 
 
 def _duration(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
-    """Write the duration inside the bar if it is long enough, else to its right."""
     text = _time(span[1] - span[0])
     if span[1] - span[0] >= _ROOM * width_s:
         axes.text(
@@ -450,7 +444,6 @@ def _step(axes: Axes, upper: int, end_s: float, lower: int, start_s: float, colo
 
 
 def _answers(axes: Axes, row: Row, width_s: float) -> None:
-    """Mark the frame, its setpoint with the response time, and the setpoint of the new plan."""
     answer_s, plan_s = row["response_s"], row["plan_setpoint_s"]
     axes.vlines(0.0, -1.1, _SETPOINT + 0.3, color=INK, linewidth=0.9, zorder=1)
     axes.vlines(answer_s, -1.1, _SETPOINT, color=_ANSWER, linewidth=0.9, zorder=1)
@@ -477,9 +470,14 @@ def _answers(axes: Axes, row: Row, width_s: float) -> None:
 
 
 def _acts(axes: Axes, stamp_s: float, text: str, colour: str, below: float, width_s: float) -> None:
-    """Write below a setpoint what the vehicle does from then on."""
     late = stamp_s > _ANSWER_LATE * axes.get_xlim()[1]
     axes.text(
         stamp_s + (-0.004 if late else 0.006) * width_s, _SETPOINT + below, text, fontsize=8,
         color=colour, va="center", ha="right" if late else "left", zorder=8,
     )  # fmt: skip
+
+
+PICTURES: Mapping[str, Callable[[Row], Figure]] = {
+    "compare.svg": _draw_comparison,
+    "timeline.svg": _draw_timeline,
+}

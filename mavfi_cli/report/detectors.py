@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -128,7 +128,6 @@ def _recovery_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Number of harmful faults that each detector detects, and whose harm it undoes."""
     detectors = [row["detector"] for row in rows if row["value"] == rows[0]["value"]]
     told = [name for name in detectors if name != NONE]
     yield [f"by {by}", "active", "harmful", "seen:", *told, "undone:", *told]
@@ -149,7 +148,6 @@ def _group_rows(by: str, rows: Sequence[Row]) -> Iterator[list[str]]:
 
 
 def _worst_rows(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Worst flight time of each world over the golden flight's, and its recovery."""
     yield ["worst time", *dict.fromkeys(row["detector"] for row in rows)]
     for value in dict.fromkeys(row["value"] for row in rows):
         group = [row for row in rows if row["value"] == value]
@@ -195,10 +193,8 @@ def detector_csv(*pairs: pa.Table) -> str:
 
 # Pictures -----------------------------------------------------------------------------------------
 
-Evaluation = Mapping[str, Any]
 
-
-def draw_roc_plot(evaluation: Evaluation) -> Figure:
+def _draw_roc(evaluation: Row) -> Figure:
     """Draw a figure with ROC on the left and precision over recall on the right.
 
     A dot marks the detector at its own threshold.
@@ -251,7 +247,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
     open_frame(axes)
 
 
-def draw_recovery_plot(evaluation: Evaluation) -> Figure:
+def _draw_recovery(evaluation: Row) -> Figure:
     """Draw a figure of recovered harmful faults by stage and worst flights by world."""
     rows = evaluation["faults"]
     names = list(dict.fromkeys(row["detector"] for row in rows))
@@ -344,3 +340,9 @@ def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
     axes.grid(visible=True, color="#edf0f4", linewidth=0.6)
     axes.legend(frameon=False, fontsize=8)
     return figure
+
+
+PICTURES: Mapping[str, Callable[[Row], Figure]] = {
+    "roc.svg": _draw_roc,
+    "recovery.svg": _draw_recovery,
+}

@@ -57,13 +57,6 @@ def detector_colours(names: Sequence[str]) -> dict[str, str]:
     }
 
 
-def rgb(colour: str) -> tuple[float, float, float]:
-    """Return red, green and blue of a colour, each from 0 to 1."""
-    from matplotlib.colors import to_rgb
-
-    return to_rgb(colour)
-
-
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure that finds room for its labels by itself."""
     from matplotlib.figure import Figure

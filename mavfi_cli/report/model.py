@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.mission.measures import HOST_CHECKS
@@ -306,7 +306,7 @@ _MOST_HZ = 1000.0
 _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
 
 
-def draw_roofline_plot(report: Mapping[str, Any]) -> Figure:
+def _draw_roofline(report: Mapping[str, Any]) -> Figure:
     """Draw a figure with throughput in Hz and velocity in m/s on logarithmic axes."""
     vehicles = report["vehicles"]
     figure = new_figure(max(6.4, 4.9 * len(vehicles)), 4.9)
@@ -357,7 +357,6 @@ def _roofline_panel(axes: Axes, one: Mapping[str, Any], share: float) -> None:
 
 
 def _ceilings(axes: Axes, one: Mapping[str, Any], row: Mapping[str, Any]) -> None:
-    """Draw the ceilings that the rates of sensor and computer set for one board."""
     sensor_hz = next(p["value"] for p in one["parameters"] if p["parameter"] == "sensor_hz")
     label = [f"one board\nroof {row['roof_mps']:.2f} m/s, knee {row['knee_hz']:.1f} Hz"]
     for name, at_hz, ceiling in (
@@ -399,7 +398,7 @@ _QUANTITIES = (("flight_time_ratio", "flight time"), ("energy_ratio", "energy"))
 _COST_WIDTH = 0.15
 
 
-def draw_redundancy_plot(report: Mapping[str, Any]) -> Figure:
+def _draw_redundancy(report: Mapping[str, Any]) -> Figure:
     """Draw a figure with a panel per vehicle, a bar per scheme and ratios to the reference."""
     vehicles = report["vehicles"]
     figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
@@ -439,7 +438,6 @@ def _cost_panel(axes: Axes, one: Mapping[str, Any]) -> None:
 
 
 def _cost_caption(report: Mapping[str, Any]) -> str:
-    """Return the caption, which lists the calibrated numbers and their sources."""
     lines = [f"{report['model']}; flights of {report['distance_m']:g} m at the safe velocity"]
     for one in report["vehicles"]:
         if any(row["calibrated"] for row in one["parameters"]):
@@ -457,7 +455,7 @@ _FLOWN_RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("ene
 _STEP = 0.17
 
 
-def draw_flight_plot(report: Mapping[str, Any]) -> Figure:
+def _draw_flights(report: Mapping[str, Any]) -> Figure:
     """Draw a figure with a row per vehicle: velocities left, ratios to the reference right.
 
     A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
@@ -553,3 +551,11 @@ def _not_flown(axes: Axes, place: float) -> None:
         "not flown", (place, 0.0), xytext=(0, 3), textcoords="offset points", ha="center",
         va="bottom", fontsize=7, color=NOTE, rotation=90.0,
     )  # fmt: skip
+
+
+PICTURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
+    "roofline.svg": _draw_roofline,
+    "redundancy.svg": _draw_redundancy,
+    "flights.svg": _draw_flights,
+}
+"""By the names of their files; the last shows flights."""

@@ -141,7 +141,6 @@ def _item_chart(item: Any, shown: Mapping[str, Any]) -> _Chart:
 
 
 def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
-    """Lost missions of each arm with their intervals."""
     figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()
     print_axes(axes)
@@ -166,7 +165,6 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 
 def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
-    """What struck kernels did, a bar a kernel."""
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)
@@ -198,14 +196,12 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
 
 
 def _percent(value: float | None, digits: int = 0, sign: str = "") -> str:
-    """A share of one as per cent."""
     if value is None or not math.isfinite(value):
         return _NONE
     return f"{100 * value:{sign}z.{digits}f} %"
 
 
 def _ends(share: Any, scale: float = 100.0, digits: int = 0) -> str:
-    """The ends of an interval."""
     return f"{scale * share.low:z.{digits}f} to {scale * share.high:z.{digits}f}"
 
 
@@ -222,19 +218,16 @@ def _effect(found: Any, unit: str) -> str:
 
 
 def _p_value(chance: float | None) -> str:
-    """A p-value."""
     if chance is None:
         return _NONE
     return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
 
 
 def _detector(name: str | None) -> str:
-    """A detector as the page calls it."""
     return DETECTOR_TITLES.get(name, name) if name else "none"
 
 
 def _hourly(rates: tuple[float, float, float]) -> str:
-    """A rate with its interval, two digits each."""
     point, low, high = (f"{each:.2g}" for each in rates)
     return f"{point} ({low} to {high})"
 
@@ -245,7 +238,6 @@ def _shade(share: float | None) -> str:
 
 
 def _link(text: str) -> str:
-    """A link that holds CSV text."""
     code = base64.b64encode(text.encode()).decode()
     return f"data:text/csv;charset=utf-8;base64,{code}"
 

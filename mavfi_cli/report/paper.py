@@ -192,7 +192,6 @@ def _in_pairs(table: PaperTable) -> list[str]:
 
 
 def _as_markdown(table: PaperTable) -> str:
-    """A pipe table."""
     head, *rows = table.cells()
     aligned = ["---"] * len(table.labels) + ["---:"] * (len(head) - len(table.labels))
     lines = [_piped(row) for row in (head, aligned, *rows)]

@@ -26,12 +26,10 @@ PAPER = "paper, Fig. 16: worst case x 2.8 on the TX2, of which GAD recovers 79.3
 
 
 def _setting_title(setting: str) -> str:
-    """The name of a setting."""
     return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
 
 
 def _titles_of(told: Row) -> dict[str, str]:
-    """The names of the platforms."""
     return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
 
 
@@ -69,7 +67,6 @@ def platform_lines(told: Row) -> list[str]:
 
 
 def _few(told: Row) -> list[str]:
-    """A warning if intervals rest on too few flights."""
     counts = [row["quantities"]["flight_time_s"]["mean"]["count"] for row in told["settings"]]
     if not any(1 < count < FEW for count in counts):
         return []
@@ -100,7 +97,6 @@ def _head(told: Row) -> list[str]:
 
 
 def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -> list[str]:
-    """A table of all platforms and settings; the first label is printed once."""
     titles, last, rows = _titles_of(told), "", []
     for row in told[name]:
         labels = [titles[row["platform"]], _setting_title(row["setting"])]
@@ -111,7 +107,6 @@ def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -
 
 
 def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: Any) -> list[str]:
-    """A title, and a table of a platform compared with the first one."""
     rows = [row for row in told[name] if row["platform"] == platform["platform"]]
     title, *names = head
     told_rows = [[_setting_title(row["setting"]), *cells(row)] for row in rows]
@@ -186,7 +181,6 @@ def _worst_cells(row: Row) -> list[str]:
 
 
 def _again(told: Row) -> list[str]:
-    """How to repeat the most expensive flights."""
     titles, lines = _titles_of(told), []
     for row in told["costs"]:
         if row["setting"] != NONE or row["worst_flight"] is None:
@@ -200,7 +194,6 @@ def _again(told: Row) -> list[str]:
 
 
 def _command_of(plan: Row, row: Row) -> str:
-    """The command that repeats the worst flight of a setting without detector."""
     flight = row["worst_flight"]
     words = ["mavfi", "fly", "--world", plan["world"], "--seed", f"{flight['seed']}"]
     words += ["--platform", row["platform"]]

@@ -72,14 +72,12 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _folded(line: str) -> list[str]:
-    """Wrap a line at the screen width. Continuation lines align with its text."""
     return textwrap.wrap(
         line, WIDTH, subsequent_indent=_INDENT, break_long_words=False, break_on_hyphens=False
     ) or [""]
 
 
 def _host_lines(flight: FlightRecord) -> list[str]:
-    """Return the host time of the flight."""
     host, simulated_s = flight.host, flight.simulated_s
     if host.get("flight_wall_s") and simulated_s is not None:
         factor = simulated_s / host["flight_wall_s"]
@@ -91,7 +89,6 @@ def _host_lines(flight: FlightRecord) -> list[str]:
 
 
 def _flight_lines(flight: FlightRecord) -> list[str]:
-    """Return quality of flight and counts of plans, or one line if there was no flight."""
     qof, counters = flight.quality_of_flight, flight.pilot
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
@@ -111,7 +108,6 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
 
 
 def _clearance_and_energy(qof: Section) -> list[str]:
-    """Return clearance and energy, which are unknown for a foreign autopilot."""
     clearance, energy = "not known", "not known"
     if qof["min_clearance_m"] is not None:
         clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} minimum"
@@ -124,7 +120,6 @@ def _clearance_and_energy(qof: Section) -> list[str]:
 
 
 def _measured_lines(measured: Section) -> list[str]:
-    """Return the kernel medians of a platform measured on the host."""
     if not measured:
         return []
     medians = ", ".join(
@@ -134,7 +129,6 @@ def _measured_lines(measured: Section) -> list[str]:
 
 
 def _node_lines(nodes: Section) -> list[str]:
-    """Return the crashes and hangs of each node."""
     lines = []
     for name, node in nodes.items():
         ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
@@ -148,7 +142,6 @@ def _node_lines(nodes: Section) -> list[str]:
 
 
 def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str]:
-    """Return the detector's alarms, its recomputations, and the host time of its checks."""
     if not detection:
         return []
     responses, alarms = detection["responses"], detection["alarm_count"]
@@ -197,7 +190,6 @@ def event_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _fault_lines(fault: Section) -> list[str]:
-    """Return the requested fault and its strikes."""
     if not fault:
         return []
     if fault["level"] == "instruction":
@@ -241,7 +233,6 @@ def _activation(fault: Section) -> str:
 
 
 def _instruction_lines(fault: Section) -> list[str]:
-    """Return the drawn instruction-level fault, its population and its effect."""
     lines = [
         f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
         f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "

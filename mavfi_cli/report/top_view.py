@@ -85,8 +85,6 @@ def draw_top_view(run: Run) -> Figure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Path:
-    """The path of a flight, from the truth if it is known."""
-
     places: np.ndarray  # (n, 4) stamp in s, and position in m
     speeds_mps: np.ndarray  # (n,)
 
@@ -127,7 +125,6 @@ def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray)
 
 
 def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the newest plans, older ones paler, and say how many there are."""
     shown = [plan for plan in plans if len(plan["points_enu_m"])]
     told = "planned" if len(shown) <= _PLANS else f"planned (newest {_PLANS} of {len(shown)})"
     newest = shown[-_PLANS:]
@@ -164,7 +161,6 @@ def _explain_speed(figure: Figure, axes: Axes, lines: Any) -> None:
 
 
 def _draw_goal(axes: Axes, flight: FlightRecord) -> None:
-    """Mark the goal of a flight with its tolerance."""
     from matplotlib.patches import Circle
 
     goal = flight.goal_enu_m or flight.world.get("goal")
@@ -193,7 +189,6 @@ def _draw_end(
     columns: list[int] = _FROM_ABOVE,
     colour: str = FAULT,
 ) -> None:
-    """Mark the end of a failed flight."""
     if len(path.places) and not flight.succeeded:
         across, up = path.places[-1, columns]
         axes.scatter(
@@ -225,7 +220,6 @@ def _draw_marks(
 
 
 def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
-    """Set the limits round world and positions (n, 3) m, equal scales and plain axes."""
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
     if places:
@@ -242,7 +236,6 @@ def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
 
 
 def _frame_heights(axes: Axes, flight: FlightRecord, path: _Path) -> None:
-    """Show ground, path and the height of the goal, and set plain axes."""
     goal = flight.goal_enu_m or flight.world.get("goal")
     heights_m = [0.0, *path.places[:, 3], *(goal[2:] if goal else ())]
     if goal:
@@ -264,7 +257,6 @@ def _plain(axes: Axes) -> None:
 
 
 def _place_of(flight: FlightRecord) -> str:
-    """Return world and seed of a flight as text."""
     config = flight.config
     world = config["link"] or config["world"].removesuffix(".toml").rpartition("/")[2]
     return f"{world}, seed {config['seed']}"
@@ -306,62 +298,80 @@ def _struck(fault: Mapping[str, Any]) -> str:
 # Flights of one mission: golden, with a fault, protected ---------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Panel:
-    """Superposed flights. Equal names have equal colours in all panels."""
-
-    title: str
-    flights: Sequence[tuple[str, Run]]
+_Flights = Sequence[tuple[str, Run]]
 
 
-def panels_of(pair: Mapping[str, Any]) -> list[Panel]:
-    """Read the run folders of a pair.
+@dataclass(frozen=True, slots=True)
+class Trajectories:
+    """Panels of superposed flights. Equal names have equal colours in all panels.
 
-    Args:
-        pair: As `analysis.trajectories.pair`.
+    The first flight without fault and detector is the reference for the times of the others.
 
-    Raises:
-        RecordError: A run folder cannot be read.
+    Attributes:
+        panels: At least one, each with its title and at least one flight.
     """
-    return [
-        Panel(
-            title=panel["title"],
-            flights=[(each["name"], load_run(each["path"])) for each in panel["flights"]],
-        )
-        for panel in pair["panels"]
-    ]
 
+    panels: Sequence[tuple[str, _Flights]]
 
-def draw_trajectories(panels: Sequence[Panel], across: int = _COLUMNS) -> Figure:
-    """Draw a figure with a top view per panel, in metres, east to the right and north up.
+    @classmethod
+    def of(cls, pair: Mapping[str, Any]) -> Trajectories:
+        """Read the run folders of `analysis.trajectories.pair`.
 
-    Args:
-        panels: At least one panel, each with at least one flight. The first flight without fault
-            and detector is the reference for the flight times of the others.
-        across: At most so many panels side by side.
-    """
-    columns = min(across, len(panels))
-    rows = -(-len(panels) // columns)
-    most = max(len(panel.flights) for panel in panels)
-    figure = new_figure(5.2 * columns, (5.3 + 0.19 * most) * rows)
-    figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
-    colours = _colours(panels)
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for number, axes in enumerate(grid.flat):
-        if number < len(panels):
-            _draw_panel(figure, axes, panels[number], number, colours)
-        else:
+        Raises:
+            RecordError: A run folder cannot be read.
+        """
+        return cls([
+            (panel["title"], [(each["name"], load_run(each["path"])) for each in panel["flights"]])
+            for panel in pair["panels"]
+        ])  # fmt: skip
+
+    def draw(self, across: int = _COLUMNS) -> Figure:
+        """Draw a top view per panel, in metres, east to the right and north up.
+
+        Args:
+            across: At most so many panels side by side.
+        """
+        columns = min(across, len(self.panels))
+        rows = -(-len(self.panels) // columns)
+        most = max(len(flights) for _, flights in self.panels)
+        figure = new_figure(5.2 * columns, (5.3 + 0.19 * most) * rows)
+        figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
+        colours = _colours(flight for _, flights in self.panels for flight in flights)
+        grid = figure.subplots(rows, columns, squeeze=False)
+        for number, (title, flights) in enumerate(self.panels):
+            axes = grid.flat[number]
+            _draw_panel(figure, axes, flights, number, colours)
+            if title:
+                told = textwrap.fill(f"fault: {title}", _TITLE)
+                axes.set_title(told, fontsize=9.5, loc="left")
+        for axes in grid.flat[len(self.panels) :]:
             axes.set_axis_off()
-    _explain_marks(figure)
-    figure.suptitle(_place_of(panels[0].flights[0][1].record), fontsize=11)
-    return figure
+        _explain_marks(figure)
+        figure.suptitle(self._place, fontsize=11)
+        return figure
+
+    def lines(self) -> list[str]:
+        """Describe the picture: world and seed, and outcome, time and folder of every flight."""
+        text = [self._place]
+        for title, flights in self.panels:
+            text += [f"fault: {title}"] if title else []
+            golden_s = _golden_s(flights)
+            text += [
+                f"  {_legend_entry(name, run.record, golden_s)}  {run.folder.path}"
+                for name, run in flights
+            ]
+        return text
+
+    @property
+    def _place(self) -> str:
+        return _place_of(self.panels[0][1][0][1].record)
 
 
-def _colours(panels: Sequence[Panel]) -> dict[str, str]:
+def _colours(flights: Iterable[tuple[str, Run]]) -> dict[str, str]:
     """Return a colour per name: its detector's if still unused, else the next free one."""
     colours: dict[str, str] = {}
     turn = itertools.cycle(FLIGHTS)
-    for name, run in (flight for panel in panels for flight in panel.flights):
+    for name, run in flights:
         if name not in colours:
             detector = run.record.detection.get("detector")
             own = DETECTORS.get(detector) if detector else None
@@ -369,30 +379,15 @@ def _colours(panels: Sequence[Panel]) -> dict[str, str]:
     return colours
 
 
-def lines(panels: Sequence[Panel]) -> list[str]:
-    """Describe the picture: world and seed, and outcome, time and folder of every flight."""
-    text = [_place_of(panels[0].flights[0][1].record)]
-    for panel in panels:
-        text += [f"fault: {panel.title}"] if panel.title else []
-        golden_s = _golden_s([run for _, run in panel.flights])
-        text += [
-            f"  {_legend_entry(name, run.record, golden_s)}  {run.folder.path}"
-            for name, run in panel.flights
-        ]
-    return text
-
-
 def _draw_panel(
-    figure: Figure, axes: Axes, panel: Panel, number: int, colours: Mapping[str, str]
+    figure: Figure, axes: Axes, flights: _Flights, number: int, colours: Mapping[str, str]
 ) -> None:
-    runs = [run for _, run in panel.flights]
-    paths = [_path_of(run) for run in runs]
+    paths = [_path_of(run) for _, run in flights]
     everywhere = np.concatenate([path.positions_enu_m for path in paths])
-    first = runs[0].record
-    golden_s = _golden_s(runs)
+    first, golden_s = flights[0][1].record, _golden_s(flights)
     _draw_obstacles(axes, first.world, everywhere)
     handles = []
-    for place, ((name, run), path) in enumerate(zip(panel.flights, paths, strict=True)):
+    for place, ((name, run), path) in enumerate(zip(flights, paths, strict=True)):
         handles += axes.plot(
             *path.places[:, _FROM_ABOVE].T, color=colours[name], zorder=4.0 + 0.01 * place,
             linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
@@ -402,11 +397,8 @@ def _draw_panel(
         _draw_end(axes, run.record, path, colour=colours[name])
     _draw_goal(axes, first)
     _draw_start(axes, paths[0])
-    _draw_panel_marks(figure, axes, panel, colours)
+    _draw_panel_marks(figure, axes, flights, colours)
     _frame(axes, first.world, everywhere)
-    if panel.title:
-        title = textwrap.fill(f"fault: {panel.title}", _TITLE)
-        axes.set_title(title, fontsize=9.5, loc="left")
     axes.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize=8
     )
@@ -414,12 +406,14 @@ def _draw_panel(
         handle.set_label(None)  # the remaining labels are the same in all panels
 
 
-def _draw_panel_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
+def _draw_panel_marks(
+    figure: Figure, axes: Axes, flights: _Flights, colours: Mapping[str, str]
+) -> None:
     """Mark faults and alarms beside the path in the colours of their flights."""
     from matplotlib.transforms import offset_copy
 
     for kind, (right, up) in _MARKED.items():
-        for name, run in panel.flights:
+        for name, run in flights:
             beside = offset_copy(axes.transData, figure, right, up, units="points")
             places = _draw_marks(
                 axes, run.record.events, kind, facecolors=colours[name], edgecolors=INK,
@@ -434,7 +428,6 @@ def _draw_panel_marks(figure: Figure, axes: Axes, panel: Panel, colours: Mapping
 
 
 def _explain_marks(figure: Figure) -> None:
-    """Draw one legend for all marks."""
     marks: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -448,9 +441,8 @@ def _explain_marks(figure: Figure) -> None:
             shown.set(facecolor="white", edgecolor=INK)
 
 
-def _golden_s(runs: Sequence[Run]) -> float | None:
-    """Return the flight time of the golden flight if it succeeded, else None."""
-    for run in runs:
+def _golden_s(flights: _Flights) -> float | None:
+    for _, run in flights:
         if (flight := run.record).golden:
             time_s: float | None = flight.quality_of_flight["flight_time_s"]
             return time_s if flight.succeeded else None
@@ -458,7 +450,6 @@ def _golden_s(runs: Sequence[Run]) -> float | None:
 
 
 def _legend_entry(name: str, flight: FlightRecord, golden_s: float | None) -> str:
-    """Return the legend entry of a flight: setting, outcome and flight time."""
     time_s = flight.quality_of_flight["flight_time_s"]
     entry = f"{name}: {flight.outcome.replace('_', ' ')}"
     if time_s is None:

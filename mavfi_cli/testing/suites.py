@@ -54,7 +54,6 @@ def _alarms(detector: Detector, deltas: Deltas, stage: Stage) -> bool:
 
 
 def _run(detector: Detector, rows: Iterable[Deltas]) -> list[float]:
-    """Return the scores of a stream of samples. The detector learns those that pass."""
     found = []
     for number, deltas in enumerate(rows):
         stage = _STAGES[number % 3]
@@ -224,7 +223,6 @@ Corner = tuple[float, float, float]
 
 
 def _slab(low: Corner | FloatArray, high: Corner | FloatArray) -> FloatArray:
-    """Points that fill the voxels of a box."""
     axes = [
         np.arange(a, b, RESOLUTION_M) + 0.5 * RESOLUTION_M for a, b in zip(low, high, strict=True)
     ]
@@ -232,7 +230,6 @@ def _slab(low: Corner | FloatArray, high: Corner | FloatArray) -> FloatArray:
 
 
 def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
-    """Six walls round a point."""
     faces = []
     for axis in range(3):
         for side in (-half, half):

@@ -12,7 +12,7 @@ from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.model import draw_flight_plot, model_lines, redundancy_csv
+from mavfi_cli.report.model import PICTURES, model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report, setting_of
@@ -175,17 +175,17 @@ def test_a_detector_that_does_not_know_these_flights(spark):
 
 def test_the_picture(spark, tmp_path):
     told = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1)
-    write_figure(draw_flight_plot(told), tmp_path / "a.svg")
-    write_figure(draw_flight_plot(told), tmp_path / "b.svg")
+    write_figure(PICTURES["flights.svg"](told), tmp_path / "a.svg")
+    write_figure(PICTURES["flights.svg"](told), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
-    left, right = draw_flight_plot(spark()).axes
+    left, right = PICTURES["flights.svg"](spark()).axes
     diamonds = [y for line in left.lines if line.get_marker() == "D" for y in line.get_ydata()]
     drawn = [row["model_velocity_mps"] for row in rows_of(spark()).values()]
     assert diamonds == pytest.approx(drawn)
     heights = [bar.get_height() for bar in right.patches]
     assert len(heights) == 15
     assert max(heights) == pytest.approx(rows_of(spark())["tmr"]["flight_energy_ratio"])
-    words = [text.get_text() for text in draw_flight_plot(told).axes[0].texts]
+    words = [text.get_text() for text in PICTURES["flights.svg"](told).axes[0].texts]
     assert "not flown" in words
     assert "0 % of 1 succeed" in words
 

@@ -1,6 +1,6 @@
 """Figures that are drawn from run folders: from a campaign that has kept them."""
 
-from types import SimpleNamespace
+from pathlib import Path
 
 import pytest
 from flown import table
@@ -9,7 +9,7 @@ from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.paper import document
 from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import BY_NAME, FlightsPlan
-from mavfi_cli.paper.sources import STACKS
+from mavfi_cli.paper.sources import CampaignSource, Evidence
 
 FIG13 = BY_NAME["fig13"]
 KINDS = FlightsPlan(items=[FIG13], stack="mavbench").kinds()
@@ -23,11 +23,12 @@ def shown(monkeypatch):
 
     def of(*exports):
         tables = [Flights.of(each) for each in exports]
-        evidence = SimpleNamespace(
-            campaigns=[SimpleNamespace(flights=each) for each in tables], isolated={}
-        )
-        flights = {stack: Flights.pooled(tables, stack) for stack in STACKS}
-        shown = document.shown_items(evidence, flights)
+        campaigns = [
+            CampaignSource(path=Path("some"), name="some", spec=None, planned=None, flights=each)
+            for each in tables
+        ]
+        evidence = Evidence(campaigns=campaigns, kernels=[], problems=[])
+        shown = document.document(evidence)["items"]
         return next(each for item in shown for each in item["shown"] if each["stack"] == "mavbench")
 
     return of

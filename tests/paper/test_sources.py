@@ -12,8 +12,8 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
-from mavfi_cli.paper.document import shown_items
-from mavfi_cli.paper.sources import STACKS, gather
+from mavfi_cli.paper.document import document
+from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.report.campaign import write_flights
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -57,7 +57,7 @@ def export(tmp_path):
 
 
 def test_a_whole_campaign_has_no_problems(campaign):
-    found = gather([campaign("whole", 3, 3)])
+    found = Evidence.gather([campaign("whole", 3, 3)])
     assert found.problems == []
     (source,) = found.campaigns
     assert (source.name, source.planned, len(source.flights)) == ("whole", 3, 3)
@@ -69,7 +69,7 @@ def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
     folder = campaign("half", 5, 2)
     with Ledger(folder) as ledger:
         write_flights(exported(ledger), tmp_path / "half.parquet")
-    found = [gather([place]) for place in (folder, tmp_path / "half.parquet")]
+    found = [Evidence.gather([place]) for place in (folder, tmp_path / "half.parquet")]
     there, here = (each.campaigns[0] for each in found)
     assert (here.planned, here.versions, here.host) == (there.planned, there.versions, there.host)
     (problem,) = found[1].problems
@@ -77,14 +77,14 @@ def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
 
 
 def test_what_has_not_flown_is_told(campaign):
-    (problem,) = gather([campaign("half", 5, 2)]).problems
+    (problem,) = Evidence.gather([campaign("half", 5, 2)]).problems
     assert "2 of 5 missions have flown" in problem
 
 
 def test_the_rest_of_a_reproduction_is_flown_by_naming_no_item(campaign, tmp_path):
     with Ledger(campaign("mavbench", 5, 2), writing=True) as ledger:
         ledger.set_meta({"reproduction": '{"stack": "mavbench", "scale": 0.5}'})
-    (problem,) = gather([tmp_path]).problems
+    (problem,) = Evidence.gather([tmp_path]).problems
     assert problem.endswith(
         f"2 of 5 missions have flown. mavfi reproduce --stack mavbench --scale 0.5 --out {tmp_path}"
         " flies the rest."
@@ -94,14 +94,14 @@ def test_the_rest_of_a_reproduction_is_flown_by_naming_no_item(campaign, tmp_pat
 def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
     campaign("new", 1, 1)
     campaign("old", 1, 1, {"numpy": "1.0"})
-    (problem,) = gather([tmp_path]).problems
+    (problem,) = Evidence.gather([tmp_path]).problems
     assert "old and" in problem
     assert "numpy was" in problem
     assert "is 1.0" in problem
 
 
 def test_a_build_that_is_not_this_one_is_told(campaign):
-    (problem,) = gather([campaign("old", 1, 1, {"ompl": "0.1"})]).problems
+    (problem,) = Evidence.gather([campaign("old", 1, 1, {"ompl": "0.1"})]).problems
     assert "another build than this one" in problem
     assert "ompl was 0.1" in problem
 
@@ -109,16 +109,16 @@ def test_a_build_that_is_not_this_one_is_told(campaign):
 def test_nothing_is_an_error(tmp_path, campaign):
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordError, match="empty: holds no campaign"):
-        gather([tmp_path / "empty"])
+        Evidence.gather([tmp_path / "empty"])
     with pytest.raises(RecordError, match="does not exist"):
-        gather([tmp_path / "absent"])
+        Evidence.gather([tmp_path / "absent"])
     with pytest.raises(RecordError, match="no mission has flown yet"):
-        gather([campaign("unflown", 4, 0)])
+        Evidence.gather([campaign("unflown", 4, 0)])
 
 
 def test_an_empty_folder_beside_another_is_told(tmp_path, campaign):
     (tmp_path / "empty").mkdir()
-    (problem,) = gather([campaign("whole", 1, 1), tmp_path / "empty"]).problems
+    (problem,) = Evidence.gather([campaign("whole", 1, 1), tmp_path / "empty"]).problems
     assert "empty: holds no campaign" in problem
 
 
@@ -130,7 +130,7 @@ def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
     pq.write_table(table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
     pq.write_table(table([row() | {"changes": "no json"}]), tmp_path / "odd.parquet")
     (tmp_path / "kernels.json").write_text("[]")
-    found = gather([tmp_path])
+    found = Evidence.gather([tmp_path])
     assert len(found.campaigns) == 1
     told = "\n".join(found.problems)
     for name in ("torn", "other.parquet", "foreign.parquet", "odd.parquet", "kernels.json"):
@@ -147,7 +147,7 @@ def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
     else:
         del summary["kernels"][0][lacks]
     (tmp_path / "kernels.json").write_text(json.dumps(summary))
-    found = gather([tmp_path])
+    found = Evidence.gather([tmp_path])
     assert len(found.campaigns) == 1
     (problem,) = found.problems
     assert "kernels.json: not a whole summary of `mavfi kernels`" in problem
@@ -158,18 +158,18 @@ def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
     export("whole/runs/0-sparse-1/trace.parquet", row())
     export("whole/world-search/found.parquet", row())
     export("whole/kernels.parquet", row())
-    assert len(gather([tmp_path]).campaigns) == 1
+    assert len(Evidence.gather([tmp_path]).campaigns) == 1
 
 
 def test_a_campaign_may_lie_in_a_folder_of_any_name(tmp_path, campaign):
     (tmp_path / "runs").mkdir()
     campaign("runs/whole", 1, 1)
-    assert len(gather([tmp_path]).campaigns) == 1
+    assert len(Evidence.gather([tmp_path]).campaigns) == 1
 
 
 def test_a_part_has_the_specification_beside_it(export, tmp_path):
     (tmp_path / "mine.toml").write_text("repetitions = 3\n[[setting]]\n")
-    (source,) = gather([export("mine-part2.parquet", row())]).campaigns
+    (source,) = Evidence.gather([export("mine-part2.parquet", row())]).campaigns
     assert source.spec.repetitions == 3
     assert source.planned is None
     assert len(source.digest) == 64
@@ -182,19 +182,18 @@ def test_a_kernel_in_two_places_counts_once(tmp_path):
         told["kernels"] = told["kernels"][:2]
         (tmp_path / name / "kernels.json").write_text(json.dumps(told))
         told["kernels"][0]["runs"] = 7
-    found = gather([tmp_path])
+    found = Evidence.gather([tmp_path])
     (first, *_) = found.isolated.values()
     assert first["runs"] == 7
     assert len(found.problems) == 2
     assert found.problems[0].endswith(f"both have {first['kernel']}; the latter counts.")
-    flights = {stack: found.flights(stack) for stack in STACKS}
-    fig6 = next(each for each in shown_items(found, flights) if each["item"].name == "fig6")
+    fig6 = next(each for each in document(found)["items"] if each["item"].name == "fig6")
     assert [len(part["table"].rows) for part in fig6["shown"]] == [2]
 
 
 def test_a_mission_in_two_places_counts_once(export):
     places = [export("one.parquet", row(seed=1)), export("two.parquet", row(seed=1), row(seed=2))]
-    found = gather(places)
+    found = Evidence.gather(places)
     assert len(found.flights()) == len(found.flights("mavbench")) == 2
     assert len(found.flights("hardened")) == 0
 
@@ -203,7 +202,7 @@ def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
     failed = {"state": "error", "outcome": None}
     places = [export("one.parquet", row(seed=1, **failed), row(seed=2)),
               export("two.parquet", row(seed=1))]  # fmt: skip
-    found = gather(places)
+    found = Evidence.gather(places)
     assert len(found.flights()) == len(found.flights("mavbench")) == 2
 
 
@@ -215,11 +214,10 @@ def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
             fault = {"field": field, "together": True}
             rows.append(row("waypoint_position", seed=seed, fault=fault))
     rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
-    found = gather([export("a.parquet", *rows)])
-    flights = {stack: found.flights(stack) for stack in STACKS}
+    found = Evidence.gather([export("a.parquet", *rows)])
     shown = {
         (each["item"].name, part["stack"]): part
-        for each in shown_items(found, flights)
+        for each in document(found)["items"]
         for part in each["shown"]
     }
     found = shown["fig9", "mavbench"]

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mavfi_cli.paper.document import document
-from mavfi_cli.paper.sources import gather
+from mavfi_cli.paper.sources import Evidence
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 _CAMPAIGNS = ("instruction", "effects-part2", "protected-part2", "hardening-part1", "sight-part1")
@@ -12,4 +12,4 @@ _CAMPAIGNS = ("instruction", "effects-part2", "protected-part2", "hardening-part
 def everything():
     """The whole document, made anew."""
     exports = [RESULTS / f"{name}.parquet" for name in _CAMPAIGNS]
-    return document(gather([*exports, RESULTS / "kernels.json"]))
+    return document(Evidence.gather([*exports, RESULTS / "kernels.json"]))

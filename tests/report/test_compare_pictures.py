@@ -8,7 +8,7 @@ import pytest
 from flown_twice import PLAN, figures_of
 from matplotlib.patches import Rectangle
 
-from mavfi_cli.report.compare_plot import draw_compare_plot, draw_timeline
+from mavfi_cli.report.compare_plot import PICTURES
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.studies.compare import ComparePlan
 
@@ -28,7 +28,7 @@ def bars(axes, colour=None):
     return [p for p in found if wanted is None or p.get_facecolor() == wanted]
 
 
-@pytest.mark.parametrize("draw", [draw_compare_plot, draw_timeline])
+@pytest.mark.parametrize("draw", PICTURES.values())
 def test_equal_comparisons_give_equal_bytes_whatever_the_settings(whole, tmp_path, draw):
     write_figure(draw(whole), tmp_path / "a.svg")
     with mpl.rc_context({"svg.hashsalt": "another", "svg.fonttype": "path"}):
@@ -38,7 +38,7 @@ def test_equal_comparisons_give_equal_bytes_whatever_the_settings(whole, tmp_pat
 
 
 def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
-    write_figure(draw_compare_plot(whole), tmp_path / "compare.svg")
+    write_figure(PICTURES["compare.svg"](whole), tmp_path / "compare.svg")
     said = texts(tmp_path / "compare.svg")
     assert "x86: Intel i9-9940X, the paper's host computer" in said
     assert any(text.startswith("tx2: Jetson TX2") for text in said)
@@ -49,25 +49,25 @@ def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
 
 
 def test_the_replans_stand_below_the_flights(whole):
-    said = [text.get_text() for text in draw_compare_plot(whole).axes[0].texts]
+    said = [text.get_text() for text in PICTURES["compare.svg"](whole).axes[0].texts]
     means = [row["quantities"]["replans"]["mean"]["value"] for row in whole["settings"]]
     assert [text for text in said if "replans" in text] == [f"{m:.1f} replans" for m in means]
 
 
 def test_the_worst_case_bars_are_as_high_as_the_numbers(whole):
-    worst = draw_compare_plot(whole).axes[4]
+    worst = PICTURES["compare.svg"](whole).axes[4]
     heights = [bar.get_height() for bar in bars(worst)]
     told = [row["over_own"]["largest"] for row in whole["costs"]]
     assert heights == pytest.approx([100.0 * (ratio - 1.0) for ratio in told])
 
 
 def test_success_bars_are_shares_in_per_cent(whole):
-    success = draw_compare_plot(whole).axes[1]
+    success = PICTURES["compare.svg"](whole).axes[1]
     assert [bar.get_height() for bar in bars(success)] == [100.0] * 8
 
 
 def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
-    response = draw_compare_plot(whole).axes[2]
+    response = PICTURES["compare.svg"](whole).axes[2]
     of_tx2 = [bar for bar in bars(response) if bar.get_y() > 0.5]
     assert sum(bar.get_width() for bar in of_tx2) == pytest.approx(1600.0)
     latency_s = whole["plan"]["platforms"][1]["kernel_latency_s"]
@@ -82,14 +82,14 @@ def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
 def test_nothing_flown_and_other_numbers_of_platforms_are_drawn_all_the_same(plan, tmp_path):
     told = {"plan": plan.told(), "errors": [], **figures_of(plan, []),
             "timeline": {"seed": 1, "platforms": []}}  # fmt: skip
-    write_figure(draw_compare_plot(told), tmp_path / "compare.svg")
-    write_figure(draw_timeline(told), tmp_path / "timeline.svg")
+    write_figure(PICTURES["compare.svg"](told), tmp_path / "compare.svg")
+    write_figure(PICTURES["timeline.svg"](told), tmp_path / "timeline.svg")
     assert "Success" in texts(tmp_path / "compare.svg")
     assert texts(tmp_path / "timeline.svg") == ["no flight answered a depth frame"]
 
 
 def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp_path):
-    write_figure(draw_timeline(whole), tmp_path / "timeline.svg")
+    write_figure(PICTURES["timeline.svg"](whole), tmp_path / "timeline.svg")
     said = texts(tmp_path / "timeline.svg")
     for kernel in (*KERNELS, "setpoint"):
         assert said.count(kernel) == 2, kernel
@@ -101,7 +101,7 @@ def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp
 
 
 def test_bars_lie_where_the_kernels_ran_on_one_axis_for_all(whole):
-    panels = draw_timeline(whole).axes
+    panels = PICTURES["timeline.svg"](whole).axes
     for axes, row in zip(panels, whole["timeline"]["platforms"], strict=True):
         assert axes.get_xlim() == (-0.05, 2.5)
         start, end = row["chain_s"]["octomap"]

@@ -8,7 +8,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.report.detectors import draw_recovery_plot
+from mavfi_cli.report import detectors, model
 from mavfi_cli.report.drawing import (
     DETECTORS,
     NONE,
@@ -17,7 +17,6 @@ from mavfi_cli.report.drawing import (
     detector_colours,
     write_figure,
 )
-from mavfi_cli.report.model import draw_redundancy_plot
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
 
@@ -60,12 +59,12 @@ def evaluated():
 
 
 def test_a_detector_looks_the_same_in_every_picture(evaluated):
-    shares, _ = draw_recovery_plot(evaluated).axes
+    shares, _ = detectors.PICTURES["recovery.svg"](evaluated).axes
     assert {to_hex(bar.get_facecolor()) for bar in shares.patches[:2]} == {
         DETECTORS["gad"], DETECTORS["aad"],
     }  # fmt: skip
     told = report([ModelVehicle.load("spark")], Choices(), SCHEMES)
-    (axes,) = draw_redundancy_plot(told).axes
+    (axes,) = model.PICTURES["redundancy.svg"](told).axes
     named = {
         container.get_label(): to_hex(container.patches[0].get_facecolor())
         for container in axes.containers
@@ -81,7 +80,7 @@ def test_a_detector_looks_the_same_in_every_picture(evaluated):
 
 def test_a_group_of_nothing_is_empty_and_says_so_once(evaluated):
     """Its tick has n = 0; where there were flights, and none succeeded, that is written."""
-    shares, times = draw_recovery_plot(evaluated).axes
+    shares, times = detectors.PICTURES["recovery.svg"](evaluated).axes
     assert [text.get_text() for text in shares.texts] == []
     assert [label.get_text() for label in shares.get_xticklabels()] == [
         "planning\nn = 4", "control\nn = 0",

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.drawing import DETECTORS, write_figure
-from mavfi_cli.report.top_view import Panel, draw_trajectories, lines
+from mavfi_cli.report.top_view import Trajectories
 
 SVG = "{http://www.w3.org/2000/svg}"
 FAULT = {"kind": "fault", "stamp_s": 9.0, "text": "", "position_enu_m": [3.0, 1.0, 5.0]}
@@ -40,19 +40,19 @@ def panels(golden):
     lost = faulty(golden, outcome="collision", shift_m=1.0)
     saved = faulty(golden, (FAULT, ALARM), shift_m=0.5, time_s=21.0, detection={"alarms": []})
     return [
-        Panel(title="a bit of x", flights=[("golden", golden), ("FI", faulty(golden))]),
-        Panel(title="a bit of y", flights=[("golden", golden), ("FI", lost), ("D&R", saved)]),
+        ("a bit of x", [("golden", golden), ("FI", faulty(golden))]),
+        ("a bit of y", [("golden", golden), ("FI", lost), ("D&R", saved)]),
     ]
 
 
 @pytest.fixture(scope="module")
 def figure(panels):
-    return draw_trajectories(panels)
+    return Trajectories(panels).draw()
 
 
 def test_the_svg_has_every_flight_and_says_what_became_of_it(panels, golden, tmp_path):
     path = tmp_path / "pair.svg"
-    write_figure(draw_trajectories(panels), path)
+    write_figure(Trajectories(panels).draw(), path)
     root = ET.parse(path).getroot()
     groups = {e.get("id"): e for e in root.iter(f"{SVG}g") if "flight-" in (e.get("id") or "")}
     assert set(groups) == {"flight-0-0", "flight-0-1", "flight-1-0", "flight-1-1", "flight-1-2"}
@@ -77,20 +77,20 @@ def test_the_svg_has_every_flight_and_says_what_became_of_it(panels, golden, tmp
 
 def test_equal_flights_give_equal_bytes(panels, tmp_path):
     for name in ("a.svg", "b.svg"):
-        write_figure(draw_trajectories(panels), tmp_path / name)
+        write_figure(Trajectories(panels).draw(), tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 
 
 def test_every_way_is_the_truth_of_its_flight(panels, figure):
-    for axes, panel in zip(figure.axes, panels, strict=True):
-        assert len(axes.lines) == len(panel.flights)
-        for line, (_, run) in zip(axes.lines, panel.flights, strict=True):
+    for axes, (_, flights) in zip(figure.axes, panels, strict=True):
+        assert len(axes.lines) == len(flights)
+        for line, (_, run) in zip(axes.lines, flights, strict=True):
             x, y = (run.trace[f"truth_{axis}_m"].to_numpy() for axis in "xy")
             np.testing.assert_array_equal(line.get_xydata(), np.column_stack([x, y]))
         widths = [line.get_linewidth() for line in axes.lines]
         assert widths == sorted(widths, reverse=True)  # those of one way are seen over each other
         boxes = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
-        assert len(boxes) == len(panel.flights[0][1].result["world"]["boxes"])
+        assert len(boxes) == len(flights[0][1].result["world"]["boxes"])
 
 
 def test_a_protected_flight_has_the_colour_of_its_detector(golden):
@@ -99,7 +99,7 @@ def test_a_protected_flight_has_the_colour_of_its_detector(golden):
                for name in ("gad", "aad")}  # fmt: skip
     flights = [("golden", golden), ("FI", faulty(golden)), ("D&R(G)", guarded["gad"]),
                ("D&R(A)", guarded["aad"]), ("D&R(A), 2", guarded["aad"])]  # fmt: skip
-    axes = draw_trajectories([Panel(title="", flights=flights)]).axes[0]
+    axes = Trajectories([("", flights)]).draw().axes[0]
     colours = [line.get_color() for line in axes.lines]
     assert colours[2:4] == [DETECTORS["gad"], DETECTORS["aad"]]
     assert len(set(colours)) == 5
@@ -128,7 +128,7 @@ def test_faults_and_alarms_have_the_colour_of_their_flight(figure):
 
 
 def test_it_is_told_in_words_too(panels, golden):
-    told = lines(panels)
+    told = Trajectories(panels).lines()
     assert told[:2] == ["posts, seed 2", "fault: a bit of x"]
     assert told[2].endswith(f" s  {golden.folder.path}")
     assert told[6].startswith("  FI: collision, 30.0 s  ")
@@ -139,17 +139,17 @@ def test_flights_without_a_trace_or_a_fault_are_drawn_all_the_same(golden, tmp_p
     cut = faulty(golden, outcome="crash", world=None)
     cut.result["quality_of_flight"] = dict.fromkeys(golden.result["quality_of_flight"])
     panels = [
-        Panel(title="", flights=[("golden", golden)]),
-        Panel(title="x", flights=[("fault", replace(cut, trace=None))]),
-        *[Panel(title="y", flights=[("golden", golden)])] * 2,
+        ("", [("golden", golden)]),
+        ("x", [("fault", replace(cut, trace=None))]),
+        *[("y", [("golden", golden)])] * 2,
     ]
-    write_figure(draw_trajectories(panels), tmp_path / "odd.svg")
+    write_figure(Trajectories(panels).draw(), tmp_path / "odd.svg")
     assert "fault: crash<" in (tmp_path / "odd.svg").read_text()
-    assert [axes.get_visible() and axes.axison for axes in draw_trajectories(panels).axes] == [
+    assert [axes.get_visible() and axes.axison for axes in Trajectories(panels).draw().axes] == [
         *[True] * 4, False, False,
     ]  # fmt: skip
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(panels, tmp_path):
     with pytest.raises(RecordError, match="its folder does not exist"):
-        write_figure(draw_trajectories(panels), tmp_path / "none" / "pair.svg")
+        write_figure(Trajectories(panels).draw(), tmp_path / "none" / "pair.svg")

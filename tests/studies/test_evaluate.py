@@ -11,10 +11,9 @@ from mavfi_cli.campaigns.detector_plans import EvaluationPlan
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.detectors import (
+    PICTURES,
     detector_csv,
     detector_lines,
-    draw_recovery_plot,
-    draw_roc_plot,
 )
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.studies.evaluate import told
@@ -99,16 +98,16 @@ def test_files(evaluation, pairs, tmp_path):
 
 
 def test_pictures_show_the_numbers(evaluation, tmp_path):
-    roc, precision = draw_roc_plot(evaluation).axes
+    roc, precision = PICTURES["roc.svg"](evaluation).axes
     curve, dot = roc.lines[0], roc.lines[1]
     assert list(curve.get_xdata())[:2] == [0.0, 0.0]
     assert list(curve.get_ydata())[:2] == [0.0, 1.0]
     assert (dot.get_xdata()[0], dot.get_ydata()[0]) == (0.25, 1.0)
     assert (precision.lines[1].get_xdata()[0], precision.lines[1].get_ydata()[0]) == (1.0, 2 / 3)
-    shares, times = draw_recovery_plot(evaluation).axes
+    shares, times = PICTURES["recovery.svg"](evaluation).axes
     assert [bar.get_height() for bar in shares.patches[:2]] == [50.0, 50.0]  # all, control
     assert len(times.patches) == 4  # none and gad in two worlds
-    for draw, name in ((draw_roc_plot, "roc.svg"), (draw_recovery_plot, "recovery.svg")):
+    for draw, name in ((each, name) for name, each in PICTURES.items()):
         write_figure(draw(evaluation), tmp_path / name)
         first = (tmp_path / name).read_bytes()
         write_figure(draw(evaluation), tmp_path / name)
@@ -121,7 +120,7 @@ def test_an_evaluation_without_harm_has_no_curve():
     none = pa.table({"stage": [], "field": [], "score": []})
     empty = told(PLAN, (table(free), table([])), [], lambda _: (none, [0.5]))
     assert "Faults" not in "\n".join(detector_lines(empty))
-    assert not draw_roc_plot(empty).axes[0].lines[:-1]
+    assert not PICTURES["roc.svg"](empty).axes[0].lines[:-1]
     assert flown()["succeeded"]
 
 

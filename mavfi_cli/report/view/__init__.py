@@ -152,7 +152,6 @@ def _notes(flight: ViewedFlight) -> Iterator[Entry]:
 
 
 def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
-    """The positions of all events of a kind so far, at each of them."""
     places: list[Sequence[float]] = []
     for event in flight.run.record.events:
         if event["kind"] == kind and event["position_enu_m"]:
@@ -176,7 +175,6 @@ def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
 
 
 def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
-    """The path flown so far, again and again."""
     stamps = trace["stamp_s"].to_numpy()
     places = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
     last = len(stamps) - 1

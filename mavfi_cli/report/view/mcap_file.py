@@ -33,13 +33,13 @@ from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
+from matplotlib.colors import to_rgb
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from mavfi_cli.core.files import plain, write_atomically
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
-from mavfi_cli.report.drawing import rgb
 from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _STATES = "mavfi.States"  # schema of the states of a tick
@@ -94,7 +94,6 @@ def _encoded(message: Message | dict[str, Any]) -> bytes:
 def _channel(
     writer: Writer, schemas: dict[str, int], topic: str, message: Message | dict[str, Any]
 ) -> int:
-    """Register the channel of a topic, and the schema of its messages if it is new."""
     if isinstance(message, Message):
         encoding, name = "protobuf", message.DESCRIPTOR.full_name
         if name not in schemas:
@@ -108,7 +107,6 @@ def _channel(
 
 
 def _schema(message: dict[str, Any]) -> bytes:
-    """Return the JSON schema of an object of numbers."""
     properties = {name: {"type": ["number", "boolean", "null"]} for name in message}
     return json.dumps({"type": "object", "properties": properties}).encode()
 
@@ -150,12 +148,11 @@ def _timestamp(entry: Entry) -> Timestamp:
 
 
 def _colour(colour: str) -> Color:
-    red, green, blue = rgb(colour)
+    red, green, blue = to_rgb(colour)
     return Color(r=red, g=green, b=blue, a=1.0)
 
 
 def _pose(position: FloatArray, quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)) -> PoseMessage:
-    """Return a pose from a position (3,) and a quaternion w x y z."""
     return PoseMessage(position=_vector(position), orientation=_turn(quaternion))
 
 

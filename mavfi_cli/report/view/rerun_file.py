@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from matplotlib.colors import to_rgb
 
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage, of_stage
-from mavfi_cli.report.drawing import rgb
 from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _TIME = "simulated_time"
@@ -49,7 +49,7 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
     recording.send_blueprint(_blueprint(flights))
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for flight in flights:
-        body = rr.Boxes3D(half_sizes=[_BODY_M], colors=[rgb(flight.colour)], fill_mode="solid")
+        body = rr.Boxes3D(half_sizes=[_BODY_M], colors=[to_rgb(flight.colour)], fill_mode="solid")
         recording.log(f"{flight.name}/vehicle", body, static=True)
     _log_entries(recording, entries_of(flights), {f"{each.name}/states": each for each in flights})
 
@@ -79,7 +79,7 @@ def _log_entries(
                 flight = drawn[path]
                 width = _FAULTY_WIDTH if flight.run.record.fault else _WIDTH
                 line = rr.SeriesLines(
-                    colors=[rgb(flight.colour)], widths=[width], names=[f"{flight.name} {name}"]
+                    colors=[to_rgb(flight.colour)], widths=[width], names=[f"{flight.name} {name}"]
                 )
                 recording.log(f"{path}/{name}", line, static=True)
                 time = rr.TimeColumn(_TIME, duration=stamps)
@@ -88,7 +88,7 @@ def _log_entries(
 
 def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
     """What rerun logs of an entry, with the path of each part."""
-    data, colours = entry.data, [rgb(entry.colour)] if entry.colour else None
+    data, colours = entry.data, [to_rgb(entry.colour)] if entry.colour else None
     shown: Any
     match entry.kind:
         case "boxes":
@@ -175,7 +175,6 @@ def _eye(flight: ViewedFlight) -> Any:
 
 
 def _groups(stage: Stage) -> dict[str, Sequence[str]]:
-    """Return the states of a stage by the group that one plot shows."""
     groups: dict[str, Sequence[str]] = {}
     for state in of_stage(stage):
         groups[state.group] = (*groups.get(state.group, ()), state.name)
