@@ -12,7 +12,7 @@ import click
 
 from mavfi_cli.core.errors import MavfiError
 
-CONTEXT = {"help_option_names": ["-h", "--help"]}
+CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True}
 Triple = tuple[float, ...]
 
 
@@ -32,7 +32,7 @@ class Place(click.ParamType[Triple]):
         return place
 
 
-class Size(click.ParamType[tuple[int, int]]):
+class _Size(click.ParamType[tuple[int, int]]):
     """Columns and rows of an image."""
 
     name = "COLSxROWS"
@@ -47,24 +47,86 @@ class Size(click.ParamType[tuple[int, int]]):
         return int(columns), int(rows)
 
 
-key_file = click.option(
-    "--key-file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="File with the signing passphrase.",
-)
-allow_unsigned = click.option(
-    "--allow-unsigned", is_flag=True, help="Allow unsigned links beyond this machine."
-)
-camera_heartbeat = click.option(
-    "--camera-heartbeat",
-    "camera_heartbeat_hz",
-    type=click.FloatRange(0.0, 50.0),
-    default=1.0,
-    show_default=True,
-    help="Rate of the camera's heartbeats, Hz. 0 turns them off for MAVProxy, which mistakes the "
-    "camera for a second vehicle.",
-)
+class Positive(click.ParamType[float]):
+    """A finite number above 0."""
+
+    name = "X"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """Return the number, or fail with a usage error."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not 0.0 < number < math.inf:
+            self.fail(f"{value!r} is not a number above 0", param, ctx)
+        return number
+
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def _options(*each: Decorator) -> Decorator:
+    """Return one decorator for several options, in their order."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(each):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+places = _options(
+    click.option("--seed", type=click.IntRange(min=0), default=3, help="Seed of the world."),
+    click.option("--start", "start_enu_m", type=Place(), help="Start, ENU m. See --goal."),
+    click.option(
+        "--goal", "goal_enu_m", type=Place(),
+        help="Goal, ENU m. A generated world is built around start and goal: other positions move "
+        "its bounds, and towers within 3 m of them are left out.",
+    ),
+)  # fmt: skip
+world_and_vehicle = _options(
+    click.option(
+        "--world", default="dense", metavar="NAME|FILE",
+        help="World: a name of `mavfi world list`, gen:density,size or a TOML file.",
+    ),
+    places,
+    click.option(
+        "--vehicle", default="solo", metavar="NAME|FILE", help="Vehicle: a name or a TOML file."
+    ),
+)  # fmt: skip
+
+
+def camera_options(prefix: str = "") -> Decorator:
+    """Return the options of the depth camera; some names begin with a prefix."""
+    return _options(
+        click.option(
+            f"--{prefix}size", "camera_size", type=_Size(), default="64x48",
+            help="Size of the depth image, pixels.",
+        ),
+        click.option(
+            f"--{prefix}rate", "camera_rate_hz", type=Positive(), default=10.0,
+            help="Frame rate for clients that ask for no interval, Hz.",
+        ),
+        click.option(
+            "--camera-heartbeat", "camera_heartbeat_hz", type=click.FloatRange(0.0, 50.0),
+            default=1.0,
+            help="Rate of the camera's heartbeats, Hz. 0 turns them off for MAVProxy, which "
+            "mistakes the camera for a second vehicle.",
+        ),
+    )  # fmt: skip
+
+
+signing = _options(
+    click.option(
+        "--key-file", type=click.Path(path_type=Path), metavar="FILE",
+        help="File with the signing passphrase.",
+    ),
+    click.option(
+        "--allow-unsigned", is_flag=True, help="Allow unsigned links beyond this machine."
+    ),
+)  # fmt: skip
 
 
 def stop_on_signals() -> Callable[[], bool]:

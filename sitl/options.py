@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +10,7 @@ from typing import Any
 import click
 
 from sitl.autopilot.telemetry import Preset
-from sitl.command_line import (
-    CONTEXT,
-    Place,
-    Size,
-    Triple,
-    allow_unsigned,
-    camera_heartbeat,
-    key_file,
-)
+from sitl.command_line import CONTEXT, Positive, Triple, camera_options, signing, world_and_vehicle
 
 _FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
@@ -50,22 +40,6 @@ class _Link(click.ParamType[tuple[Preset, str]]):
         return Preset(name), url
 
 
-class _Positive(click.ParamType[float]):
-    """A finite number above 0."""
-
-    name = "X"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the number, or fail with a usage error."""
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not 0.0 < number < math.inf:
-            self.fail(f"{value!r} is not a number above 0", param, ctx)
-        return number
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerOptions:
     """The parsed options of the user."""
@@ -78,7 +52,6 @@ class ServerOptions:
     links: Sequence[tuple[Preset, str]]
     fd: int | None
     lockstep: bool
-    realtime: bool
     speed: float | None  # None: no limit, in lockstep only
     answer_limit_s: float
     truth: Path | None
@@ -96,22 +69,7 @@ class ServerOptions:
 
 
 @click.command(context_settings=CONTEXT)
-@click.option(
-    "--world",
-    default="dense",
-    show_default=True,
-    help="World: a name, gen:density,size or a TOML file.",
-)
-@click.option("--seed", type=int, default=3, show_default=True, help="Seed of the world.")
-@click.option(
-    "--vehicle", default="solo", show_default=True, help="Vehicle: a name or a TOML file."
-)
-@click.option("--start", "start_enu_m", type=Place(), help="Start, ENU m. See --goal.")
-@click.option(
-    "--goal", "goal_enu_m", type=Place(),
-    help="Goal, ENU m. A generated world is built around start and goal: other positions move its "
-    "bounds, and towers within 3 m of them are left out.",
-)  # fmt: skip
+@world_and_vehicle
 @click.option(
     "--link", "links", type=_Link(), multiple=True,
     help="Endpoint; repeatable. Presets: onboard, gcs, lockstep.  "
@@ -121,29 +79,19 @@ class ServerOptions:
 @click.option("--lockstep", is_flag=True, help="Wait for the companion on --fd at every tick.")
 @click.option("--realtime", is_flag=True, help="The same as --speed 1.")
 @click.option(
-    "--speed",
-    type=_Positive(),
+    "--speed", type=Positive(),
     help="Speed, in times real time  [1; in lockstep as fast as possible].",
-)
+)  # fmt: skip
 @click.option(
-    "--answer-limit", "answer_limit_s", type=_Positive(), default=120.0, show_default=True,
+    "--answer-limit", "answer_limit_s", type=Positive(), default=120.0,
     help="Time that the companion in lockstep may take for a tick, s.",
 )  # fmt: skip
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder for the referee's truth.")
+@camera_options("camera-")
 @click.option(
-    "--camera-size", type=Size(), default="64x48", show_default=True, help="Depth image, pixels."
+    "--sysid", "system_id", type=click.IntRange(1, 255), default=1, help="MAVLink system id."
 )
-@click.option(
-    "--camera-rate", "camera_rate_hz", type=_Positive(), default=10.0, show_default=True,
-    help="Frame rate for clients that ask for no interval, Hz.",
-)  # fmt: skip
-@camera_heartbeat
-@click.option(
-    "--sysid", "system_id", type=click.IntRange(1, 255), default=1, show_default=True,
-    help="MAVLink system id.",
-)  # fmt: skip
-@key_file
-@allow_unsigned
+@signing
 @click.option("--hil", type=click.Choice(["px4"]), help="PX4 flies, on its simulator link (TCP).")
 @click.option(
     "--json", "json_backend", type=click.Choice(["ardupilot"]),
@@ -154,11 +102,11 @@ class ServerOptions:
     help="SITL binary to start  [none: you start it yourself].",
 )  # fmt: skip
 @click.option(
-    "--firmware-link", metavar="URL", default=_FIRMWARE_LINK, show_default=True,
+    "--firmware-link", metavar="URL", default=_FIRMWARE_LINK,
     help="Endpoint to which a firmware that you start yourself sends its MAVLink.",
 )  # fmt: skip
 @click.option(
-    "--firmware-seed", type=click.IntRange(min=0), default=1, show_default=True,
+    "--firmware-seed", type=click.IntRange(min=0), default=1,
     help="Seed of the noise of the firmware's sensors.",
 )  # fmt: skip
 @click.option(
@@ -177,39 +125,25 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
         click.exceptions.Exit: It asks for help, which is printed.
     """
     given = _sitl.make_context("mavfi sitl", list(arguments)).params
-    kind = _firmware_kind(given)
-    options = ServerOptions(**given, firmware_kind=kind)
-    links, speed = options.links, 1.0 if options.realtime else options.speed
-    if options.realtime and options.speed is not None:
-        raise click.UsageError("--realtime and --speed exclude each other")
-    if options.lockstep:
-        if options.fd is None:
-            raise click.UsageError("--lockstep needs --fd")
-        if links:
-            raise click.UsageError("--lockstep serves the companion on --fd only, without --link")
-    elif options.fd is not None:
-        links = [*links, (Preset.LOCKSTEP, f"fd:{options.fd}")]
-    elif not links:
-        urls = _DEFAULT_LINKS if options.firmware_kind is None else _FIRMWARE_LINKS
+    hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))
+    kind, lockstep, fd = hil or backend, given["lockstep"], given["fd"]
+    links, speed = given.pop("links"), given.pop("speed")
+    for is_wrong, problem in (
+        (hil and backend, "--hil and --json exclude each other"),
+        (given["firmware"] and not kind, "--firmware needs --hil or --json"),
+        (kind and given["trusted"], "--trust is for our own autopilot"),
+        (kind and lockstep, "--lockstep is for our own autopilot"),
+        (realtime and speed is not None, "--realtime and --speed exclude each other"),
+        (lockstep and fd is None, "--lockstep needs --fd"),
+        (lockstep and links, "--lockstep serves the companion on --fd only, without --link"),
+    ):
+        if is_wrong:
+            raise click.UsageError(problem)
+    if realtime or not lockstep:
+        speed = speed or 1.0
+    if not lockstep and fd is not None:
+        links = [*links, (Preset.LOCKSTEP, f"fd:{fd}")]
+    elif not lockstep and not links:
+        urls = _FIRMWARE_LINKS if kind else _DEFAULT_LINKS
         links = [_Link().convert(url, None, None) for url in urls]
-    if speed is None and not options.lockstep:
-        speed = 1.0
-    return dataclasses.replace(options, links=links, speed=speed)
-
-
-def _firmware_kind(given: dict[str, Any]) -> str | None:
-    """Return the firmware that flies, and remove its two options.
-
-    Raises:
-        click.UsageError: The options contradict each other.
-    """
-    named = [name for name in (given.pop("hil"), given.pop("json_backend")) if name is not None]
-    if len(named) > 1:
-        raise click.UsageError("--hil and --json exclude each other")
-    if not named and given["firmware"] is not None:
-        raise click.UsageError("--firmware needs --hil or --json")
-    if named and given["trusted"]:
-        raise click.UsageError("--trust is for our own autopilot")
-    if named and given["lockstep"]:
-        raise click.UsageError("--lockstep is for our own autopilot")
-    return named[0] if named else None
+    return ServerOptions(**given, links=links, speed=speed, firmware_kind=kind)

@@ -136,10 +136,7 @@ class Simulation:
             RecordError: A file cannot be written.
         """
         truth = self.vehicle.truth
-        energies = {
-            "regression": truth.energy_regression_j,
-            "propeller": truth.energy_propeller_j,
-        }
+        energies = {"regression": truth.energy_regression_j, "propeller": truth.energy_propeller_j}
         self.referee.save(folder, energies)
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         host = {"stage_wall_s": self.wall.totals, "memory_mb": memory_mb}
@@ -175,16 +172,9 @@ class Simulation:
         )
         if collision is not None:
             commander.terminate(collision.text)
-        if self._wreck is None and commander.terminated and _has_come_down(truth):
+        place, rates = truth.position_ned_m, truth.rates_frd_radps
+        is_down = truth.on_ground or place[2] > -_GROUND_M
+        if self._wreck is None and commander.terminated and is_down:
             self._wreck = truth.wreck()
-        if not _is_believable(truth):
+        if not (place @ place < _FARTHEST_M**2 and rates @ rates < _FASTEST_RADPS**2):
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
-
-
-def _is_believable(truth: Truth) -> bool:
-    place, rates = truth.position_ned_m, truth.rates_frd_radps
-    return float(place @ place) < _FARTHEST_M**2 and float(rates @ rates) < _FASTEST_RADPS**2
-
-
-def _has_come_down(truth: Truth) -> bool:
-    return truth.on_ground or bool(truth.position_ned_m[2] > -_GROUND_M)

@@ -76,13 +76,7 @@ class Signing:
         ValueError: The key does not have 32 bytes, or the link id is out of range.
     """
 
-    def __init__(
-        self,
-        key: bytes,
-        clock: Callable[[], float],
-        *,
-        link_id: int = 0,
-    ) -> None:
+    def __init__(self, key: bytes, clock: Callable[[], float], *, link_id: int = 0) -> None:
         if len(key) != 32:
             raise ValueError(f"a signing key has 32 bytes, not {len(key)}")
         if not 0 <= link_id <= 255:
@@ -165,15 +159,7 @@ _V1_HEADER, _V2_HEADER = 6, 10  # bytes
 _V1_HEAD, _V2_HEAD = struct.Struct("<BBBBB"), struct.Struct("<BBBBBBHB")
 
 
-def _slow_crc(data: bytes, initial: int = 0xFFFF) -> int:
-    crc = dialect.x25crc()
-    crc.crc = initial
-    crc.accumulate(data)
-    return int(crc.crc)
-
-
-# CRC-16/MCRF4XX. pymavlink prefers the compiled implementation, but does not need it.
-_crc: Callable[..., int] = dialect.mcrf4xx or _slow_crc
+_crc: Callable[..., int] = dialect.mcrf4xx  # CRC-16/MCRF4XX, compiled
 
 # A further byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]. This is the table.
 _CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
@@ -201,9 +187,9 @@ class _Kind:
         kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
         names = cls.ordered_fieldnames
         texts = [kinds[name] == "char" for name in names]
-        self._columns = _getter(
-            [f"_{name}_raw" if text else name for name, text in zip(names, texts, strict=True)]
-        )
+        attributes = [f"_{n}_raw" if text else n for n, text in zip(names, texts, strict=True)]
+        get: Callable[[Any], Any] = attrgetter(*attributes)
+        self._columns = get if len(names) > 1 else lambda source: (get(source),)
         self._texts = [place for place, text in enumerate(texts) if text]
         self._arrays = [
             (place, length, kinds[name] == "uint8_t")
@@ -238,12 +224,6 @@ class _Kind:
         for place in self._texts:
             values[place] = values[place].rstrip(b"\0")
         return values
-
-
-def _getter(names: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
-    """Return a function from an object to its attributes, which may also be a single one."""
-    get: Callable[[Any], Any] = attrgetter(*names)
-    return get if len(names) > 1 else lambda source: (get(source),)
 
 
 def _received(cls: Any) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from enum import Enum
 from typing import NoReturn
 
 from mavfi_cli.core.errors import CommandRefused
@@ -38,13 +37,6 @@ _HOME_INTERVAL_S = 1.0
 _WARNING = dialect.MAV_SEVERITY_WARNING
 
 
-class _CommandState(Enum):
-    PENDING = "pending"
-    ACCEPTED = "accepted"
-    REFUSED = "refused"
-    UNANSWERED = "no answer"
-
-
 @dataclass(slots=True, kw_only=True)
 class Ticket:
     """A submitted command."""
@@ -53,8 +45,8 @@ class Ticket:
     component: int
     parameters: tuple[float, ...]
     refusals_left: int
-    verdict: _CommandState = _CommandState.PENDING
-    result: str = _CommandState.UNANSWERED.value  # the peer's answer in words
+    accepted: bool | None = None  # None until it is decided; False if refused or given up
+    result: str = "no answer"  # the peer's answer in words
     sent: int = 0
     sent_since_answer: int = 0
     due_s: float = -1.0
@@ -62,7 +54,7 @@ class Ticket:
     @property
     def pending(self) -> bool:
         """True until the command is accepted, refused or given up."""
-        return self.verdict is _CommandState.PENDING
+        return self.accepted is None
 
 
 class Commands:
@@ -111,7 +103,7 @@ class Commands:
         )
         lane = self._lanes.setdefault((component, command), deque())
         if len(lane) >= _MAX_WAITING:
-            ticket.verdict = _CommandState.UNANSWERED
+            ticket.accepted = False
         else:
             lane.append(ticket)
         return ticket
@@ -131,12 +123,12 @@ class Commands:
         if message.result == dialect.MAV_RESULT_IN_PROGRESS:
             ticket.due_s = self.now_s + PROGRESS_TIMEOUT_S
         elif message.result == dialect.MAV_RESULT_ACCEPTED:
-            self._close(lane, _CommandState.ACCEPTED)
+            lane.popleft().accepted = True
         elif message.result in _PASSING and ticket.refusals_left > 0:
             ticket.refusals_left -= 1
             ticket.due_s = self.now_s + REFUSAL_PAUSE_S
         else:
-            self._close(lane, _CommandState.REFUSED)
+            lane.popleft().accepted = False
 
     def poll(self, system: int) -> list[Message]:
         """Return the commands that are due now, addressed to `system`."""
@@ -147,7 +139,7 @@ class Commands:
                 if ticket.sent_since_answer < TRIES:
                     due.append(self._send(ticket, system))
                     break
-                self._close(lane, _CommandState.UNANSWERED)
+                lane.popleft().accepted = False
         return due
 
     def _send(self, ticket: Ticket, system: int) -> Message:
@@ -158,10 +150,6 @@ class Commands:
         return dialect.MAVLink_command_long_message(
             system, ticket.component, ticket.command, confirmation, *ticket.parameters
         )
-
-    @staticmethod
-    def _close(lane: deque[Ticket], verdict: _CommandState) -> None:
-        lane.popleft().verdict = verdict
 
     # Requests of the present phase
 
@@ -207,7 +195,7 @@ class Commands:
         if self._decided_s is None:
             self._decided_s = self.now_s
         waited_s = self.now_s - self._decided_s
-        if ticket.verdict is _CommandState.ACCEPTED:
+        if ticket.accepted:
             if waited_s >= _EFFECT_S:
                 self._ticket = None
             return True

@@ -38,20 +38,6 @@ _DEPTH_M = np.array([*(DEPTH_UNIT_M * level for level in range(NOTHING)), math.i
 _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
 
-def _hfov_of(message: Message) -> float | None:
-    """Return the horizontal field of view in a camera's message, rad; None if there is none.
-
-    CAMERA_INFORMATION gives 2 atan(sensor width / 2 focal length), CAMERA_FOV_STATUS degrees.
-    """
-    if isinstance(message, dialect.MAVLink_camera_information_message):
-        if message.focal_length > 0.0 and 0.0 < message.sensor_size_h < math.inf:
-            return 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
-        return None
-    if isinstance(message, dialect.MAVLink_camera_fov_status_message) and 0 < message.hfov < 180:
-        return math.radians(message.hfov)
-    return None
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageFrame:
     """A complete image from the camera."""
@@ -184,9 +170,9 @@ class ImageReceiver:
         return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
-        hfov_rad = _hfov_of(message)
-        if hfov_rad is not None:
-            self.hfov_rad = hfov_rad
+        """Take 2 atan(sensor width / 2 focal length) of a CAMERA_INFORMATION."""
+        if message.focal_length > 0.0 and 0.0 < message.sensor_size_h < math.inf:
+            self.hfov_rad = 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
         return []
 
     def _captured(self, message: Message) -> list[ImageFrame]:
@@ -316,7 +302,6 @@ _HANDLERS: dict[int, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
     dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE: ImageReceiver._handshake,
     dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED: ImageReceiver._captured,
     dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: ImageReceiver._field_of_view,
-    dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: ImageReceiver._field_of_view,
 }
 IMAGE_MESSAGES = frozenset(_HANDLERS)  # ids of the messages that a receiver takes
 

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,10 +55,7 @@ class _AutopilotProfile:
 _PROFILES, _ = read_toml(Path(__file__).with_name("autopilots.toml"))
 PX4, ARDUCOPTER = (_AutopilotProfile(**_PROFILES[each]) for each in ("px4", "ardupilot"))
 
-_PROFILES = {
-    dialect.MAV_AUTOPILOT_PX4: PX4,
-    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUCOPTER,
-}
+_PROFILES = {dialect.MAV_AUTOPILOT_PX4: PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUCOPTER}
 _COPTERS = (
     dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_COAXIAL, dialect.MAV_TYPE_HELICOPTER,
     dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR, dialect.MAV_TYPE_TRICOPTER,
@@ -119,8 +117,6 @@ def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> Vehic
 
 
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
-
-
 _IN_AIR = (
     dialect.MAV_LANDED_STATE_IN_AIR,
     dialect.MAV_LANDED_STATE_TAKEOFF,
@@ -134,17 +130,16 @@ _PATIENCE_S = 1.0  # maximum wait for missing chunks
 _GAP = "[...]"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Text:
+class _Text(NamedTuple):
     """A complete text of a component."""
 
-    stamp_s: float  # arrival of its last chunk
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
     text: str
 
 
-@dataclass(slots=True, kw_only=True)
-class _Open:
+class _Open(NamedTuple):
+    """A text of which chunks have come, by their numbers."""
+
     severity: int
     started_s: float
     chunks: dict[int, str]
@@ -174,36 +169,36 @@ class _TextCollector:
     def add(self, message: Message, stamp_s: float) -> list[_Text]:
         """Handle a STATUSTEXT. Return the texts that are complete now."""
         if message.id == 0:
-            return [self._emit(stamp_s, message.severity, message.text)]
+            return [self._emit(message.severity, message.text)]
         done = []
         key = (message.get_srcSystem(), message.get_srcComponent(), message.id)
         if key not in self.open:
             if len(self.open) >= _MAX_OPEN:
-                done.append(self._finish(next(iter(self.open)), stamp_s))
-            self.open[key] = _Open(severity=message.severity, started_s=stamp_s, chunks={})
+                done.append(self._finish(next(iter(self.open))))
+            self.open[key] = _Open(message.severity, stamp_s, {})
         chunks = self.open[key].chunks
         chunks[message.chunk_seq] = message.text
         last = max(chunks)
         if len(chunks[last]) < CHUNK_LENGTH and len(chunks) == last + 1:
-            done.append(self._finish(key, stamp_s))
+            done.append(self._finish(key))
         return done
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
         """Close and return texts with chunks missing for longer than the patience, with a gap."""
         late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
-        return [self._finish(key, stamp_s) for key in late]
+        return [self._finish(key) for key in late]
 
-    def _finish(self, key: tuple[int, int, int], stamp_s: float) -> _Text:
+    def _finish(self, key: tuple[int, int, int]) -> _Text:
         part = self.open.pop(key)
         last = max(part.chunks)
         text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
         if len(part.chunks[last]) >= CHUNK_LENGTH:
             text += _GAP
-        return self._emit(stamp_s, part.severity, text)
+        return self._emit(part.severity, text)
 
-    def _emit(self, stamp_s: float, severity: int, text: str) -> _Text:
+    def _emit(self, severity: int, text: str) -> _Text:
         self.total += 1
-        self.texts.append(_Text(stamp_s=stamp_s, severity=severity, text=text.strip()))
+        self.texts.append(_Text(severity, text.strip()))
         return self.texts[-1]
 
 

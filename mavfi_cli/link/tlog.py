@@ -47,22 +47,23 @@ def unix_time_of_stamp_0(path: Path) -> float:
 class _TlogWriter:
     """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
 
-    Args:
-        path: File to create or overwrite.
-        epoch_unix_s: Unix time of stamp 0.
+    What is written before `open` waits for it. Every method may raise RecordError.
 
-    Raises:
-        RecordError: The file cannot be written, here or in any method.
+    Args:
+        epoch_unix_s: Unix time of stamp 0.
     """
 
-    def __init__(self, path: Path, epoch_unix_s: int = EPOCH_UNIX_S) -> None:
-        self._path = path
+    def __init__(self, epoch_unix_s: int) -> None:
         self._epoch_us = epoch_unix_s * 1_000_000
         self._pending: list[bytes] = []
         self._pending_bytes = 0
         self._whole = 0  # length of the whole records in the file, bytes
         self._flushed_s = 0.0
         self._descriptor: int | None = None
+
+    def open(self, path: Path) -> None:
+        """Create or overwrite the file."""
+        self._path = path
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
@@ -81,29 +82,20 @@ class _TlogWriter:
 
     def flush(self) -> None:
         """Write pending records to the file, each whole or not at all."""
-        data = memoryview(b"".join(self._pending))
-        self._pending, self._pending_bytes = [], 0
         if self._descriptor is None:
             return
-        written = 0
+        data, written = memoryview(b"".join(self._pending)), 0
+        self._pending, self._pending_bytes = [], 0
         try:
             while written < len(data):
                 written += os.write(self._descriptor, data[written:])
         except OSError as error:
-            self._take_back()
+            descriptor, self._descriptor = self._descriptor, None
+            with contextlib.suppress(OSError):  # a pipe or device cannot be truncated
+                os.ftruncate(descriptor, self._whole)  # a record did not fit on the disk
+            os.close(descriptor)
             raise self._error(error) from None
         self._whole += written
-
-    def _take_back(self) -> None:
-        """Remove a record that did not fit on the disk, and stop writing."""
-        assert self._descriptor is not None
-        descriptor, self._descriptor = self._descriptor, None
-        try:
-            os.ftruncate(descriptor, self._whole)
-        except OSError:  # a pipe or device cannot be truncated
-            pass
-        finally:
-            os.close(descriptor)
 
     def close(self) -> None:
         """Flush and close. May be called repeatedly."""
@@ -140,8 +132,7 @@ class RecordedLink:
         self._transport = transport
         self._clock = clock
         self._codec = Codec(system, component, signing=signing)
-        self._tlog: _TlogWriter | None = None
-        self._early: list[tuple[float, list[bytes]]] = []
+        self._tlog = _TlogWriter(EPOCH_UNIX_S if clock is None else 0)
 
     @contextlib.contextmanager
     def recording(self, path: Path) -> Iterator[None]:
@@ -150,11 +141,8 @@ class RecordedLink:
         Raises:
             RecordError: The file cannot be written, now or at any later message.
         """
-        epoch_unix_s = EPOCH_UNIX_S if self._clock is None else 0
-        with contextlib.closing(_TlogWriter(path, epoch_unix_s)) as self._tlog:
-            for stamp_s, frames in self._early:
-                self._tlog.write(stamp_s, *frames)
-            self._early.clear()
+        self._tlog.open(path)
+        with contextlib.closing(self._tlog):
             yield
 
     @property
@@ -192,9 +180,4 @@ class RecordedLink:
             self._transport.send(b"".join(frames))
 
     def _record(self, stamp_s: float, frames: list[bytes]) -> None:
-        if self._clock is not None:
-            stamp_s = self._clock()
-        if self._tlog is None:
-            self._early.append((stamp_s, frames))
-        else:
-            self._tlog.write(stamp_s, *frames)
+        self._tlog.write(stamp_s if self._clock is None else self._clock(), *frames)

@@ -11,13 +11,7 @@ import numpy as np
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect, text_messages
 from sitl.autopilot import services
-from sitl.autopilot.commander import (
-    GPS_FIX_US,
-    Commander,
-    FlightMode,
-    Result,
-    Severity,
-)
+from sitl.autopilot.commander import GPS_FIX_US, Commander, FlightMode, Result, Severity
 from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.telemetry import Link, Preset, Setpoint, Snapshot, no_setpoint
@@ -46,13 +40,7 @@ class Autopilot:
         restart_asked: True once a client has asked for a reboot. The owner restarts.
     """
 
-    def __init__(
-        self,
-        truth: Truth,
-        *,
-        system_id: int = 1,
-        trusted: Sequence[int] = (),
-    ) -> None:
+    def __init__(self, truth: Truth, *, system_id: int = 1, trusted: Sequence[int] = ()) -> None:
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)

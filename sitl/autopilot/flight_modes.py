@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from enum import Enum, auto
 
 import numpy as np
 
@@ -71,8 +70,6 @@ def _limit_velocity(out: Setpoint, parameters: Parameters) -> None:
 class _Anchor:
     """A position hold that brakes first, then keeps the point of rest."""
 
-    __slots__ = ("_axes", "_place")
-
     def __init__(self, axes: slice, place: Vector | None = None) -> None:
         self._axes = axes
         self._place = place
@@ -89,60 +86,54 @@ class _Anchor:
         out[0:3][axes] = self._place
 
 
-class _Hold:
-    """AUTO.LOITER: flies to a position, if given, and stays there."""
+def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guidance:
+    """AUTO.LOITER: flies straight to a distant position, if given, and stays there."""
+    anchor = _Anchor(_ALL_AXES, target_ned_m)
 
-    def __init__(self, target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> None:
-        self._target = target_ned_m
-        self._yaw_rad = yaw_rad
-        self._anchor = _Anchor(_ALL_AXES, target_ned_m)
-
-    def fly(self, now: Snapshot, out: Setpoint) -> None:
-        """Fly straight to a distant position, otherwise hold."""
-        out[9] = self._yaw_rad
-        if self._target is not None:
-            delta = self._target - now.truth.position_ned_m
+    def fly(now: Snapshot, out: Setpoint) -> None:
+        out[9] = yaw_rad
+        if target_ned_m is not None:
+            delta = target_ned_m - now.truth.position_ned_m
             if float(delta @ delta) > _ARRIVED_M**2:
                 _go(now, out, delta)
                 return
-        self._anchor.hold(now, out)
+        anchor.hold(now, out)
+
+    return fly
 
 
-class _Takeoff:
-    """AUTO.TAKEOFF: climbs straight to a height, then has it held, but 0.5 m lower at most."""
+def _take_off(target_down_m: float, finished: Callable[[Vector], None]) -> Guidance:
+    """AUTO.TAKEOFF: climbs straight to a height, then has it held, but 0.5 m lower at most.
 
-    def __init__(self, target_down_m: float, finished: Callable[[Vector], None]) -> None:
-        self._target_down_m = target_down_m
-        self._finished = finished
-        self._anchor = _Anchor(_HORIZONTAL)
-        self._climbing_s = 0.0
+    Its speed ramps up over MPC_TKO_RAMP_T.
+    """
+    anchor, climbing_s = _Anchor(_HORIZONTAL), 0.0
 
-    def fly(self, now: Snapshot, out: Setpoint) -> None:
-        """Climb at a speed that ramps up over MPC_TKO_RAMP_T."""
-        self._anchor.hold(now, out)
-        delta = self._target_down_m - float(now.truth.position_ned_m[2])
+    def fly(now: Snapshot, out: Setpoint) -> None:
+        nonlocal climbing_s
+        anchor.hold(now, out)
+        delta = target_down_m - float(now.truth.position_ned_m[2])
         if not now.commander.landed and delta > -_TAKEOFF_NEAR_M:
-            out[2] = self._target_down_m
+            out[2] = target_down_m
             place = np.array(now.truth.position_ned_m)
-            place[2] = min(self._target_down_m, float(place[2]) + 0.5)
-            self._finished(place)
+            place[2] = min(target_down_m, float(place[2]) + 0.5)
+            finished(place)
             return
         if now.spooled_up:
-            self._climbing_s += now.elapsed_s
+            climbing_s += now.elapsed_s
         ramp_s = max(now.parameters.effective("MPC_TKO_RAMP_T"), now.elapsed_s)
-        fastest = now.parameters.effective("MPC_TKO_SPEED") * min(1.0, self._climbing_s / ramp_s)
+        fastest = now.parameters.effective("MPC_TKO_SPEED") * min(1.0, climbing_s / ramp_s)
         out[5] = -min(max(fastest, _TAKEOFF_FIRST_MPS), max(-delta, _TAKEOFF_FIRST_MPS))
 
+    return fly
 
-class _Land:
-    """AUTO.LAND: descends straight, slower near the ground."""
 
-    def __init__(self, over: Vector | None = None) -> None:
-        self._anchor = _Anchor(_HORIZONTAL, over)
+def _land(over: Vector | None = None) -> Guidance:
+    """AUTO.LAND: descends at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, slower near the ground."""
+    anchor = _Anchor(_HORIZONTAL, over)
 
-    def fly(self, now: Snapshot, out: Setpoint) -> None:
-        """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
-        self._anchor.hold(now, out)
+    def fly(now: Snapshot, out: Setpoint) -> None:
+        anchor.hold(now, out)
         value = now.parameters.effective
         height = float(now.home_ned_m[2] - now.truth.position_ned_m[2])
         high, low = value("MPC_LAND_ALT1"), value("MPC_LAND_ALT2")
@@ -150,60 +141,52 @@ class _Land:
         slow = value("MPC_LAND_SPEED")
         out[5] = slow + (value("MPC_Z_V_AUTO_DN") - slow) * min(max(share, 0.0), 1.0)
 
-
-class _Leg(Enum):
-    CLIMB = auto()
-    CROSS = auto()
-    LAND = auto()
+    return fly
 
 
-class _Return:
+def _return(announce: Callable[[float], None]) -> Guidance:
     """AUTO.RTL: climbs, crosses, descends and lands at home."""
+    down_m: float | None = None
+    anchor = _Anchor(_HORIZONTAL)
+    landing: Guidance | None = None
+    crosses = False
 
-    def __init__(self, announce: Callable[[float], None]) -> None:
-        self._announce = announce
-        self._leg: _Leg | None = None
-        self._down_m = 0.0
-        self._anchor = _Anchor(_HORIZONTAL)
-        self._landing = _Land()
-
-    def fly(self, now: Snapshot, out: Setpoint) -> None:
-        """Fly the present leg and begin the next at its end."""
+    def fly(now: Snapshot, out: Setpoint) -> None:
+        nonlocal down_m, landing, crosses
         if now.commander.landed:
             out[5] = now.parameters.effective("MPC_LAND_SPEED")
             return
-        if self._leg is None:
-            self._begin(now)
+        if down_m is None:
+            height = _return_height(now)
+            down_m = float(now.home_ned_m[2]) - height
+            announce(height)
         to_home = now.home_ned_m - now.truth.position_ned_m
-        rise = self._down_m - float(now.truth.position_ned_m[2])
-        if self._leg is _Leg.CLIMB:
-            self._anchor.hold(now, out)
-            _go_vertical(now, out, rise)
-            if rise > -_ARRIVED_M:
-                self._leg = _Leg.CROSS
-        elif self._leg is _Leg.CROSS:
-            to_home[2] = rise
+        to_home[2] = down_m - float(now.truth.position_ned_m[2])
+        if landing is not None:
+            landing(now, out)
+        elif crosses:
             _go(now, out, to_home)
             if math.hypot(to_home[0], to_home[1]) < _ARRIVED_M:
-                self._leg = _Leg.LAND
-                self._landing = _Land(np.array(now.home_ned_m[:2]))
+                landing = _land(np.array(now.home_ned_m[:2]))
         else:
-            self._landing.fly(now, out)
+            anchor.hold(now, out)
+            _go_vertical(now, out, float(to_home[2]))
+            crosses = to_home[2] > -_ARRIVED_M
 
-    def _begin(self, now: Snapshot) -> None:
-        """Choose the height: a cone round home when near, RTL_RETURN_ALT when far."""
-        value = now.parameters.effective
-        away = now.truth.position_ned_m - now.home_ned_m
-        distance, above = math.hypot(away[0], away[1]), -float(away[2])
-        height = value("RTL_RETURN_ALT")
-        cone = math.radians(value("RTL_CONE_ANG"))
-        if distance < value("RTL_MIN_DIST") and cone > 0.0:
-            in_cone = distance / math.tan(cone) if cone < math.pi / 2.0 else 0.0
-            height = min(height, max(in_cone, 2.0 * value("NAV_ACC_RAD")))
-        height = max(height, above)
-        self._down_m = float(now.home_ned_m[2]) - height
-        self._leg = _Leg.CLIMB
-        self._announce(height)
+    return fly
+
+
+def _return_height(now: Snapshot) -> float:
+    """Return the height above home: a cone round it when near, RTL_RETURN_ALT when far."""
+    value = now.parameters.effective
+    away = now.truth.position_ned_m - now.home_ned_m
+    distance, above = math.hypot(away[0], away[1]), -float(away[2])
+    height = value("RTL_RETURN_ALT")
+    cone = math.radians(value("RTL_CONE_ANG"))
+    if distance < value("RTL_MIN_DIST") and cone > 0.0:
+        in_cone = distance / math.tan(cone) if cone < math.pi / 2.0 else 0.0
+        height = min(height, max(in_cone, 2.0 * value("NAV_ACC_RAD")))
+    return max(height, above)
 
 
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
@@ -275,9 +258,9 @@ def begin(
         if math.isnan(takeoff_down_m):
             height_m = now.parameters.effective("MIS_TAKEOFF_ALT")
             takeoff_down_m = float(now.home_ned_m[2]) - height_m
-        return _Takeoff(takeoff_down_m, finished).fly
+        return _take_off(takeoff_down_m, finished)
     if mode is FlightMode.LAND:
-        return _Land().fly
+        return _land()
     if mode is FlightMode.RTL:
-        return _Return(announce_return).fly
-    return _Hold(*hold).fly if hold is not None else _Hold().fly
+        return _return(announce_return)
+    return _hold(*(hold or ()))

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -19,106 +20,56 @@ from sitl.camera.station import PoseTracker, Router, Station, Witness
 from sitl.command_line import (
     CONTEXT,
     Place,
-    Size,
     Triple,
-    allow_unsigned,
-    camera_heartbeat,
+    camera_options,
     exit_code,
-    key_file,
     stop_on_signals,
+    world_and_vehicle,
 )
+from sitl.command_line import signing as signing_options
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
 
 @click.command(context_settings=CONTEXT)
+@world_and_vehicle
 @click.option(
-    "--world",
-    "name",
-    default="dense",
-    show_default=True,
-    metavar="NAME|FILE",
-    help="World that the camera sees; `mavfi world list` lists the worlds.",
-)
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=3, show_default=True, help="Seed of the world."
-)
-@click.option("--start", type=Place(), metavar="X,Y,Z", help="Start in the world, ENU m.")
-@click.option("--goal", type=Place(), metavar="X,Y,Z", help="Goal in the world, ENU m.")
-@click.option(
-    "--origin",
-    type=Place(),
-    metavar="X,Y,Z",
+    "--origin", type=Place(), metavar="X,Y,Z",
     help="Position of the autopilot's local origin in the world, ENU m  [the world's start; with "
     "mavfi sitl, the world's origin].",
-)
+)  # fmt: skip
 @click.option(
-    "--link",
-    "links",
-    multiple=True,
-    default=["udpin:127.0.0.1:14540"],
-    show_default=True,
-    metavar="URL",
+    "--link", "links", multiple=True, default=["udpin:127.0.0.1:14540"], metavar="URL",
     help="Endpoint of an autopilot or client; repeatable. Messages of MAVLink's common set are "
     "forwarded between all links.",
+)  # fmt: skip
+@camera_options()
+@click.option(
+    "--hfov", "hfov_deg", type=float, default=90.0, help="Horizontal field of view, degrees."
 )
 @click.option(
-    "--size", type=Size(), default="64x48", show_default=True, help="Size of the image, pixels."
-)
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=float,
-    default=10.0,
-    show_default=True,
-    help="Frame rate for clients that ask for no interval, Hz.",
-)
-@click.option(
-    "--hfov",
-    "hfov_deg",
-    type=float,
-    default=90.0,
-    show_default=True,
-    help="Horizontal field of view, degrees.",
-)
-@click.option(
-    "--mount",
-    type=Place(),
-    metavar="F,L,U",
+    "--mount", type=Place(), metavar="F,L,U",
     help="Offset of the lens from the vehicle's position: forward, left, up in m  [--vehicle's].",
-)
+)  # fmt: skip
 @click.option(
-    "--vehicle",
-    default="solo",
-    show_default=True,
-    metavar="NAME|FILE",
-    help="Vehicle whose body and energy model the referee uses.",
-)
-@click.option(
-    "--truth",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
+    "--truth", type=click.Path(path_type=Path), metavar="DIR",
     help="Folder for the briefing and, at the end, the referee's log and verdict.",
-)
-@camera_heartbeat
-@key_file
-@allow_unsigned
+)  # fmt: skip
+@signing_options
 def _camera(
-    name: str,
-    seed: int,
-    start: Triple | None,
-    goal: Triple | None,
+    *,
     origin: Triple | None,
     links: Sequence[str],
-    size: tuple[int, int],
-    rate_hz: float,
+    camera_size: tuple[int, int],
+    camera_rate_hz: float,
+    camera_heartbeat_hz: float,
     hfov_deg: float,
     mount: Triple | None,
     vehicle: str,
     truth: Path | None,
-    camera_heartbeat_hz: float,
     key_file: Path | None,
     allow_unsigned: bool,
+    **of_world: Any,
 ) -> None:
     """Run depth camera and referee for an autopilot without a world, such as PX4 or ArduPilot SITL.
 
@@ -127,18 +78,14 @@ def _camera(
     MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE. The
     referee judges the same pose, and tells a collision in a STATUSTEXT.
     """
-    world = load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal)
+    world = load_world(of_world.pop("world"), **of_world)
     profile = load_profile(vehicle)
     forward, left, up = profile.camera_mount_flu_m if mount is None else mount
-    made = Camera(
-        world.boxes_enu_m,
-        columns=size[0],
-        rows=size[1],
-        hfov_rad=math.radians(hfov_deg),
-        mount_offset_flu_m=(forward, left, up),
-        rate_hz=rate_hz,
+    camera = Camera(
+        world.boxes_enu_m, columns=camera_size[0], rows=camera_size[1], rate_hz=camera_rate_hz,
+        hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
         heartbeat_hz=camera_heartbeat_hz,
-    )
+    )  # fmt: skip
     signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
     witness = Witness(world, profile, logs=truth is not None)
     if truth is not None:
@@ -148,13 +95,15 @@ def _camera(
         Router(links, signing=signing, allow_unsigned=allow_unsigned)
     ) as router:
         station = Station(
-            made,
+            camera,
             PoseTracker(world.start_enu_m if origin is None else np.array(origin)),
             router,
             witness=witness,
             origin_given=origin is not None,
         )
-        click.echo(f"depth camera in {world.name}, seed {seed}, on {', '.join(links)}", err=True)
+        click.echo(
+            f"depth camera in {world.name}, seed {world.seed}, on {', '.join(links)}", err=True
+        )
         try:
             station.run(lambda: not stopped())
         except LinkLost:

@@ -10,13 +10,12 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, rotation_matrix
-from mavfi_cli.link.codec import dialect
+from mavfi_cli.link.codec import Message, dialect
 from sitl.autopilot.telemetry import int32
 from sitl.camera.depth import render_depth
 from sitl.geodesy import Origin
@@ -26,19 +25,17 @@ _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding err
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame per control tick
 _MAX_SIDE_PX = 2048
-_HOME = Origin()
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 _LEGACY_REQUESTS: dict[int, int] = {
     dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION: dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION,
     dialect.MAV_CMD_REQUEST_CAMERA_SETTINGS: dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS,
     dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION,
-    dialect.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: (dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS),
+    dialect.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS,
 }
 
 _PAYLOAD_BYTES = 253
 _PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal length)
-_UNKNOWN = 0x7FFF_FFFF
 
 
 @dataclass(slots=True, kw_only=True)
@@ -67,9 +64,6 @@ class _Schedule:
         self._first_s, self._count = None, 0
 
 
-Message = Any  # a message of pymavlink's `common` dialect
-
-
 class Camera:
     """A depth camera on a vehicle in a world.
 
@@ -82,7 +76,6 @@ class Camera:
         rate_hz: Default frame rate, at most 50 Hz.
         heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
-        origin: Geographic origin of the world, for the position fields.
 
     Attributes:
         local_origin_enu_m: Origin of LOCAL_POSITION_NED in the world (3,), m.
@@ -102,7 +95,6 @@ class Camera:
         rate_hz: float = 10.0,
         heartbeat_hz: float = 1.0,
         system: int = 1,
-        origin: Origin = _HOME,
     ) -> None:
         if not 0.0 < rate_hz <= MAX_RATE_HZ:
             raise ConfigError(f"camera rate {rate_hz:g} Hz: must be above 0, to {MAX_RATE_HZ:g}")
@@ -113,34 +105,18 @@ class Camera:
             raise ConfigError(f"camera field of view {hfov_rad:g} rad: must be 0.01 to 3.1")
         self.mount_offset_flu_m = np.array(mount_offset_flu_m, dtype=np.float64)
         self._columns, self._rows, self._hfov_rad = columns, rows, hfov_rad
-        self._focal_px = columns / 2.0 / math.tan(hfov_rad / 2.0)
         self.system = system
         self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
-        self._origin = origin
+        self._origin = Origin()
         self.local_origin_enu_m = np.zeros(3)
         self._default_interval_s = 1.0 / rate_hz
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
-        self._pose: tuple[Vector, Vector] | None = None  # optical centre (3,) and attitude (4,)
         self._stamp_s = 0.0
         self._heartbeat = _Schedule(interval_s=1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
         self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
-        self._streams: dict[int, _Schedule] = {}
-        self._commands: dict[int, Callable[[Message], int]] = {
-            dialect.MAV_CMD_IMAGE_START_CAPTURE: self._start_capture,
-            dialect.MAV_CMD_IMAGE_STOP_CAPTURE: self._stop_capture,
-            dialect.MAV_CMD_SET_CAMERA_MODE: self._set_mode,
-            dialect.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-        }
-
-    def _local_origin(self) -> Message:
-        """Return LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: add it for world coordinates."""
-        offset = enu_from_ned(self.local_origin_enu_m).tolist()
-        return dialect.MAVLink_local_position_ned_system_global_offset_message(
-            self._boot_ms, *offset, 0.0, 0.0, 0.0
-        )
 
     def handle(self, message: Message) -> list[Message]:
         """Return the answer to a message, or nothing if it is not for a camera."""
@@ -159,7 +135,7 @@ class Camera:
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """Return the messages due at a stamp: heartbeat, streams, and a frame from the pose.
+        """Return the messages due at a stamp: a heartbeat, and a frame from the pose.
 
         Args:
             stamp_s: Boot clock of the vehicle, s. A step back by 1 s counts as a reboot.
@@ -167,28 +143,19 @@ class Camera:
             quaternion_flu_enu: Attitude of the vehicle (4,).
         """
         if stamp_s < self._stamp_s - 1.0:
-            self._reboot()
+            for schedule in filter(None, (self._heartbeat, self._frames)):
+                schedule.restart()
         self._stamp_s = stamp_s
-        offset_m = rotation_matrix(quaternion_flu_enu) @ self.mount_offset_flu_m
-        self._pose = position_enu_m + offset_m, quaternion_flu_enu
         beats = self._heartbeat is not None and self._heartbeat.due(stamp_s)
         due = [_heartbeat()] if beats else []
-        for message_id, stream in self._streams.items():
-            answer = self._request(message_id) if stream.due(stamp_s) else None
-            if answer is not None:
-                due.append(answer)
         if self._frames is not None and self._frames.due(stamp_s):
-            due += self._take_frame(*self._pose)
+            offset_m = rotation_matrix(quaternion_flu_enu) @ self.mount_offset_flu_m
+            due += self._take_frame(position_enu_m + offset_m, quaternion_flu_enu)
         return due
 
     def idle(self) -> list[Message]:
         """Return the messages to send while there is no pose: a heartbeat, unless it has none."""
         return [] if self._heartbeat is None else [_heartbeat()]
-
-    def _reboot(self) -> None:
-        for schedule in (self._heartbeat, self._frames, *self._streams.values()):
-            if schedule is not None:
-                schedule.restart()
 
     def _take_frame(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Message]:
         """Return the messages of one frame in the order of sending.
@@ -230,60 +197,39 @@ class Camera:
         number = int(message.command)
         answers: list[Message] = []
         if number == dialect.MAV_CMD_REQUEST_MESSAGE or number in _LEGACY_REQUESTS:
-            wanted = _LEGACY_REQUESTS.get(number, message.param1)
-            answer = self._request(_whole(wanted))
-            answers = [] if answer is None else [answer]
-            result = dialect.MAV_RESULT_DENIED if answer is None else dialect.MAV_RESULT_ACCEPTED
+            build = _BUILDERS.get(_whole(_LEGACY_REQUESTS.get(number, message.param1)))
+            answers = [] if build is None else [build(self)]
+            result = dialect.MAV_RESULT_ACCEPTED if answers else dialect.MAV_RESULT_DENIED
         else:
-            act = self._commands.get(number)
-            result = dialect.MAV_RESULT_UNSUPPORTED if act is None else act(message)
+            result = self._act(number, message)
         ack = dialect.MAVLink_command_ack_message(
             number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
         )
         return [*answers, ack]
 
-    def _request(self, message_id: int | None) -> Message | None:
-        """Return the present message with an id; None if the camera does not send it."""
-        build = _BUILDERS.get(message_id)
-        return None if build is None else build(self)
-
     def _information(self) -> Message:
-        """Return CAMERA_INFORMATION. Focal length and sensor size give the field of view."""
+        """Focal length and sensor size give the field of view."""
         sensor_mm = (self._columns * _PIXEL_PITCH_MM, self._rows * _PIXEL_PITCH_MM)
+        focal_px = self._columns / 2.0 / math.tan(self._hfov_rad / 2.0)
         return dialect.MAVLink_camera_information_message(
             self._boot_ms, list(b"mavfi".ljust(32, b"\0")), list(b"depth8".ljust(32, b"\0")), 1,
-            self._focal_px * _PIXEL_PITCH_MM, *sensor_mm, self._columns, self._rows, 0,
+            focal_px * _PIXEL_PITCH_MM, *sensor_mm, self._columns, self._rows, 0,
             dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE, 0, b"",
         )  # fmt: skip
 
-    def _settings(self) -> Message:
-        """Return CAMERA_SETTINGS: photo mode, no zoom, no focus."""
-        mode = dialect.CAMERA_MODE_IMAGE
-        return dialect.MAVLink_camera_settings_message(self._boot_ms, mode, math.nan, math.nan)
-
-    def _storage_information(self) -> Message:
-        """Return STORAGE_INFORMATION without storage, as frames are sent at once."""
-        return dialect.MAVLink_storage_information_message(
-            self._boot_ms, 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
-        )
-
     def _capture_status(self) -> Message:
-        """Return CAMERA_CAPTURE_STATUS: idle, or capturing at an interval."""
+        """Idle, or capturing at an interval."""
         status, interval_s = (0, 0.0) if self._frames is None else (3, self._frames.interval_s)
         return dialect.MAVLink_camera_capture_status_message(
             self._boot_ms, status, 0, interval_s, 0, 0.0, self.images
         )
 
-    def _fov_status(self) -> Message | None:
-        """Return CAMERA_FOV_STATUS. The geographic position of the image centre is unknown."""
-        if self._pose is None:
-            return None
-        position_enu_m, quaternion_flu_enu = self._pose
-        return dialect.MAVLink_camera_fov_status_message(
-            self._boot_ms, *self._geodetic_e7_mm(position_enu_m), _UNKNOWN, _UNKNOWN, _UNKNOWN,
-            flu_enu_from_frd_ned(quaternion_flu_enu).tolist(), math.degrees(self._hfov_rad),
-            math.degrees(2.0 * math.atan(self._rows / 2.0 / self._focal_px)),
-        )  # fmt: skip
+    def _local_origin(self) -> Message:
+        """To be added to a LOCAL_POSITION_NED for world coordinates."""
+        offset = enu_from_ned(self.local_origin_enu_m).tolist()
+        return dialect.MAVLink_local_position_ned_system_global_offset_message(
+            self._boot_ms, *offset, 0.0, 0.0, 0.0
+        )
 
     @property
     def _boot_ms(self) -> int:
@@ -295,6 +241,19 @@ class Camera:
         altitude = int32((self._origin.altitude_amsl_m + up) * 1e3)
         return int32(latitude * 1e7), int32(longitude * 1e7), altitude
 
+    def _act(self, number: int, message: Message) -> int:
+        """Carry out a command. Return its MAV_RESULT."""
+        result: int = dialect.MAV_RESULT_ACCEPTED
+        if number == dialect.MAV_CMD_IMAGE_START_CAPTURE:
+            result = self._start_capture(message)
+        elif number == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
+            self._frames, self._frames_left = None, 0
+        elif number != dialect.MAV_CMD_SET_CAMERA_MODE:
+            result = dialect.MAV_RESULT_UNSUPPORTED
+        elif _whole(message.param2) != 0:  # any mode but photo
+            result = dialect.MAV_RESULT_DENIED
+        return result
+
     def _start_capture(self, message: Message) -> int:
         """Handle IMAGE_START_CAPTURE: param2 is the interval, s (0: default), param3 the count."""
         interval_s, count = float(message.param2), _whole(message.param3)
@@ -305,27 +264,6 @@ class Camera:
         interval_s = round(interval_s, 6)  # a float32 of 0.1 would drift against ticks
         self._frames = _Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
-        return int(dialect.MAV_RESULT_ACCEPTED)
-
-    def _stop_capture(self, _message: Message) -> int:
-        self._frames, self._frames_left = None, 0
-        return int(dialect.MAV_RESULT_ACCEPTED)
-
-    def _set_mode(self, message: Message) -> int:
-        photo = _whole(message.param2) == 0
-        return int(dialect.MAV_RESULT_ACCEPTED if photo else dialect.MAV_RESULT_DENIED)
-
-    def _set_interval(self, message: Message) -> int:
-        """Handle SET_MESSAGE_INTERVAL for known messages; 0 and -1 both mean on request only."""
-        message_id, interval_us = _whole(message.param1), _whole(message.param2)
-        known = message_id is not None and self._request(message_id) is not None
-        if not known or interval_us is None:
-            return int(dialect.MAV_RESULT_DENIED)
-        assert message_id is not None
-        self._streams.pop(message_id, None)
-        if interval_us > 0:
-            interval_s = max(interval_us / 1e6, 1.0 / MAX_RATE_HZ)
-            self._streams[message_id] = _Schedule(interval_s=interval_s)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
 
@@ -342,12 +280,18 @@ def _heartbeat() -> Message:
     )
 
 
-_BUILDERS: dict[int | None, Callable[[Camera], Message | None]] = {
+_BUILDERS: dict[int | None, Callable[[Camera], Message]] = {
     dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: Camera._information,
-    dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS: Camera._settings,
-    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: Camera._storage_information,
+    dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS: lambda camera: dialect.MAVLink_camera_settings_message(
+        camera._boot_ms, dialect.CAMERA_MODE_IMAGE, math.nan, math.nan
+    ),
+    # There is no storage, as frames are sent at once.
+    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: (
+        lambda camera: dialect.MAVLink_storage_information_message(
+            camera._boot_ms, 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
+        )
+    ),
     dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: Camera._capture_status,
-    dialect.MAVLINK_MSG_ID_CAMERA_FOV_STATUS: Camera._fov_status,
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: Camera._local_origin,
 }
-"""Messages that can be streamed or requested, by their ids."""
+"""Messages that can be requested, by their ids."""

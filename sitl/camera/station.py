@@ -181,23 +181,19 @@ class PoseTracker:
 
     Attributes:
         origin_enu_m: Autopilot's local origin in the world (3,).
+        has_quaternion: True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE.
     """
 
     def __init__(self, origin_enu_m: Vector) -> None:
         self.origin_enu_m = np.asarray(origin_enu_m, dtype=np.float64)
         self._position: tuple[float, Vector, Vector] | None = None  # stamp, NED m, NED m/s
         self._attitude: tuple[float, Vector] | None = None
-        self._has_quaternions = False
+        self.has_quaternion = False
 
     @property
     def has_position(self) -> bool:
         """True once LOCAL_POSITION_NED has arrived."""
         return self._position is not None
-
-    @property
-    def has_quaternion(self) -> bool:
-        """True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE."""
-        return self._has_quaternions
 
     @property
     def attitude_stamp_s(self) -> float | None:
@@ -225,23 +221,16 @@ class PoseTracker:
     def _quaternion(self, kind: str, message: Any) -> Vector | None:
         if kind == "ATTITUDE_QUATERNION":
             quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
-            self._has_quaternions = True
-        elif kind == "ATTITUDE" and not self._has_quaternions:
+            self.has_quaternion = True
+        elif kind == "ATTITUDE" and not self.has_quaternion:
             quaternion = quaternion_from_euler(message.roll, message.pitch, message.yaw)
         else:
             return None
         length = float(np.linalg.norm(quaternion))
         return quaternion / length if math.isfinite(length) and length > 0.5 else None
 
-    @property
-    def velocity_enu_mps(self) -> Vector:
-        """Newest velocity (3,). Raises LookupError if there is none yet."""
-        if self._position is None:
-            raise LookupError("no velocity yet")
-        return enu_from_ned(self._position[2])
-
-    def pose(self) -> tuple[float, Vector, Vector]:
-        """Return stamp, s, position (3,) in the world and attitude (4,) FLU to ENU.
+    def pose(self) -> tuple[float, Vector, Vector, Vector]:
+        """Return stamp, s, position (3,) in the world, attitude (4,) FLU to ENU, and velocity (3,).
 
         Raises:
             LookupError: There is no pose yet.
@@ -252,7 +241,8 @@ class PoseTracker:
         since_s, position, velocity = self._position
         ahead_s = max(0.0, min(stamp_s - since_s, _LONGEST_EXTRAPOLATION_S))
         local = enu_from_ned(position + ahead_s * velocity)
-        return stamp_s, self.origin_enu_m + local, flu_enu_from_frd_ned(quaternion)
+        place = self.origin_enu_m + local
+        return stamp_s, place, flu_enu_from_frd_ned(quaternion), enu_from_ned(velocity)
 
 
 class Witness:
@@ -421,11 +411,10 @@ class Station:
 
     def _look(self) -> None:
         """Send what is due at the newest pose, and let the referee judge it."""
-        stamp_s, position, quaternion = self._tracker.pose()
-        self._send(self.camera.poll(stamp_s, position, quaternion))
+        pose = self._tracker.pose()
+        self._send(self.camera.poll(*pose[:3]))
         if self._witness is not None:
-            velocity = self._tracker.velocity_enu_mps
-            collision = self._witness.observe(stamp_s, position, quaternion, velocity)
+            collision = self._witness.observe(*pose)
             if collision is not None:
                 text = collision.text.encode()
                 self._send(list(text_messages(dialect.MAV_SEVERITY_CRITICAL, text, 1)))

@@ -244,11 +244,7 @@ class FirmwareProcess:
     """
 
     def __init__(
-        self,
-        binary: Path,
-        arguments: Sequence[str],
-        folder: Path,
-        environment: Mapping[str, str],
+        self, binary: Path, arguments: Sequence[str], folder: Path, environment: Mapping[str, str]
     ) -> None:
         self._binary, self._folder = binary, folder
         try:

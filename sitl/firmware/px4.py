@@ -23,7 +23,7 @@ from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
 from sitl.firmware.autopilot import FirmwareProcess, require_program
-from sitl.firmware.sensors import Sensors, pressure_altitude_m
+from sitl.firmware.sensors import Sensors
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Truth
@@ -237,20 +237,19 @@ class Px4Link:
             magnetic = tuple(sensors.magnetic_field(truth).tolist())
         if self._steps % _BARO_STEPS == 0:
             fields |= _BARO_FIELDS
-            pressure = sensors.pressure(truth)
-            altitude_m = pressure_altitude_m(pressure)
+            pressure, altitude_m = sensors.barometer(truth)
         return dialect.MAVLink_hil_sensor_message(
             stamp_us, *force.tolist(), *rates.tolist(), *magnetic, pressure / 100.0, 0.0,
             altitude_m, _TEMPERATURE_C, fields,
         )  # fmt: skip
 
     def _hil_gps(self, stamp_us: int, truth: Truth) -> Message:
-        fix = self._sensors.fix(truth)
-        north, east, down = fix.velocity_ned_mps.tolist()
+        latitude_deg, longitude_deg, altitude_m, velocity = self._sensors.fix(truth)
+        north, east, down = velocity.tolist()
         course_deg = math.degrees(math.atan2(east, north)) % 360.0
         return dialect.MAVLink_hil_gps_message(
-            stamp_us, _FIX_3D, round(fix.latitude_deg * 1e7), round(fix.longitude_deg * 1e7),
-            round(fix.altitude_amsl_m * 1e3), _EPH_CM, _EPV_CM,
+            stamp_us, _FIX_3D, round(latitude_deg * 1e7), round(longitude_deg * 1e7),
+            round(altitude_m * 1e3), _EPH_CM, _EPV_CM,
             round(100.0 * math.hypot(north, east)), round(100.0 * north), round(100.0 * east),
             round(100.0 * down), round(100.0 * course_deg) % 36_000, _SATELLITES,
         )  # fmt: skip

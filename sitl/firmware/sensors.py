@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,33 +39,6 @@ _LAPSE_PER_M = 2.25577e-5
 _EXPONENT = 5.25588
 
 
-def _pressure_pa(altitude_amsl_m: float) -> float:
-    """Return the pressure of the standard atmosphere at an altitude."""
-    return float(_SEA_LEVEL_PA * (1.0 - _LAPSE_PER_M * altitude_amsl_m) ** _EXPONENT)
-
-
-def pressure_altitude_m(pressure: float) -> float:
-    """Return the altitude above sea level at which the standard atmosphere has a pressure, Pa."""
-    return float((1.0 - (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
-
-
-def _specific_force(truth: Truth) -> Vector:
-    """Return what an ideal accelerometer measures (3,), body FRD, m/s^2."""
-    felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
-    force: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ felt_ned
-    return force
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Fix:
-    """One position and velocity of a GPS receiver."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_amsl_m: float
-    velocity_ned_mps: Vector  # (3,)
-
-
 class Sensors:
     """Gyroscope, accelerometer, magnetometer, barometer and GPS of one vehicle.
 
@@ -84,28 +56,29 @@ class Sensors:
         """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""
         noise = self._noise.standard_normal(6)
         rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
-        return rates, _specific_force(truth) + ACCELEROMETER_MPS2 * noise[3:]
+        felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
+        force: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ felt_ned
+        return rates, force + ACCELEROMETER_MPS2 * noise[3:]
 
     def magnetic_field(self, truth: Truth) -> Vector:
         """Return the magnetic field (3,), body FRD, gauss."""
         field: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ FIELD_NED_GAUSS
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
-    def pressure(self, truth: Truth) -> float:
-        """Return the air pressure, Pa."""
+    def barometer(self, truth: Truth) -> tuple[float, float]:
+        """Return the air pressure, Pa, and its altitude above sea level, m."""
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
-        return _pressure_pa(altitude_m) + BAROMETER_PA * float(self._noise.standard_normal())
+        pressure = float(_SEA_LEVEL_PA * (1.0 - _LAPSE_PER_M * altitude_m) ** _EXPONENT)
+        pressure += BAROMETER_PA * float(self._noise.standard_normal())
+        share = (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)
+        return pressure, float((1.0 - share) / _LAPSE_PER_M)
 
-    def fix(self, truth: Truth) -> _Fix:
-        """Return position and velocity of the GPS receiver."""
+    def fix(self, truth: Truth) -> tuple[float, float, float, Vector]:
+        """Return latitude, longitude (deg), altitude (m) and velocity (3,), NED, of a GPS."""
         noise = self._noise.standard_normal(6)
         north, east, down = truth.position_ned_m.tolist()
         latitude, longitude = self._origin.geodetic(
             north + FIX_HORIZONTAL_M * noise[0], east + FIX_HORIZONTAL_M * noise[1]
         )
-        return _Fix(
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            altitude_amsl_m=self._origin.altitude_amsl_m - down + FIX_VERTICAL_M * noise[2],
-            velocity_ned_mps=truth.velocity_ned_mps + FIX_SPEED_MPS * noise[3:],
-        )
+        altitude_m = self._origin.altitude_amsl_m - down + FIX_VERTICAL_M * noise[2]
+        return latitude, longitude, altitude_m, truth.velocity_ned_mps + FIX_SPEED_MPS * noise[3:]

@@ -28,13 +28,13 @@ SP_YAW = 9
 SP_YAW_RATE = 10
 SETPOINT_SIZE = 11
 
-# Measurement (14,)
-M_POSITION = 0  # NED, m
-M_VELOCITY = 3  # NED, m/s
-M_QUATERNION = 6  # w x y z, body FRD -> NED
-M_RATES = 10  # body FRD, rad/s
-M_ON_GROUND = 13  # 0 or 1
-MEASUREMENT_SIZE = 14
+# Measurement (33,): what the controller reads of the vehicle's truth, at its places there
+M_POSITION = 1  # NED, m
+M_VELOCITY = 4  # NED, m/s
+M_QUATERNION = 10  # w x y z, body FRD -> NED
+M_RATES = 14  # body FRD, rad/s
+M_ON_GROUND = 25  # 0 or 1
+MEASUREMENT_SIZE = 33
 
 # Controller state (21,)
 S_VELOCITY_INTEGRAL = 0  # NED, m/s^2

@@ -126,12 +126,7 @@ class Physics:
     """A JSBSim instance that flies a profile over flat, fixed ground."""
 
     def __init__(
-        self,
-        profile: VehicleProfile,
-        *,
-        position_ned_m: Vector,
-        heading_rad: float,
-        dt_s: float,
+        self, profile: VehicleProfile, *, position_ned_m: Vector, heading_rad: float, dt_s: float
     ) -> None:
         jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
         try:

@@ -37,14 +37,14 @@ from sitl.vehicle.physics import (
 from sitl.vehicle.profile import VehicleProfile
 
 T_STAMP = 0
-T_POSITION = 1
-T_VELOCITY = 4
+T_POSITION = M_POSITION
+T_VELOCITY = M_VELOCITY
 T_ACCELERATION = 7
-T_QUATERNION = 10
-T_RATES = 14
+T_QUATERNION = M_QUATERNION
+T_RATES = M_RATES
 T_COMMANDS = 17
 T_RPM = 21
-T_ON_GROUND = 25
+T_ON_GROUND = M_ON_GROUND
 T_VOLTAGE = 26
 T_CURRENT = 27
 T_REMAINING = 28
@@ -52,7 +52,7 @@ T_POWER_REGRESSION = 29
 T_POWER_PROPELLER = 30
 T_ENERGY_REGRESSION = 31
 T_ENERGY_PROPELLER = 32
-TRUTH_SIZE = 33
+TRUTH_SIZE = MEASUREMENT_SIZE
 
 KMH_PER_MPS = 3.6
 
@@ -231,18 +231,12 @@ def _refresh(
     dt_s: float,
     armed: bool,
     truth: Vector,
-    measurement: Vector,
 ) -> None:
-    """Update `truth` and the controller's `measurement` in place after a step of `dt_s`."""
+    """Update `truth` in place after a step of `dt_s`."""
     _observe_motion(raw, dt_s, truth)
     for rotor in range(4):
         truth[T_COMMANDS + rotor] = commands[rotor]
     _account_energy(truth, regression, battery, dt_s, armed)
-    measurement[M_POSITION : M_POSITION + 3] = truth[T_POSITION : T_POSITION + 3]
-    measurement[M_VELOCITY : M_VELOCITY + 3] = truth[T_VELOCITY : T_VELOCITY + 3]
-    measurement[M_QUATERNION : M_QUATERNION + 4] = truth[T_QUATERNION : T_QUATERNION + 4]
-    measurement[M_RATES : M_RATES + 3] = truth[T_RATES : T_RATES + 3]
-    measurement[M_ON_GROUND] = truth[T_ON_GROUND]
 
 
 class Quadrotor:
@@ -278,7 +272,6 @@ class Quadrotor:
         self._regression = profile.energy.coefficients(profile.extra_payload_kg)
         self._battery = profile.battery.parameters()
         self._state = np.zeros(STATE_SIZE)
-        self._measurement = np.zeros(MEASUREMENT_SIZE)
         self._raw = np.zeros(RAW_SIZE)
         self._flat = np.zeros(TRUTH_SIZE)
         self._flat[T_REMAINING] = 1.0
@@ -294,9 +287,7 @@ class Quadrotor:
                 m/s^2, rad, rad/s. Values that are not finite are not controlled.
             armed: False stops the motors.
         """
-        self._state, commands = control_step(
-            self._state, self._measurement, setpoint, self._gains, armed
-        )
+        self._state, commands = control_step(self._state, self._flat, setpoint, self._gains, armed)
         self.drive(commands, armed=armed)
 
     def drive(self, commands: Vector, *, armed: bool) -> None:
@@ -308,13 +299,4 @@ class Quadrotor:
 
     def _refresh(self, commands: Vector, dt_s: float, *, armed: bool) -> None:
         self._physics.read(self._raw)
-        _refresh(
-            self._raw,
-            commands,
-            self._regression,
-            self._battery,
-            dt_s,
-            armed,
-            self._flat,
-            self._measurement,
-        )
+        _refresh(self._raw, commands, self._regression, self._battery, dt_s, armed, self._flat)

@@ -13,49 +13,27 @@ from typing import Any
 import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
-from sitl.command_line import CONTEXT, Place, Triple, exit_code
+from sitl.command_line import CONTEXT, Triple, exit_code, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, WorldCheck, check_world, world_svg
 from sitl.world.world import World, load_world, named_worlds, show
 
 _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
 
 
-def _on_world(command: Callable[..., None]) -> Callable[..., None]:
+def _on_world(command: Callable[..., None]) -> Callable[..., Any]:
     """Add the options of a world to a command, which gets the loaded world instead of them."""
 
+    @click.argument("name", metavar="WORLD")
+    @places
+    @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
     @functools.wraps(command)
     def with_world(
-        *,
-        name: str,
-        seed: int,
-        start: Triple | None,
-        goal: Triple | None,
-        **given: Any,
+        *, name: str, seed: int, start_enu_m: Triple | None, goal_enu_m: Triple | None, **given: Any
     ) -> None:
-        command(load_world(name, seed=seed, start_enu_m=start, goal_enu_m=goal), **given)
+        world = load_world(name, seed=seed, start_enu_m=start_enu_m, goal_enu_m=goal_enu_m)
+        command(world, **given)
 
-    decorators = [
-        click.argument("name", metavar="WORLD"),
-        click.option(
-            "--seed",
-            type=click.IntRange(min=0),
-            default=3,
-            show_default=True,
-            help="Seed of the world.",
-        ),
-        click.option("--start", type=Place(), help="Start of flights, ENU m. See --goal."),
-        click.option(
-            "--goal",
-            type=Place(),
-            help="Goal of flights, ENU m. A generated world is built around start and goal: other "
-            "positions move its bounds, and towers within 3 m of them are left out.",
-        ),
-        click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
-    ]
-    decorated: Callable[..., None] = with_world
-    for decorate in reversed(decorators):
-        decorated = decorate(decorated)
-    return decorated
+    return with_world
 
 
 @click.group(context_settings=CONTEXT)
@@ -84,11 +62,7 @@ def _list(as_json: bool) -> None:
 @_world.command(name="make", epilog=_WORLD_HELP, short_help="Write a world as a TOML file.")
 @_on_world
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="TOML file  [stdout].")
-def _make(
-    made: World,
-    as_json: bool,
-    output: Path | None,
-) -> None:
+def _make(made: World, as_json: bool, output: Path | None) -> None:
     """Write a world as a TOML file of boxes, which every --world option accepts."""
     text = made.toml()
     if output is not None:
@@ -107,16 +81,10 @@ def _make(
     "--clearance",
     type=click.FloatRange(min=0.0),
     default=DEFAULT_CLEARANCE_M,
-    show_default=True,
     help="Clearance of the path from every box, m.",
 )
 @click.option("--expect", type=click.Choice(["path"]), help="Exit with code 1 if there is no path.")
-def _check(
-    made: World,
-    as_json: bool,
-    clearance: float,
-    expect: str | None,
-) -> None:
+def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> None:
     """Check that start and goal are clear and that a path with the clearance exists.
 
     The path is searched on a grid of 0.5 m at the goal's height. Paths over or under an obstacle
@@ -135,12 +103,7 @@ def _check(
 @_on_world
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="SVG file  [WORLD-SEED.svg].")
 @click.option("--path", "with_path", is_flag=True, help="Also draw the path that `check` finds.")
-def _draw(
-    made: World,
-    as_json: bool,
-    output: Path | None,
-    with_path: bool,
-) -> None:
+def _draw(made: World, as_json: bool, output: Path | None, with_path: bool) -> None:
     """Draw a world from above, as SVG."""
     file = output or Path(f"{made.name.replace(':', '-').replace('/', '-')}-{made.seed}.svg")
     require_output(file, [".svg"])
@@ -163,35 +126,23 @@ def _boxes(made: World) -> str:
 
 
 def _check_text(made: World, found: WorldCheck) -> str:
+    def metres(value: float) -> str:
+        return f"{value:.1f} m away" if math.isfinite(value) else "none"
+
     path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
-    return "\n".join(
-        [
-            _boxes(made),
-            f"start  {show(made.start_enu_m)}, nearest obstacle {_metres(found.start_clearance_m)}",
-            f"goal   {show(made.goal_enu_m)}, nearest obstacle {_metres(found.goal_clearance_m)}",
-            f"path   {path} with {found.clearance_m:g} m clearance; straight "
-            f"{found.straight_m:.1f} m",
-        ]
+    return (
+        f"{_boxes(made)}\n"
+        f"start  {show(made.start_enu_m)}, nearest obstacle {metres(found.start_clearance_m)}\n"
+        f"goal   {show(made.goal_enu_m)}, nearest obstacle {metres(found.goal_clearance_m)}\n"
+        f"path   {path} with {found.clearance_m:g} m clearance; straight {found.straight_m:.1f} m"
     )
 
 
-def _metres(value: float) -> str:
-    return f"{value:.1f} m away" if math.isfinite(value) else "none"
-
-
 def _check_json(found: WorldCheck) -> dict[str, Any]:
-    def finite(value: float) -> float | None:
-        """Return None for infinity, which JSON lacks."""
-        return value if math.isfinite(value) else None
-
-    return {
-        "clearance_m": found.clearance_m,
-        "path_exists": found.path_exists,
-        "path_m": found.path_m,
-        "straight_m": found.straight_m,
-        "start_clearance_m": finite(found.start_clearance_m),
-        "goal_clearance_m": finite(found.goal_clearance_m),
-    }
+    keys = ("clearance_m", "path_exists", "path_m", "straight_m")
+    gaps = {f"{at}_clearance_m": getattr(found, f"{at}_clearance_m") for at in ("start", "goal")}
+    finite = {key: value if math.isfinite(value) else None for key, value in gaps.items()}
+    return {**{key: getattr(found, key) for key in keys}, **finite}  # JSON lacks infinity
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

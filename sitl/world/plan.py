@@ -172,7 +172,7 @@ def _length_m(path: Vector) -> float:
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
-_GROUND, _INK = "#fbfbf9", "#222831"
+_GROUND = "#fbfbf9"
 _TALL, _TALL_EDGE = "#c9ced6", "#8b93a1"
 _LOW, _LOW_EDGE = "#cfe0bd", "#8aa573"
 _START, _GOAL, _PATH = "#1f5fa8", "#1b7f4b", "#b5651d"
@@ -207,7 +207,6 @@ def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
                 linestyle=(0, (4, 2)), label="way with clearance", zorder=3,
             )  # fmt: skip
         _draw_places(axes, world)
-        _draw_scale(axes, world)
         axes.set_xlim(west, east)
         axes.set_ylim(south, north)
         axes.set_aspect("equal")
@@ -253,38 +252,3 @@ def _draw_places(axes: Axes, world: World) -> None:
         [goal[0]], [goal[1]], s=110, marker="*", facecolor=_GOAL, edgecolor="white",
         linewidth=0.8, label=f"goal, {goal[2]:g} m up", zorder=5,
     )  # fmt: skip
-
-
-def _draw_scale(axes: Axes, world: World) -> None:
-    """Draw a bar of 1, 2 or 5 times a power of ten, about 1/6 of the width, in a free corner."""
-    west, south, _, east, north, _ = (float(v) for v in world.bounds_enu_m)
-    width = east - west
-    power = 10.0 ** np.floor(np.log10(width / 6.0))
-    length = float(power * max(f for f in (1.0, 2.0, 5.0) if f * power <= width / 6.0))
-    margin, room = 0.04 * width, 0.07 * width
-    corners = [
-        (x, y)
-        for y in (south + margin, north - margin - room)
-        for x in (west + margin, east - margin - length)
-    ]
-    free = [corner for corner in corners if _is_empty(world, corner, length, room)]
-    x, y = (free or corners)[0]
-    axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.0, solid_capstyle="butt", zorder=6)
-    axes.text(
-        x + length / 2.0, y + 0.012 * width, f"{length:g} m", ha="center", va="bottom",
-        fontsize=8, color=_INK, zorder=6,
-    )  # fmt: skip
-
-
-def _is_empty(world: World, corner: tuple[float, float], width: float, height: float) -> bool:
-    """Return True if no box, start or goal lies in a rectangle of the plan."""
-    boxes = world.boxes_enu_m
-    places = np.array([world.start_enu_m, world.goal_enu_m])
-    footprints = np.vstack([boxes[:, [0, 1, 3, 4]], np.hstack([places[:, :2], places[:, :2]])])
-    apart = (
-        (footprints[:, 0] > corner[0] + width)
-        | (footprints[:, 2] < corner[0])
-        | (footprints[:, 1] > corner[1] + height)
-        | (footprints[:, 3] < corner[1])
-    )
-    return bool(apart.all())

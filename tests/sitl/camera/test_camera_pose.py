@@ -27,7 +27,7 @@ def test_a_pose_is_a_position_and_an_attitude_in_the_world() -> None:
         PoseTracker(np.zeros(3)).pose()
     assert not tracker.take(position(1000, north=3.0, east=4.0))
     assert tracker.take(attitude(1020, math.radians(90.0)))  # nose to the east
-    stamp_s, place, quaternion = tracker.pose()
+    stamp_s, place, quaternion, _ = tracker.pose()
     assert stamp_s == 1.02
     assert place == pytest.approx([104.0, 203.0, 5.0])
     assert yaw_from_quaternion(quaternion) == pytest.approx(0.0, abs=1e-12)
