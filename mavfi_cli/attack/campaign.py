@@ -36,7 +36,7 @@ from mavfi_cli.attack.target import (
     places_of,
 )
 from mavfi_cli.core.errors import FaultError, TargetError
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy, strategy
 
@@ -335,7 +335,7 @@ class _Bench:
 
     def generator(self, *what: str | int) -> np.random.Generator:
         """The target's own random numbers; those of fault number i depend on i only."""
-        return generator(self.plan.seed, Stream.FAULT, *self.target.stream, *what)
+        return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
 
 class _Open:

@@ -17,7 +17,7 @@ from mavfi_cli.campaigns.missions import Label, PlannedMission, changes_of
 from mavfi_cli.campaigns.specification import require_named
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import file_digest
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import DType, Stage
 from mavfi_cli.detect.base import detector_names
 from mavfi_cli.detect.fit import KINDS
@@ -225,15 +225,17 @@ class EvaluationPlan:
 
     def _fault(self, site: _Site, world: str, seed: int) -> dict[str, Any]:
         """Draw the fault of a mission, as settings of the mission."""
-        drawn = (self.seed, Stream.FAULT, "evaluation", world, seed, site.target, site.field)
+        drawn = (self.seed, "evaluation", world, seed, site.target, site.field)
         if self.level == INSTRUCTION:
-            return {"instruction": InstructionConfig(target=site.target, seed=derive(*drawn))}
+            return {
+                "instruction": InstructionConfig(target=site.target, seed=Stream.FAULT.seed(*drawn))
+            }
         whole = site.field == INTEGER
         for number in range(_DRAWS):
             fault = FaultConfig(
                 target=site.target,
                 field=Field.ANY.value if whole else site.field,
-                seed=derive(*drawn, number),
+                seed=Stream.FAULT.seed(*drawn, number),
             )
             # Draw again until the state has the required type: all of them are equally likely.
             if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:

@@ -13,7 +13,7 @@ from typing import Any
 from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -352,9 +352,9 @@ class Spec:
         seed = values.get("seed", self.first_seed + repetition)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
-        drawn = (Stream.FAULT, "campaign", seed, repetition, _target_of(values))
+        drawn = ("campaign", seed, repetition, _target_of(values))
         with naming(labels):
-            config = _mission_of(values, seed, derive(self.seed, *drawn))
+            config = _mission_of(values, seed, Stream.FAULT.seed(self.seed, *drawn))
             if self.fixed_world is not None and config.world_seed is None:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)

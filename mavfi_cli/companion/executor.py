@@ -32,7 +32,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import numpy as np
 
 from mavfi_cli.companion.node_process import NodeLost, NodeProcess
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Invocation
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.spec.platform import KERNELS, PlatformProfile
@@ -56,7 +56,7 @@ class LatencyModel:
         self, profile: PlatformProfile, root_seed: int, wall: WallClock | None = None
     ) -> None:
         self._profile, self._wall = profile, wall
-        self._streams = {kernel: generator(root_seed, Stream.LATENCY, kernel) for kernel in KERNELS}
+        self._streams = {kernel: Stream.LATENCY.generator(root_seed, kernel) for kernel in KERNELS}
         self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:

@@ -10,7 +10,7 @@ from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.source.injector import (
@@ -64,7 +64,7 @@ class _Killer(Injector):
     _awaits = "control tick"
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float, listener: Listener) -> None:
-        rng = generator(config.seed, Stream.FAULT, "process")
+        rng = Stream.FAULT.generator(config.seed, "process")
         trigger, corruption = config.trigger(), config.corruption()
         super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import (
     Briefing,
     CollisionReport,
@@ -107,7 +107,7 @@ class Kernels:
             replace(request, trajectory_seq=_next_int32(newest)),
             snapshot,
             bounds_enu_m=self._bounds_enu_m,
-            seed=derive(self._seed, Stream.PLANNER, request.attempt),
+            seed=Stream.PLANNER.seed(self._seed, request.attempt),
             params=self._planning_params,
         )
 

@@ -37,7 +37,6 @@ from mavfi_cli.core.types import (
     Stage,
     Trajectory,
     VehicleState,
-    of_stage,
 )
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.injector import Moment
@@ -54,10 +53,10 @@ ATTEMPTS = 2  # maximum recomputations of a command in one tick
 BRAKE_SHARE = 0.6  # fraction of a_max assumed for stopping, as in planned motion
 
 # Monitored states that the receivers of a message read.
-REPORT_STATES = {state.name for state in of_stage(Stage.PERCEPTION)}
-COMMAND_STATES = {state.name for state in of_stage(Stage.CONTROL)}
-FOLLOWED_STATES = {s.name for s in of_stage(Stage.PLANNING) if s.name.startswith("waypoint_")}
-PLAN_STATES = {s.name for s in of_stage(Stage.PLANNING)} - FOLLOWED_STATES
+REPORT_STATES = {state.name for state in Stage.PERCEPTION.states}
+COMMAND_STATES = {state.name for state in Stage.CONTROL.states}
+FOLLOWED_STATES = {s.name for s in Stage.PLANNING.states if s.name.startswith("waypoint_")}
+PLAN_STATES = {s.name for s in Stage.PLANNING.states} - FOLLOWED_STATES
 CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 
 

@@ -43,7 +43,7 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.detect.preprocess import take_tick
 from mavfi_cli.fi.source.injector import Follower
-from mavfi_cli.spec.detector import DetectorConfig, detector_of, watch_of
+from mavfi_cli.spec.detector import DetectorConfig, detector_of, extended_ranges
 
 MAX_LISTED_ALARMS = 100
 TOLD_EVERY_S = 1.0  # minimum time between two announced alarms of one stage
@@ -135,7 +135,7 @@ class Protection(NoProtection):
         self._wall = wall
         detector = detector_of(config, stack)
         stages = frozenset(Stage(name) for name in config.protect)
-        self.gate: Gate = Gate(detector, stages, watch=watch_of(config, detector))
+        self.gate: Gate = Gate(detector, stages, extended=extended_ranges(config, detector))
         self._threshold = detector.threshold
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)

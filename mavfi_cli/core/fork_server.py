@@ -150,7 +150,7 @@ class ForkServer:
 # The server ---------------------------------------------------------------------------------------
 
 
-def main() -> NoReturn:
+def _serve() -> NoReturn:
     """Load the module, then fork a guard for every order until the client closes its end."""
     _call_this_process(SERVER)
     control = socket.socket(fileno=int(sys.argv[1]))
@@ -337,4 +337,4 @@ def _children() -> list[int]:
 
 
 if __name__ == "__main__":
-    main()
+    _serve()

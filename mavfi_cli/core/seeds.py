@@ -22,24 +22,20 @@ class Stream(Enum):
     LATENCY = "latency"
     SENSOR = "sensor"
 
+    def generator(self, root_seed: int, *detail: str | int) -> np.random.Generator:
+        """Return a new PCG64 generator. `detail` names a sub-stream (kernel, invocation)."""
+        return np.random.Generator(np.random.PCG64(self._sequence(root_seed, *detail)))
 
-def _spawn_key(name: str) -> tuple[int, ...]:
-    digest = hashlib.sha256(name.encode()).digest()
-    return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
+    def seed(self, root_seed: int, *detail: str | int) -> int:
+        """Return a positive 31-bit seed for a consumer that takes an int (OMPL, a child process).
 
+        `detail` names a sub-stream.
+        """
+        state = self._sequence(root_seed, *detail).generate_state(1, np.uint32)
+        return int(state[0] & 0x7FFF_FFFF) or 1
 
-def _seed_sequence(root_seed: int, stream: Stream, *detail: str | int) -> np.random.SeedSequence:
-    """Return the seed sequence of a stream. `detail` names a sub-stream (kernel, invocation)."""
-    name = "/".join([stream.value, *(str(part) for part in detail)])
-    return np.random.SeedSequence(root_seed, spawn_key=_spawn_key(name))
-
-
-def generator(root_seed: int, stream: Stream, *detail: str | int) -> np.random.Generator:
-    """Return a new PCG64 generator of one stream."""
-    return np.random.Generator(np.random.PCG64(_seed_sequence(root_seed, stream, *detail)))
-
-
-def derive(root_seed: int, stream: Stream, *detail: str | int) -> int:
-    """Return a positive 31-bit seed for a consumer that takes an int (OMPL, a child process)."""
-    state = _seed_sequence(root_seed, stream, *detail).generate_state(1, np.uint32)
-    return int(state[0] & 0x7FFF_FFFF) or 1
+    def _sequence(self, root_seed: int, *detail: str | int) -> np.random.SeedSequence:
+        name = "/".join([self.value, *(str(part) for part in detail)])
+        digest = hashlib.sha256(name.encode()).digest()
+        key = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
+        return np.random.SeedSequence(root_seed, spawn_key=key)

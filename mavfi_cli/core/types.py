@@ -26,6 +26,11 @@ class Stage(Enum):
     PLANNING = "planning"
     CONTROL = "control"
 
+    @property
+    def states(self) -> tuple[State, ...]:
+        """The states that the stage outputs, in table order."""
+        return tuple(state for state in STATES if state.stage is self)
+
 
 class Outcome(Enum):
     """Outcome of a mission."""
@@ -229,8 +234,3 @@ STATES: tuple[State, ...] = (
     State("command_yaw", Command, "yaw_rad", "rad", detected=True),
 )  # fmt: skip
 BY_NAME: dict[str, State] = {state.name: state for state in STATES}
-
-
-def of_stage(stage: Stage) -> tuple[State, ...]:
-    """Return the states that a stage outputs, in table order."""
-    return tuple(state for state in STATES if state.stage is stage)

@@ -28,10 +28,10 @@ from mavfi_cli.core.types import FloatArray, StackMark, Stage
 from mavfi_cli.detect.preprocess import (
     EXTENDED,
     LIMIT,
+    STATES_DIGEST,
     Codes,
     PreprocessParams,
     Ranges,
-    states_digest,
 )
 
 SCHEMA = 2
@@ -119,7 +119,7 @@ class Model:
     arrays: dict[str, Any]  # arrays of float64, which a file holds as lists
     stack: StackMark  # stack of the flights it was fitted to
     extended: Ranges  # ranges of the extended states in these flights
-    states: str = field(default_factory=states_digest)
+    states: str = STATES_DIGEST
     preprocess: PreprocessParams = field(default_factory=PreprocessParams)
     preprocess_digest: str = ""  # empty: that of `preprocess`
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -194,7 +194,7 @@ class Model:
         model = cls.read(path)
         _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
         _refuse_other(path, "detector", model.detector, detector)
-        if model.states != states_digest():
+        if model.states != STATES_DIGEST:
             raise ModelError("made for another table of states; train it anew", path=path)
         if model.preprocess_digest != model.preprocess.digest():
             raise ModelError("made with another preprocessing; train it anew", path=path)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import ModelError, UnknownName
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import DType, FloatArray, Stage
 from mavfi_cli.detect import gaussian, span
 from mavfi_cli.detect.autoencoder import CODED, HIDDEN, AutoencoderDetector
@@ -112,7 +112,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
 def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
     """Split by flight, in the same way for each world. Return the indices by their use."""
-    drawn = generator(seed, Stream.MISSION, "detector-split").permutation(len(dataset))
+    drawn = Stream.MISSION.generator(seed, "detector-split").permutation(len(dataset))
     worlds = [dataset.flights[place].world for place in drawn]
     ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
     parts: dict[str, list[int]] = {"train": [], "validation": [], "threshold": []}

@@ -70,7 +70,7 @@ class Alarm:
     mended: Trajectory | None = None  # active plan with the accepted extended states
 
 
-class ExtendedWatch:
+class _ExtendedWatch:
     """Watch of the extended states, each judged by its range of changes in error-free flights.
 
     The change since the last accepted message must lie between the smallest and the largest change
@@ -152,6 +152,7 @@ class Gate:
         detector: New detector for this mission only, because it learns.
         protect: Stages to watch. The deltas of the others stay 0.
         params: Preprocessing parameters; must be those of the detector's model.
+        extended: Ranges of the extended states to watch; None watches none of them.
 
     Attributes:
         fresh: Stages with a new sample in the last judged message.
@@ -162,10 +163,10 @@ class Gate:
         detector: Detector,
         protect: frozenset[Stage] = ALL_STAGES,
         params: PreprocessParams | None = None,
-        watch: ExtendedWatch | None = None,
+        extended: Ranges | None = None,
     ) -> None:
         self.detector = detector
-        self._watch = watch
+        self._watch = None if extended is None else _ExtendedWatch(extended)
         self._report: CollisionReport | None = None  # last judged report
         self.protect = protect
         self.fresh: tuple[Stage, ...] = ()

@@ -45,11 +45,11 @@ from mavfi_cli.detect.preprocess import (
     LIMIT,
     NAMES,
     SPANS,
+    STATES_DIGEST,
     Codes,
     PreprocessParams,
     extended_codes,
     plan_deltas,
-    states_digest,
 )
 
 Columns = Mapping[str, NDArray[Any]]
@@ -472,7 +472,7 @@ class Dataset:
 def _signature(preprocess: PreprocessParams) -> dict[str, str]:
     return {
         "mavfi_samples": SCHEMA,
-        "mavfi_states": states_digest(),
+        "mavfi_states": STATES_DIGEST,
         "mavfi_preprocess": preprocess.digest(),
     }
 

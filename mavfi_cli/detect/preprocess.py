@@ -77,6 +77,14 @@ def span(stage: Stage) -> tuple[int, int]:
     return (0, _PLANNING) if stage is _PERCEPTION_STAGE else (_CONTROL, COUNT)
 
 
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+# SHA-256 of names, stages, types and units of the detected states in order.
+STATES_DIGEST = _digest([[s.name, s.stage.value, s.dtype.value, s.unit] for s in DETECTED])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreprocessParams:
     """Floor exponent of each group of states, and the ceiling of `time_to_collision`.
@@ -136,15 +144,6 @@ class PreprocessParams:
         return _digest({"coding": "signed log-magnitude", **asdict(self)})
 
 
-def states_digest() -> str:
-    """Return the SHA-256 of names, stages, types and units of the detected states in order."""
-    return _digest([[s.name, s.stage.value, s.dtype.value, s.unit] for s in DETECTED])
-
-
-def _digest(value: object) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
 def extended_codes(message: Message) -> list[tuple[int, int]]:
     """Return place in EXTENDED and code of each extended state of a message."""
     return [
@@ -155,7 +154,7 @@ def extended_codes(message: Message) -> list[tuple[int, int]]:
 
 
 @compiled
-def encode(value: float, floor: int, ceiling: int, kind: int) -> int:
+def _encode(value: float, floor: int, ceiling: int, kind: int) -> int:
     """Return the code of one value."""
     if math.isnan(value):
         return NAN_CODE
@@ -171,16 +170,16 @@ def encode(value: float, floor: int, ceiling: int, kind: int) -> int:
 def _take(work: Codes, place: int, value: float) -> None:
     """Encode a new sample of a state and make it the reference."""
     floor, kind = work[FLOOR, place], work[KIND, place]
-    code = encode(value, floor, work[CEILING, place], kind)
+    code = _encode(value, floor, work[CEILING, place], kind)
     before = work[REFERENCE, place]
-    work[DELTA, place] = difference(before, code, floor, kind)
+    work[DELTA, place] = _difference(before, code, floor, kind)
     work[PREVIOUS, place] = before
     work[CODE, place] = code
     work[REFERENCE, place] = code
 
 
 @compiled
-def difference(before: int, code: int, floor: int, kind: int) -> int:
+def _difference(before: int, code: int, floor: int, kind: int) -> int:
     """Return the saturated delta of two codes; 0 without a reference or if yaw has wrapped."""
     if before == UNKNOWN:
         return 0
@@ -244,9 +243,9 @@ def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray,
         for column in range(columns):
             place = _PLANNING + column
             floor, kind = work[FLOOR, place], work[KIND, place]
-            code = encode(waypoints[row, column], floor, work[CEILING, place], kind)
+            code = _encode(waypoints[row, column], floor, work[CEILING, place], kind)
             if not begins:
-                delta = difference(codes[column], code, floor, kind)
+                delta = _difference(codes[column], code, floor, kind)
                 out[count, place] = delta
                 changed = changed or delta != 0
             codes[column] = code

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultSpecError, named_member
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, Scalar, draw_bits, flip
 
 Value = TypeVar("Value", bound=Scalar | np.generic | NDArray[Any])
@@ -48,7 +48,7 @@ def inject(
         raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; types are {known}")
     if corrupted.size == 0:
         raise FaultSpecError("cannot flip bits of an array without elements")
-    rng = generator(seed, Stream.FAULT, "value")
+    rng = Stream.FAULT.generator(seed, "value")
     element = int(rng.integers(corrupted.size))
     chosen = exact_bits
     if chosen is None:

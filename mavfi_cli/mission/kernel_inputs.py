@@ -22,7 +22,7 @@ from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, TargetError
 from mavfi_cli.core.files import writing
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.run import fly_golden
 from mavfi_cli.spec.mission import MissionConfig
@@ -132,7 +132,7 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
             start_enu_m=request.position_enu_m,
             goal_enu_m=request.goal_enu_m,
             bounds_enu_m=recorder.briefing.bounds_enu_m,
-            seed=derive(config.seed, Stream.PLANNER, request.attempt),
+            seed=Stream.PLANNER.seed(config.seed, request.attempt),
         )
         grid = PlanningProblem.pose(
             snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()

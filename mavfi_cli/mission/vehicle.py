@@ -24,7 +24,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError, described
 from mavfi_cli.core.processes import PYTHON
-from mavfi_cli.core.seeds import Stream, derive
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
@@ -224,7 +224,7 @@ def _firmware_arguments(config: MissionConfig) -> list[str]:
     if config.autopilot == OWN_AUTOPILOT:
         return []
     option = "--hil" if config.autopilot == "px4" else "--json"
-    seed = derive(config.seed, Stream.SENSOR, "firmware")
+    seed = Stream.SENSOR.seed(config.seed, "firmware")
     return [
         option, config.autopilot, "--firmware", str(config.with_firmware().firmware),
         "--firmware-seed", str(seed),

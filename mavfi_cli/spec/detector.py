@@ -14,7 +14,7 @@ from mavfi_cli.spec.stack import load_stack
 
 if TYPE_CHECKING:
     from mavfi_cli.detect.base import Detector
-    from mavfi_cli.detect.gate import ExtendedWatch
+    from mavfi_cli.detect.preprocess import Ranges
 
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
@@ -120,18 +120,17 @@ def detector_of(config: DetectorConfig, stack: str) -> Detector:
                 "--any-stack-model (any_stack in a campaign)",
                 path=path,
             )
-    watch_of(config, detector)
+    extended_ranges(config, detector)
     return detector
 
 
-def watch_of(config: DetectorConfig, detector: Detector) -> ExtendedWatch | None:
-    """Create the watch of the extended states from the detector's model; None if not configured.
+def extended_ranges(config: DetectorConfig, detector: Detector) -> Ranges | None:
+    """Return the ranges of the extended states in the detector's model; None if not configured.
 
     Raises:
         ConfigError: The model lacks ranges of the extended states.
     """
     from mavfi_cli.detect.base import FittedDetector
-    from mavfi_cli.detect.gate import ExtendedWatch
 
     if config.watch == PAPER:
         return None
@@ -140,4 +139,4 @@ def watch_of(config: DetectorConfig, detector: Detector) -> ExtendedWatch | None
         raise ConfigError(
             f"{EXTENDED} needs the ranges of a model, and {config.name} has none", key="watch"
         )
-    return ExtendedWatch(ranges)
+    return ranges

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import BY_NAME
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.source.fault import (
@@ -274,7 +274,7 @@ class InstructionConfig:
         if self.target not in _NODES:
             raise UnknownName("node or stage", self.target, _NODES)
         nodes = _NODES[self.target]
-        return nodes[int(generator(self.seed, Stream.FAULT, "node").integers(len(nodes)))]
+        return nodes[int(Stream.FAULT.generator(self.seed, "node").integers(len(nodes)))]
 
     def strategy(self) -> Strategy:
         """Return the sampling strategy.

@@ -35,7 +35,7 @@ from mavfi_cli.core.config import load_toml, toml_text
 from mavfi_cli.core.errors import RecordError, UnknownName, WorldError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 
 CLEAR_RADIUS_M = 3.0
 """Minimum horizontal distance of an obstacle from start and goal."""
@@ -307,8 +307,8 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
 
 
 def _occupied(pair: _Pair, seed: int, i: int, j: int) -> bool:
-    stream = generator(
-        seed, Stream.WORLD, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
+    stream = Stream.WORLD.generator(
+        seed, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
     )
     return bool(stream.random() < pair.density)
 
@@ -386,7 +386,7 @@ def _choose(
     goal: Vector | None,
 ) -> tuple[Vector, Vector]:
     """Draw missing start and goal until they are clear and at the scene's distance."""
-    stream = generator(seed, Stream.WORLD, "places", scene.name)
+    stream = Stream.WORLD.generator(seed, "places", scene.name)
     least, most = scene.goal_distance_m
     low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M
     for _ in range(_TRIES):

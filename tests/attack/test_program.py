@@ -20,7 +20,7 @@ from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import RunLimits, RunOutcome, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.arch import decode
 from mavfi_cli.fi.tracer.fault import (
@@ -291,7 +291,7 @@ def test_a_record_survives_and_gives_the_fault_back(target, tmp_path):
         path = tmp_path / "fault.json"
         record.write(path, entry)
         again = record.read(path)
-        rng = generator(9, Stream.FAULT, entry["run"])
+        rng = Stream.FAULT.generator(9, entry["run"])
         drawn = campaign.profile.draw(plan.strategy(), rng)
         assert record.fault_of(again) == record.fault_of(before) == drawn
         assert again["object"] == "counting"

@@ -8,7 +8,7 @@ import sys
 import time
 
 from mavfi_cli.core.errors import RecordError, VehicleProcessError, WorldError
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 
 
 def prepare():
@@ -52,7 +52,7 @@ def perform(changes, out):
 
 
 def record(changes, seed, world, value):
-    rng = generator(seed, Stream.MISSION)
+    rng = Stream.MISSION.generator(seed)
     outcome = value if world == "end" else "success"
     return {
         "schema": 1,

@@ -9,7 +9,6 @@ from mavfi_cli.core.types import (
     DType,
     Stage,
     Trajectory,
-    of_stage,
 )
 
 TRAJECTORY = Trajectory(
@@ -54,5 +53,5 @@ def test_the_thirteen_inputs_of_the_autoencoder():
 
 
 def test_every_stage_has_states():
-    assert sum(len(of_stage(stage)) for stage in Stage) == len(STATES)
-    assert all(of_stage(stage) for stage in Stage)
+    assert sum(len(stage.states) for stage in Stage) == len(STATES)
+    assert all(stage.states for stage in Stage)

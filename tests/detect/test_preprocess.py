@@ -11,11 +11,30 @@ from mavfi_cli.core.types import WAYPOINT_FIELDS, Stage
 from mavfi_cli.detect import preprocess as pre
 from mavfi_cli.detect.preprocess import NAMES, PreprocessParams
 
-REAL, INTEGER, ANGLE = 0, 1, 2
+KEEPS_REPORT = False
 
 
-def code(value, floor=0, ceiling=pre.LIMIT, kind=REAL):
-    return pre.encode(value, floor, ceiling, kind)
+def taken(*values, place="waypoint_x", **params):
+    """The working array after some values of a state have arrived one after the other."""
+    work = PreprocessParams(**params).working_array()
+    for value in values:
+        waypoint = np.zeros((1, 10))
+        if place in NAMES[2:9]:
+            waypoint[0, NAMES.index(place) - 2] = value
+            pre.take_tick(waypoint, 0, np.zeros(3), 0.0, KEEPS_REPORT, work)
+        else:
+            both = {"time_to_collision": 1.0, "future_collision_seq": 0.0, place: value}
+            pre.take_report(*both.values(), work)
+    return work[:, NAMES.index(place)].tolist()
+
+
+def code(value, floor=0, **others):
+    floors = {} if "place" in others else {"position_floor": floor}
+    return taken(value, **floors, **others)[pre.CODE]
+
+
+def delta(*values, **others):
+    return taken(*values, **others)[pre.DELTA]
 
 
 def exponent_bits(value):
@@ -58,25 +77,23 @@ def test_values_through_zero_and_special_ones():
     assert code(math.inf) == 1024
     assert code(-math.inf) == -1024
     assert code(math.nan) == code(-math.nan) == pre.NAN_CODE
-    assert code(math.inf, ceiling=4) == code(17.0, ceiling=4) == 4
-    assert code(7, kind=INTEGER) == 7
-    assert code(-(2.0**31), kind=INTEGER) == -pre.LIMIT
+    endless = {"place": "time_to_collision", "time_to_collision_ceiling": 4}
+    assert code(math.inf, **endless) == code(17.0, **endless) == 4
+    assert code(7, place="future_collision_seq") == 7
+    assert code(-(2.0**31), place="future_collision_seq") == -pre.LIMIT
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "delta"),
-    [(1, -1, -2), (pre.UNKNOWN, 500, 0), (pre.LIMIT, -pre.LIMIT, -pre.LIMIT), (3, 5, 2)],
-)
-def test_differences(before, after, delta):
-    assert pre.difference(before, after, 0, REAL) == delta
+def test_differences():
+    assert delta(500.0) == 0  # nothing was known before
+    assert delta(2.0, -2.0) == -2
+    assert delta(8.0, 32.0) == 2
+    assert delta(2.0**31, -(2.0**31), place="future_collision_seq") == -pre.LIMIT
 
 
 def test_yaw_wraps_and_its_sign_flip_elsewhere_does_not():
-    floor = PreprocessParams().yaw_floor
-    codes = [code(v, floor, kind=ANGLE) for v in (3.1, -3.1, 1.2, -1.2)]
-    assert pre.difference(codes[0], codes[1], floor, ANGLE) == 0
-    assert pre.difference(codes[1], codes[0], floor, ANGLE) == 0
-    assert abs(pre.difference(codes[2], codes[3], floor, ANGLE)) == 2 * abs(codes[2]) > 0
+    yaw = {"place": "waypoint_yaw"}
+    assert delta(3.1, -3.1, **yaw) == delta(-3.1, 3.1, **yaw) == 0
+    assert abs(delta(1.2, -1.2, **yaw)) == 2 * abs(code(1.2, **yaw)) > 0
 
 
 def test_reports_and_ticks_write_only_what_is_theirs():

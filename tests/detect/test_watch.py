@@ -8,7 +8,7 @@ from detect_builders import RANGES, command, plan, report, trace
 
 from mavfi_cli.core.types import CollisionReport, Stage, Trajectory
 from mavfi_cli.detect import base
-from mavfi_cli.detect.gate import ExtendedWatch, Gate
+from mavfi_cli.detect.gate import Gate
 from mavfi_cli.detect.offline import FlightSamples
 from mavfi_cli.detect.preprocess import EXTENDED
 
@@ -22,7 +22,7 @@ def numbered(seq, known=0, stamp_s=0.0):
 
 
 def gate_of(name, *, ranges=RANGES, **options):
-    return Gate(base.find_detector(name), watch=ExtendedWatch(ranges), **options)
+    return Gate(base.find_detector(name), extended=ranges, **options)
 
 
 @pytest.mark.parametrize("name", OURS)

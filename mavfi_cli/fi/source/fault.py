@@ -16,8 +16,8 @@ from enum import Enum
 import numpy as np
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
-from mavfi_cli.core.seeds import Stream, generator
-from mavfi_cli.core.types import BY_NAME, Stage, State, of_stage
+from mavfi_cli.core.seeds import Stream
+from mavfi_cli.core.types import BY_NAME, Stage, State
 from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field, mask_of
 
 
@@ -130,7 +130,7 @@ def draw_fault(
         UnknownName: no such stage, state or group.
         FaultSpecError: a bit outside the width, a field that the type does not have.
     """
-    rng = generator(seed, Stream.FAULT, "site")
+    rng = Stream.FAULT.generator(seed, "site")
     states = _states(target, rng, together, corruption.field)
     for state in states:
         require_bits(state.name, NUMPY_TYPES[state.dtype.value], corruption, bits)
@@ -167,7 +167,7 @@ def _states(
     elif target in GROUPS:
         candidates = _group(target)
     elif target in stages:
-        whole = of_stage(stages[target])
+        whole = stages[target].states
         has = [state for state in whole if field in NUMPY_TYPES[state.dtype.value].fields]
         candidates = tuple(has) or whole
     else:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import CollisionReport, Command, Message, Scalar, State, Trajectory
 from mavfi_cli.fi import bits as bit_operations
 from mavfi_cli.fi.source.fault import (
@@ -281,7 +281,7 @@ class SourceInjector(Injector):
     ) -> None:
         self.fault = fault
         self._kind = fault.states[0].message
-        self._rng = generator(seed, Stream.FAULT, "strike")
+        self._rng = Stream.FAULT.generator(seed, "strike")
         super().__init__(self._rng, fault.trigger, fault.corruption, shortest_flight_s, listener)
         self._awaits = _WORDS[self._kind]
         self._invocations = 0
@@ -399,7 +399,7 @@ class MemoryInjector(Injector):
     ) -> None:
         if array is not None and array not in memory:
             raise UnknownName("part of the detector's memory", array, memory)
-        rng = generator(seed, Stream.FAULT, "memory")
+        rng = Stream.FAULT.generator(seed, "memory")
         super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
         names = sorted(memory)
         if array is None:

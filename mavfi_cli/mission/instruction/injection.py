@@ -33,7 +33,7 @@ from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.files import file_digest, own_digest, write_atomically, writing
 from mavfi_cli.core.installed import installed_versions
-from mavfi_cli.core.seeds import Stream, generator
+from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
@@ -91,9 +91,9 @@ def _plan_fault(config: MissionConfig, asked: InstructionConfig, out: Path) -> _
             f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
             "world, seed or node"
         )
-    rng = generator(asked.seed, Stream.FAULT, "instruction")
+    rng = Stream.FAULT.generator(asked.seed, "instruction")
     drawn = draw_invocation(node, counts, rng)
-    profiling = generator(config.seed, Stream.FAULT, "profile", kernel, drawn.number)
+    profiling = Stream.FAULT.generator(config.seed, "profile", kernel, drawn.number)
     found: TargetProfile = _kept(
         folder / f"profile-{kernel}-{drawn.number}.pickle",
         lambda: profile_invocation(

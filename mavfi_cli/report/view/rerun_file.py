@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from matplotlib.colors import to_rgb
 
 from mavfi_cli.core.files import write_atomically
-from mavfi_cli.core.types import Stage, of_stage
+from mavfi_cli.core.types import Stage
 from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _TIME = "simulated_time"
@@ -176,6 +176,6 @@ def _eye(flight: ViewedFlight) -> Any:
 
 def _groups(stage: Stage) -> dict[str, Sequence[str]]:
     groups: dict[str, Sequence[str]] = {}
-    for state in of_stage(stage):
+    for state in stage.states:
         groups[state.group] = (*groups.get(state.group, ()), state.name)
     return groups

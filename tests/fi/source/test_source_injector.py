@@ -16,7 +16,6 @@ from mavfi_cli.core.types import (
     Message,
     Stage,
     Trajectory,
-    of_stage,
 )
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
 from mavfi_cli.fi.source.fault import (
@@ -330,7 +329,7 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
         for seed in range(60)
     ]
     assert {state.dtype.value for state in drawn} == {"float64"}
-    able = {state.name for state in of_stage(Stage(stage)) if state.dtype.value == "float64"}
+    able = {state.name for state in Stage(stage).states if state.dtype.value == "float64"}
     assert {state.name for state in drawn} == able
 
 
