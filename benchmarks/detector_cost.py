@@ -23,7 +23,7 @@ from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect import base
 from mavfi_cli.detect.gate import Gate
 from mavfi_cli.mission.measures import detection_cost
-from mavfi_cli.spec.detector import DetectorConfig, detector_of
+from mavfi_cli.spec.detector import DetectorConfig
 
 CALM = ("--stack", "hardened", "--world", "dense")
 TICK_S = 0.02
@@ -77,7 +77,7 @@ def in_loop() -> None:
     print(f"{'detector':10} {'a check, us':>12} {'with waypoint':>15} {'share of 50 Hz':>15}"
           f" {'a report, us':>13}")  # fmt: skip
     for name in base.detector_names():
-        gate = Gate(detector_of(DetectorConfig(name=name), "hardened"))
+        gate = Gate(DetectorConfig(name=name).built("hardened"))
         each = min(timed(gate) for _ in range(7)) - empty
         fresh = []
         for i in range(100):

@@ -24,7 +24,7 @@ from mavfi_cli.detect import base
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.offline import replay
 from mavfi_cli.detect.preprocess import DETECTED, NAMES
-from mavfi_cli.spec.detector import DetectorConfig, detector_of
+from mavfi_cli.spec.detector import DetectorConfig
 
 STACK = "hardened"  # that the runs were flown on
 
@@ -97,7 +97,7 @@ def found(held: list[Run], count: int = 3000) -> None:
     kept: dict[str, np.ndarray] = {}
     for name in base.detector_names():
         seen = []
-        detector = detector_of(DetectorConfig(name=name), STACK)
+        detector = DetectorConfig(name=name).built(STACK)
         for strike in struck:
             judged = replay(strike.columns, detector)
             seen.append(
@@ -112,7 +112,7 @@ def found(held: list[Run], count: int = 3000) -> None:
         alarms = sum(
             j.alarm is not None
             for run in held
-            for j in replay(run.columns, detector_of(DetectorConfig(name=name), STACK))
+            for j in replay(run.columns, DetectorConfig(name=name).built(STACK))
         )
         print(f" {name}: {alarms} ({alarms / hours:.1f}/h)", end="")
     keys = [(strike.state, strike.field, strike.material) for strike in struck]

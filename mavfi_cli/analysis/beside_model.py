@@ -27,7 +27,7 @@ from mavfi_cli.core.config import toml_text
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import write_text, writing
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.spec.detector import detector_with_model
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT
@@ -113,7 +113,7 @@ def flight_plan(
         a_max_mps2=accel_mps2,
         map_range_m=range_m,
         camera_rate_hz=rate_hz,
-        detector=detector_with_model(scheme.name, models) if watched else None,
+        detector=DetectorConfig.with_model(scheme.name, models) if watched else None,
     )
     limits = SchemeLimits(
         v_max_mps=velocity_mps,

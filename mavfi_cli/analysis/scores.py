@@ -26,7 +26,7 @@ from mavfi_cli.detect.offline import Columns, FlightSamples, PlanStrike, columns
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.fi import bits
 from mavfi_cli.mission.run_folder import RESULT, Run, load_run
-from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
 
@@ -144,8 +144,8 @@ class Scores:
         """The highest score from the strike on, or of the whole flight without one."""
         if not flight.columns:  # it ended before the first tick
             return 0.0
-        path = model_path(detector, self._stack)
-        fresh = detector_of(detector, self._stack)
+        path = detector.model_path(self._stack)
+        fresh = detector.built(self._stack)
         from_s = -math.inf if struck_s is None else struck_s - 1e-9
         highest = 0.0
         judgements = replay(

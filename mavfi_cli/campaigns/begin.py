@@ -39,7 +39,6 @@ from mavfi_cli.core.errors import (
 from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
-from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.spec.stack import load_stack
@@ -303,7 +302,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
         config.instruction.strategy()
         config.instruction.node()
     if config.detector is not None:
-        detector_of(config.detector, config.stack)
+        config.detector.built(config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector needs a detector")
     if start:

@@ -22,13 +22,7 @@ from mavfi_cli.core.types import DType, Stage
 from mavfi_cli.detect.base import detector_names
 from mavfi_cli.detect.fit import KINDS
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.spec.detector import (
-    STAGES,
-    DetectorConfig,
-    detector_of,
-    detector_with_model,
-    model_path,
-)
+from mavfi_cli.spec.detector import STAGES, DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -97,7 +91,7 @@ class _Site(NamedTuple):
 
 def model_digest(detector: DetectorConfig, stack: str) -> str:
     """Digest of a detector's model file; `none` without one."""
-    path = model_path(detector, stack)
+    path = detector.model_path(stack)
     return "none" if path is None else file_digest(path)
 
 
@@ -162,7 +156,7 @@ class EvaluationPlan:
         Raises:
             ModelError: the folder of models has no such file.
         """
-        return detector_with_model(detector, self.models, self.protect)
+        return DetectorConfig.with_model(detector, self.models, self.protect)
 
     def told(self) -> dict[str, Any]:
         """The plan, with descriptions of the detectors, as plain values."""
@@ -171,7 +165,7 @@ class EvaluationPlan:
             "worlds": list(self.worlds),
             "detectors": {
                 each.name: {
-                    "threshold": detector_of(each, stack).threshold,
+                    "threshold": each.built(stack).threshold,
                     "model_sha256": model_digest(each, stack),
                 }
                 for each in map(self.detector_config, self.protectors)

@@ -16,9 +16,8 @@ from mavfi_cli.cli.grouped import (
     given_options,
     names_in,
     refuse_given,
-    spelling,
 )
-from mavfi_cli.core.errors import ConfigError, FaultSpecError
+from mavfi_cli.core.errors import FaultSpecError
 
 if TYPE_CHECKING:
     from mavfi_cli.spec.detector import DetectorConfig
@@ -32,67 +31,51 @@ _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
-class _Place(click.ParamType[Any]):
-    """Three numbers: east, north, up in metres."""
-
-    name = "X,Y,Z"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, float, float]:
-        """(east, north, up), or a usage error."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            x, y, z = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not three numbers like 30,40,5", param, ctx)
-        return x, y, z
+def _place(_ctx: Any, _param: Any, value: str | None) -> tuple[float, float, float] | None:
+    """(east, north, up) in metres, or a usage error."""
+    if value is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not three numbers like 30,40,5") from None
+    return x, y, z
 
 
-class _Stages(click.ParamType[Any]):
-    """Names of stages, separated by commas."""
-
-    name = "STAGE,..."
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
-        """The names, in the given order."""
-        if isinstance(value, tuple):
-            return value
-        return names_in(str(value))
-
-
-_mission = partial(click.option, cls=GroupedOption, group="Mission")
-_fault = partial(click.option, cls=GroupedOption, group="Fault")
-_instruction = partial(click.option, cls=GroupedOption, group="Instruction level")
-_detector = partial(click.option, cls=GroupedOption, group="Detector")
-_output = partial(click.option, cls=GroupedOption, group="Output")
+_option = partial(click.option, cls=GroupedOption, show_default=True)
+_mission, _fault = partial(_option, group="Mission"), partial(_option, group="Fault")
+_instruction = partial(_option, group="Instruction level")
+_detector, _output = partial(_option, group="Detector"), partial(_option, group="Output")
 
 
 @click.command(cls=GroupedCommand)
 @_mission("--config", metavar="FILE", type=click.Path(path_type=Path, exists=True, dir_okay=False),
           help="TOML file of the whole mission. Other options override it. "
                "docs/reference/settings.md lists its keys.")  # fmt: skip
-@_mission("--world", default="dense", show_default=True, metavar="NAME|FILE",
+@_mission("--world", default="dense", metavar="NAME|FILE",
           help="World, or a TOML file of boxes; `mavfi world list` lists the worlds.")  # fmt: skip
-@_mission("--seed", default=3, show_default=True, help="Root seed of all random draws.")
+@_mission("--seed", default=3, help="Root seed of all random draws.")
 @_mission("--world-seed", type=int, help="Seed of the world only  [--seed].")
-@_mission("--planner", default="rrtstar", show_default=True,
+@_mission("--planner", default="rrtstar",
           help="Planner: rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
-@_mission("--platform", default="x86", show_default=True, metavar="NAME|FILE|measured:FACTOR",
+@_mission("--platform", default="x86", metavar="NAME|FILE|measured:FACTOR",
           help="Computer whose latencies the kernels have; `mavfi platforms` lists them. "
                "`measured` takes the kernel times of this host times FACTOR and needs "
                "--realtime.")  # fmt: skip
-@_mission("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+@_mission("--stack", default="mavbench", metavar="NAME|FILE",
           help="Structure, checks and gains of the companion; `mavfi stacks` lists the "
                "stacks.")  # fmt: skip
-@_mission("--vehicle", default="solo", show_default=True, metavar="NAME|FILE",
+@_mission("--vehicle", default="solo", metavar="NAME|FILE",
           help="Simulated vehicle: solo, spark, or a TOML file.")  # fmt: skip
-@_mission("--start", type=_Place(), help="Take-off position, ENU, m  [the world's].")
-@_mission("--goal", type=_Place(),
+@_mission(
+    "--start", metavar="X,Y,Z", callback=_place, help="Take-off position, ENU, m  [the world's]."
+)
+@_mission("--goal", metavar="X,Y,Z", callback=_place,
           help="Goal, ENU, m  [the world's]. A generated world is built around start and goal: "
                "other positions move its bounds, and towers within 3 m of them are left "
                "out.")  # fmt: skip
-@_mission("--v-max", "v_max_mps", default=3.0, show_default=True, help="Speed limit, m/s.")
-@_mission("--time-limit", "time_limit_s", default=300.0, show_default=True,
+@_mission("--v-max", "v_max_mps", default=3.0, help="Speed limit, m/s.")
+@_mission("--time-limit", "time_limit_s", default=300.0,
           help="Limit of simulated time after take-off, s.")  # fmt: skip
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
 @_mission("--link", metavar="URL",
@@ -100,17 +83,17 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_mission("--eyes", is_flag=True,
           help="Start depth camera and referee of --world beside the autopilot on --link. The "
                "body is that of --vehicle.")  # fmt: skip
-@_mission("--origin", type=_Place(),
+@_mission("--origin", metavar="X,Y,Z", callback=_place,
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
-@_mission("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
+@_mission("--autopilot", default="ours", metavar="ours|px4|ardupilot",
           help="Autopilot of the simulated vehicle. px4 and ardupilot are started and ended with "
                "the mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
           help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @_mission("--key-file", metavar="FILE", type=click.Path(dir_okay=False),
           help="File with the signing passphrase of --link.")  # fmt: skip
-@_mission("--loss-limit", "loss_limit_s", default=5.0, show_default=True,
+@_mission("--loss-limit", "loss_limit_s", default=5.0,
           help="Time without a new state or depth frame after which --link counts as lost, s. It "
                "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
@@ -119,29 +102,28 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
              "process.NODE (the node's process is killed).")  # fmt: skip
-@_fault("--at", default="random", show_default=True,
+@_fault("--at", default="random",
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
-@_fault("--fault-seed", default=1, show_default=True, type=click.IntRange(min=0),
+@_fault("--fault-seed", default=1, type=click.IntRange(min=0),
         help="Seed of all random draws of the fault.")  # fmt: skip
-@_fault("--bits", default=1, show_default=True, help="Number of bits to flip.")
-@_fault("--field", default="any", show_default=True,
+@_fault("--bits", default=1, help="Number of bits to flip.")
+@_fault("--field", default="any",
         help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
 @_fault("--bit", "exact_bits", multiple=True, type=int,
         help="Flip this bit instead of a random one; 0 is the lowest. May be "
              "repeated.")  # fmt: skip
 @_fault("--all-components", "together", is_flag=True,
         help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
-@_fault("--effect", default="flip", show_default=True,
+@_fault("--effect", default="flip",
         help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
-@_fault("--persistence", default="transient", show_default=True,
+@_fault("--persistence", default="transient",
         help="Persistence: transient (once), stuck-at (held), intermittent (again).")  # fmt: skip
 @_fault("--duration", "duration_s", type=float,
         help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
-@_fault("--restart", "node_restart_s", default=1.0, show_default=True,
+@_fault("--restart", "node_restart_s", default=1.0,
         help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
-              show_default=True,
               help="`instruction` corrupts an operand of one machine instruction of a kernel. "
                    "--inject is then point_cloud, octomap, collision_check, planner, control, "
                    "perception or planning.")  # fmt: skip
@@ -153,7 +135,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_detector("--detector", metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
-@_detector("--protect", type=_Stages(), default="perception,planning,control", show_default=True,
+@_detector("--protect", metavar="STAGE,...", default="perception,planning,control",
+           callback=lambda _ctx, _param, value: names_in(value),
            help="Stages that the detector watches.")  # fmt: skip
 @_detector("--threshold", type=float,
            help="Score above which the detector raises an alarm; for gad the number of sigmas  "
@@ -163,15 +146,15 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_detector("--any-stack-model", "any_stack", is_flag=True,
            help="Accept a model of another stack. Without --model, use the model of the base "
                 "stack.")  # fmt: skip
-@_detector("--watch", default="paper", show_default=True, metavar="paper|extended",
+@_detector("--watch", default="paper", metavar="paper|extended",
            help="States that the detector watches. paper has the 13 of the paper; extended adds "
                 "collision and the sequence numbers of plans.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
-         show_default=True, help="Parent of the new run folder.")  # fmt: skip
+         help="Parent of the new run folder.")  # fmt: skip
 @_output("--record", metavar="mcap|rrd", type=click.Choice(["mcap", "rrd"]),
          help="Also record depth frames, clouds and maps: flight.mcap for Foxglove, flight.rrd "
               "for rerun.")  # fmt: skip
-@_output("--picture/--no-picture", default=True, help="Draw flight.svg.", show_default=True)
+@_output("--picture/--no-picture", default=True, help="Draw flight.svg.")
 @_output("--expect", type=click.Choice(_OUTCOMES),
          help="Exit with code 1 if the outcome differs.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print result.json instead of the summary.")
@@ -229,8 +212,8 @@ def _mission_of(path: Path | None) -> MissionConfig:
     """The mission of the file, with the options in place.
 
     Raises:
-        ConfigError: the file is not valid.
-        UsageError: an option is not valid; the message names it.
+        ConfigError: the file or an option is not valid.
+        UsageError: options do not fit together.
     """
     from mavfi_cli.core.config import load_toml
     from mavfi_cli.spec.mission import MissionConfig
@@ -238,32 +221,21 @@ def _mission_of(path: Path | None) -> MissionConfig:
     base = MissionConfig() if path is None else load_toml(path, MissionConfig)
     try:
         return _replaced(base, given_options())
-    except ConfigError as error:
-        if error.path is not None:
-            raise
-        named = f"{spelling(error.key)}: " if error.key else ""
-        raise click.UsageError(f"{named}{error.problem}") from None
     except FaultSpecError as error:
         raise click.UsageError(str(error)) from None
 
 
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     """The mission with the given options in place."""
-    from mavfi_cli.spec.detector import detector_of
     from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
-    from mavfi_cli.spec.platform import measured_factor
 
     fault, instruction = _faults(base, given)
     link = given.get("link", base.link)
     land = given.pop("land", base.land or (link is not None and base.link is None))
-    platform = given.get("platform", base.platform)
     if link is not None and not given.get("eyes", base.eyes):
         refuse_given(OF_THE_WORLD, "has no meaning with --link unless --eyes is given")
     if given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
-    paced = link is not None or given.get("realtime", base.realtime)
-    if measured_factor(platform) is not None and not paced:
-        raise click.UsageError(f"--platform {platform} needs --realtime")
     own = {field.name for field in fields(base)} - {"fault", "instruction", "detector"}
     mission = replace(
         base,
@@ -275,7 +247,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     )
     mission.loaded_stack()
     if mission.detector is not None:
-        detector_of(mission.detector, mission.stack)
+        mission.detector.built(mission.stack)
     elif fault is not None and fault.attacks_detector:
         raise click.UsageError(f"--inject {fault.target} needs --detector NAME")
     return mission

@@ -66,46 +66,28 @@ class LatencyModel:
             host_s = self._wall.newest.get(kernel, 0.0)
             self._host_s[kernel].append(host_s)
             return self._profile.measured_factor * host_s
-        latency = self._profile.kernels[kernel]
-        if latency.spread == 0.0:
-            return latency.latency_s
-        return latency.latency_s * math.exp(
-            latency.spread * float(self._streams[kernel].standard_normal())
-        )
+        latency, drawn = self._profile.kernels[kernel], self._streams[kernel].standard_normal()
+        return latency.latency_s * math.exp(latency.spread * float(drawn))
 
     def summary(self) -> dict[str, Any] | None:
         """Return the factor of a measured platform, and each kernel's medians, s; else None."""
         factor = self._profile.measured_factor
         if factor is None:
             return None
-        medians = {kernel: float(np.median(s)) for kernel, s in self._host_s.items() if s}
-        return {
-            "platform": self._profile.name,
-            "factor": factor,
-            "kernels": {
-                kernel: {
-                    "host_median_s": median_s,
-                    "latency_median_s": factor * median_s,
-                    "invocations": len(self._host_s[kernel]),
-                }
-                for kernel, median_s in medians.items()
-            },
+        kernels = {
+            kernel: {
+                "host_median_s": (median_s := float(np.median(times_s))),
+                "latency_median_s": factor * median_s,
+                "invocations": len(times_s),
+            }
+            for kernel, times_s in self._host_s.items()
+            if times_s
         }
+        return {"platform": self._profile.name, "factor": factor, "kernels": kernels}
 
 
 class TurnOver(Exception):
     """Ends a turn before its last node."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Loss:
-    """Loss of a node's process."""
-
-    node: str
-    stamp_s: float  # due time of the output, or time of the watchdog's kill
-    hung: bool
-    how: str
-    traceback: str = ""  # traceback of an error in the kernel
 
 
 @dataclass(slots=True, eq=False)
@@ -122,9 +104,7 @@ class Node(Generic[In, Out]):
     dropped: int = 0  # inputs replaced by a newer one before they were read
     busy_s: float = 0.0
     process: NodeProcess | None = None  # process that runs the kernel; None for this one
-    losses: list[_Loss] = field(default_factory=list)
     restarts: int = 0
-    finished: int = 0  # completed or failed invocations
     free_s: float = 0.0  # end of the newest invocation outside the queue
     mates: list[AnyNode] = field(default_factory=list)  # others in its process, in cyclic order
 
@@ -200,7 +180,7 @@ class Executor:
     on_start: Callable[[str, Any, float], None] = lambda _node, _input, _start_s: None
     now_s: float = 0.0
     nodes: dict[str, AnyNode] = field(default_factory=dict)
-    losses: list[_Loss] = field(default_factory=list)
+    losses: list[NodeLost] = field(default_factory=list)
     timetable: list[Invocation] = field(default_factory=list)
     _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)  # a heap
     _waiting: list[AnyNode] = field(default_factory=list)
@@ -269,7 +249,6 @@ class Executor:
             node.dropped += 1
             return None
         job = self._begin_job(node, value)
-        node.finished += 1
         lost: NodeLost | None = None
         try:
             job.result(self.wall)
@@ -341,7 +320,6 @@ class Executor:
     def _finish(self, job: _Job) -> None:
         if job.cancelled:
             return
-        job.node.finished += 1
         self._jobs.pop(job.node.name, None)
         try:
             output = job.result(self.wall)
@@ -352,15 +330,15 @@ class Executor:
         assert job.turn is not None
         self._go_on(job.turn, output)  # its core is still busy, so new invocations queue last
         self._start_next(job.node)
-        self._working -= 1
-        self._start_waiting()
+        self._free_cores(1)
 
     def _start_next(self, node: AnyNode) -> None:
         """Start the next node of the process that has an input."""
         for each in (*node.mates, node):
             self._start_if_free(each)
 
-    def _start_waiting(self) -> None:
+    def _free_cores(self, number: int) -> None:
+        self._working -= number
         while self._waiting and self._working < self.cores:
             self._start_if_free(self._waiting.pop(0))
 
@@ -393,11 +371,10 @@ class Executor:
         for job in jobs:  # the result must not depend on the host's progress
             job.settle(self.wall)
             job.cancelled = True
-            self._working -= 1
         node.busy, node.pending = True, None
         self._note_loss(node, self.now_s, NodeLost(hung=False, how="killed by SIGKILL"))
         self._at(self.now_s + self.restart_s, self._restart, node)
-        self._start_waiting()
+        self._free_cores(len(jobs))
 
     def _lose(self, job: _Job, loss: NodeLost) -> None:
         """Handle a lost output: the node stays busy until its death, then until its restart."""
@@ -408,17 +385,14 @@ class Executor:
         self._at(gone_s, self._end_process, job.node)
 
     def _note_loss(self, node: AnyNode, gone_s: float, loss: NodeLost) -> None:
-        entry = _Loss(node=node.name, stamp_s=gone_s, hung=loss.hung, how=loss.how,
-                     traceback=loss.traceback)  # fmt: skip
-        node.losses.append(entry)
-        self.losses.append(entry)
+        loss.node, loss.stamp_s = node.name, gone_s
+        self.losses.append(loss)
         for mate in node.mates:
             mate.pending = None
 
     def _end_process(self, node: AnyNode) -> None:
-        self._working -= 1
         self._at(self.now_s + self.restart_s, self._restart, node)
-        self._start_waiting()
+        self._free_cores(1)
 
     def _restart(self, node: AnyNode) -> None:
         """Start a new process with fresh state, as the nodes' copies in this process never ran."""

@@ -5,8 +5,7 @@ If a node runs in its own process, its state is there, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, smoothing, tracking
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
@@ -20,7 +19,7 @@ from mavfi_cli.core.types import (
     Trajectory,
 )
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.stack import KEYS, Stack
+from mavfi_cli.spec.stack import Stack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +55,7 @@ class Kernels:
         self._collision_params = collision.CollisionParams(
             radius_m=stack.check_radius_m,
             farthest_m=stack.farthest_waypoint_m,
-            **settings_of(stack, collision.CollisionParams),
+            **stack.settings_of(collision.CollisionParams),
         )
         self._collision_state = collision.CollisionState()
         self._planning_params = planners.PlanningParams(
@@ -71,7 +70,7 @@ class Kernels:
             kd=stack.damping_gain,
             v_max_mps=v_max,
             a_max_mps2=a_max,
-            **settings_of(stack, tracking.TrackingParams),
+            **stack.settings_of(tracking.TrackingParams),
         )
         self._tracking_state: tracking.TrackingState | None = None
         self._queue: Trajectory | None = None  # control's own copy of the plan
@@ -132,11 +131,6 @@ class Kernels:
         waypoints = trajectory.waypoints.copy()
         waypoints[:, 7:10] = 0.0
         return replace(trajectory, waypoints=waypoints)
-
-
-def settings_of(stack: Stack, params: type) -> dict[str, Any]:
-    """Return the settings of a stack that the parameters of a kernel contain by the same name."""
-    return {each.name: getattr(stack, each.name) for each in fields(params) if each.name in KEYS}
 
 
 def _next_int32(value: int) -> int:

@@ -56,12 +56,14 @@ class _Answer:
 
 
 class NodeLost(Exception):
-    """A node's process has ended or had to be killed. The executor handles this."""
+    """A node's process has ended or had to be killed. The executor notes node and stamp."""
+
+    node = ""
+    stamp_s = 0.0  # due time of the output, or time of the watchdog's kill
 
     def __init__(self, *, hung: bool, how: str, traceback: str = "") -> None:
         super().__init__(how)
-        self.hung = hung
-        self.how = how
+        self.hung, self.how = hung, how
         self.traceback = traceback  # traceback of an error in the kernel
 
 

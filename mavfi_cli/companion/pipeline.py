@@ -15,16 +15,14 @@ from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-import numpy as np
-
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
-from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams, PlanRequest
+from mavfi_cli.autonomy.pilot import Pilot, PilotParams, PlanRequest
 from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState, waypoint_index
 from mavfi_cli.companion.executor import Executor, LatencyModel, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.kernels import ControlInput, Kernels, settings_of
+from mavfi_cli.companion.kernels import ControlInput, Kernels
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.types import (
     Briefing,
@@ -103,7 +101,14 @@ class Companion:
         self._injection, self._injector = injection, injection.injector
         self._follower = injection.injector.follower
         self.protection = protection
-        self.pilot = Pilot(_pilot_params(config, stack), briefing.goal_enu_m)
+        pilot_params = PilotParams(
+            v_max_mps=config.v_max_mps,
+            a_max_mps2=config.a_max_mps2,
+            brake_mps2=BRAKE_SHARE * config.a_max_mps2,
+            tracking_error_max_m=stack.tracking_guard_m,
+            **stack.settings_of(PilotParams),
+        )
+        self.pilot = Pilot(pilot_params, briefing.goal_enu_m)
         self._recovery = Recovery(protection, self.pilot, self._follower, self._see_again)
         self.latency = LatencyModel(platform, config.seed, wall)
         self.executor = Executor(
@@ -207,7 +212,7 @@ class Companion:
         """
         if self._takeover_s is None:
             self._takeover_s = self._now_s
-        if not self.sees:
+        if self._map is None:  # which planning needs
             return None
         self._ticks += 1
         self._state = self._recovery.state = state
@@ -413,33 +418,9 @@ class Companion:
         )
 
     @property
-    def sees(self) -> bool:
-        """True once there is a map, which planning needs."""
-        return self._map is not None
-
-    @property
     def tracked(self) -> tuple[Trajectory, int] | None:
         """Return the tracked trajectory and the index of its present waypoint."""
         trajectory = self.pilot.active.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None
         return trajectory, self.pilot.active.waypoint
-
-    @property
-    def mode(self) -> PilotMode:
-        """Present mode of the pilot."""
-        return self.pilot.mode
-
-    def goal_distance_m(self, state: VehicleState) -> float:
-        """Return the distance to the goal, m."""
-        return float(np.linalg.norm(state.position_enu_m - self.pilot.goal_enu_m))
-
-
-def _pilot_params(config: MissionConfig, stack: Stack) -> PilotParams:
-    return PilotParams(
-        v_max_mps=config.v_max_mps,
-        a_max_mps2=config.a_max_mps2,
-        brake_mps2=BRAKE_SHARE * config.a_max_mps2,
-        tracking_error_max_m=stack.tracking_guard_m,
-        **settings_of(stack, PilotParams),
-    )

@@ -43,7 +43,7 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.detect.preprocess import take_tick
 from mavfi_cli.fi.source.injector import Follower
-from mavfi_cli.spec.detector import DetectorConfig, detector_of, extended_ranges
+from mavfi_cli.spec.detector import DetectorConfig
 
 MAX_LISTED_ALARMS = 100
 TOLD_EVERY_S = 1.0  # minimum time between two announced alarms of one stage
@@ -133,9 +133,9 @@ class Protection(NoProtection):
     def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
         self._config = config
         self._wall = wall
-        detector = detector_of(config, stack)
+        detector = config.built(stack)
         stages = frozenset(Stage(name) for name in config.protect)
-        self.gate: Gate = Gate(detector, stages, extended=extended_ranges(config, detector))
+        self.gate: Gate = Gate(detector, stages, extended=config.extended_ranges(detector))
         self._threshold = detector.threshold
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
@@ -282,13 +282,13 @@ class Protection(NoProtection):
 
 def is_compiled(config: DetectorConfig, stack: str) -> bool:
     """Return True if the gate's kernels are compiled. Otherwise `warm_up` takes many seconds."""
-    judge = getattr(detector_of(config, stack), "tick_judge", None)
+    judge = getattr(config.built(stack), "tick_judge", None)
     return in_cache(judge or take_tick)
 
 
 def warm_up(config: DetectorConfig, stack: str) -> None:
-    """Load and compile everything that a gate runs. Raises as `detector_of`."""
-    gate = Gate(detector_of(config, stack))
+    """Load and compile everything that a gate runs. Raises as `DetectorConfig.built`."""
+    gate = Gate(config.built(stack))
     report = CollisionReport(
         stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
     )

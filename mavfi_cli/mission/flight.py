@@ -22,7 +22,6 @@ from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import (
     CommandRefused,
     Interrupted,
-    LinkError,
     LinkLost,
     NoAutopilot,
 )
@@ -113,7 +112,7 @@ class Flight:
         injection: NoInjection,
     ) -> None:
         self._config = config
-        self._stack = stack
+        self.stack = stack
         self._platform = platform
         self._planner = planner
         self._interrupts = interrupts
@@ -184,16 +183,20 @@ class Flight:
             recorder: Keeps the briefing and the inputs of the nodes.
         """
         config, protection = self._config, NoProtection()
-        config.require_flyable(briefing, self._stack.goal_tolerance_m)
+        config.require_flyable(briefing, self.stack.goal_tolerance_m)
         self._briefing = briefing
         if config.detector is not None:
             protection = Protection(config.detector, config.stack, self.wall)
         if config.fault is not None:
-            shortest_s = self._shortest_flight_s(briefing)
+            takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, config.takeoff_height_m))
+            way_m = float(np.linalg.norm(briefing.goal_enu_m - takeoff))
+            way_m = max(0.0, way_m - self.stack.goal_tolerance_m)
+            turn_s = TURN_S if self.stack.turns_before_departure else 0.0
+            shortest_s = way_m / config.v_max_mps + turn_s  # no flight takes less
             self.injection = SourceInjection(config.fault, shortest_s, protection)
         self.companion = Companion(
             config,
-            self._stack,
+            self.stack,
             self._platform,
             self._planner,
             briefing,
@@ -205,17 +208,6 @@ class Flight:
             recorder.briefing = briefing
             self.companion.executor.on_start = recorder.on_start
         return self.companion
-
-    def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return a lower bound of the flight time.
-
-        It consists of the turn before departure, if any, and a straight flight at full speed to the
-        edge of the goal's tolerance.
-        """
-        start = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
-        distance_m = float(np.linalg.norm(briefing.goal_enu_m - start))
-        shortest_s = max(0.0, distance_m - self._stack.goal_tolerance_m) / self._config.v_max_mps
-        return shortest_s + (TURN_S if self._stack.turns_before_departure else 0.0)
 
     @contextlib.contextmanager
     def isolated_nodes(self) -> Iterator[None]:
@@ -252,8 +244,15 @@ class Flight:
                 self.end_s = self.stamp_s if self.outcome is None else self.end_s
 
     def _finished(self) -> bool:
-        if self._session.failure is not None and self.outcome is None:
-            self._take_refusal(self._session.failure)
+        """Return True once there is an outcome, and the vehicle has landed if it is to land.
+
+        A refusal in the air ends the mission and lands. Any other failure of the session is raised.
+        """
+        failure = self._session.failure
+        if failure is not None and self.outcome is None:
+            if not (isinstance(failure, CommandRefused) and self._session.is_up):
+                raise failure
+            self.end(Outcome.FAILSAFE, str(failure), lands=True)
         if self.outcome is None:
             return False
         if not (self._config.land and self._lands) or len(self._interrupts) > 1:
@@ -262,19 +261,8 @@ class Flight:
             self._landing = True
             self._session.request_land()
         elif self._session.phase is Phase.FAILED:
-            refusal = str(self._session.failure)
-            self.logger.note(self.stamp_s, "autopilot", refusal, self._session.state)
+            self.logger.note(self.stamp_s, "autopilot", str(failure), self._session.state)
         return self._session.phase in (Phase.DONE, Phase.FAILED)
-
-    def _take_refusal(self, failure: LinkError) -> None:
-        """End the mission because the autopilot refuses a command in the air, and land.
-
-        Raises:
-            LinkError: The vehicle is on the ground, or nothing was refused.
-        """
-        if not (isinstance(failure, CommandRefused) and self._session.is_up):
-            raise failure
-        self.end(Outcome.FAILSAFE, str(failure), lands=True)
 
     def end(self, outcome: Outcome, reason: str = "", *, lands: bool = False) -> None:
         """Set the outcome of the mission. Later calls have no effect.
@@ -418,7 +406,7 @@ class Flight:
                 command.acceleration_enu_mps2.tolist(),
             )
         self.trace.add(
-            stamp_s, companion.mode.value, state, companion.report, companion.tracked, command
+            stamp_s, companion.pilot.mode.value, state, companion.report, companion.tracked, command
         )
 
     def _offer_frames(self, companion: Companion) -> None:
@@ -453,9 +441,9 @@ class Flight:
         elif self._blind_s >= self._config.loss_limit_s:
             limit_s = self._config.loss_limit_s
             self.end(Outcome.LINK_LOST, f"the camera sent no frame for {limit_s:g} s", lands=True)
-        elif companion is not None and companion.mode is PilotMode.ARRIVED:
+        elif companion is not None and companion.pilot.mode is PilotMode.ARRIVED:
             self.end(Outcome.SUCCESS)
-        elif companion is not None and companion.mode is PilotMode.GAVE_UP:
+        elif companion is not None and companion.pilot.mode is PilotMode.GAVE_UP:
             self.end(
                 Outcome.NO_PATH, f"{companion.pilot.params.attempts_max} plans in a row failed"
             )
@@ -468,10 +456,3 @@ class Flight:
         if not self._camera_asked or self._config.link is None:
             return 0.0
         return self.stamp_s - self._seen_s - 1.0 / self._config.camera_rate_hz
-
-    # Record ---------------------------------------------------------------------------------------
-
-    @property
-    def goal_tolerance_m(self) -> float:
-        """Distance from the goal that counts as reached, m: the mission's own, or the stack's."""
-        return self._stack.goal_tolerance_m

@@ -11,7 +11,6 @@ import platform
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -51,6 +50,10 @@ _WHEELS = {
     "matplotlib": "matplotlib", "click": "click", "rich": "rich", "cattrs": "cattrs",
     "pyserial": "serial", "capstone": "capstone", "pyelftools": "elftools",
 }  # fmt: skip
+_EXTRAS = {
+    "train": "torch", "cluster": "distributed", "pandas": "pandas", "report": "jinja2",
+    "view": "rerun", "mcap": "mcap",
+}  # fmt: skip
 _LOAD_VEHICLE = """
 from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import Quadrotor
@@ -73,66 +76,47 @@ _PERF_REMEDY = (
 )
 _COUNTING = "counted breakpoints"
 _INSTALL = "pip install -e . in the project's folder"
-_EXTRAS = {
-    "train": "torch", "cluster": "distributed", "pandas": "pandas", "report": "jinja2",
-    "view": "rerun", "mcap": "mcap",
-}  # fmt: skip
 
 
 def check_machine() -> Iterator[Check]:
     """Run all checks in sequence and yield their results."""
-    yield _python()
+    yield _check("Python", platform.python_version())
     yield _processor()
     yield _wheels()
-    yield _extras()
-    yield _disk()
+    have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
+    lack = [extra for extra in _EXTRAS if extra not in have]
+    found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
+    yield _check("Extras", found)
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    remedy = "a campaign wants more room; name another folder with --out" if free <= 1.0 else ""
+    yield _check("Disk", f"{free:.1f} GB free here", remedy=remedy)
     yield _loopback()
     yield _physics()
     yield from _injection()
 
 
-def _python() -> Check:
-    old = sys.version_info < (3, 11)
-    remedy = "install Python 3.11 or newer" if old else ""
-    return _check("Python", platform.python_version(), remedy=remedy, failed=old)
-
-
 def _processor() -> Check:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    system, machine = platform.system(), platform.machine()
-    remedy = ""
+    system, machine, remedy = platform.system(), platform.machine(), ""
     if system != "Linux" or machine not in ("x86_64", "aarch64"):
         remedy = "wheels exist for Linux on x86-64"
     elif machine == "aarch64":
         remedy = "jsbsim and pyoctomap have no wheel here: build them"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
     return _check("Processor", found, remedy=remedy)
 
 
 def _wheels() -> Check:
     missing, found = [], []
-    for distribution, module in _WHEELS.items():
+    for name, module in _WHEELS.items():
         try:
             importlib.import_module(module)
-            found.append(f"{distribution} {importlib.metadata.version(distribution)}")
-        except (ImportError, importlib.metadata.PackageNotFoundError, OSError) as error:
-            missing.append(f"{distribution} ({error})")
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except (ImportError, OSError) as error:
+            missing.append(f"{name} ({error})")
     if missing:
         return _check("Libraries", "missing: " + "; ".join(missing), remedy=_INSTALL, failed=True)
     return _check("Libraries", ", ".join(found))
-
-
-def _extras() -> Check:
-    have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
-    lack = [extra for extra in _EXTRAS if extra not in have]
-    found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
-    return _check("Extras", found)
-
-
-def _disk() -> Check:
-    free = shutil.disk_usage(Path.cwd()).free / 1e9
-    remedy = "a campaign wants more room; name another folder with --out" if free <= 1.0 else ""
-    return _check("Disk", f"{free:.1f} GB free here", remedy=remedy)
 
 
 def _loopback() -> Check:

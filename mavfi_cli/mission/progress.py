@@ -112,14 +112,17 @@ class FlightLogger:
             self._tell_of(companion, stamp_s, session)
         if state is not None and stamp_s >= self._next_progress_s:
             self._next_progress_s = stamp_s + _PROGRESS_EVERY_S
-            flies = companion is not None and phase is Phase.OFFBOARD
+            pilot = None if companion is None else companion.pilot
+            goal_m = (
+                None if pilot is None else np.linalg.norm(state.position_enu_m - pilot.goal_enu_m)
+            )
             self._watcher.on_progress(
                 FlightProgress(
                     stamp_s=stamp_s,
-                    phase=companion.mode.value if flies and companion else phase.value,
+                    phase=pilot.mode.value if pilot and phase is Phase.OFFBOARD else phase.value,
                     speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
-                    goal_distance_m=None if companion is None else companion.goal_distance_m(state),
-                    replans=0 if companion is None else companion.pilot.counters.replans,
+                    goal_distance_m=None if goal_m is None else float(goal_m),
+                    replans=0 if pilot is None else pilot.counters.replans,
                 )
             )
 
@@ -133,7 +136,7 @@ class FlightLogger:
             text = f"node {loss.node} {'' if loss.hung else 'crashed: '}{loss.how}"
             self.note(stamp_s, "node", text, session.state)
         self._losses = len(losses)
-        mode, before = companion.mode, self._mode
+        mode, before = companion.pilot.mode, self._mode
         self._mode = mode
         if mode is before:
             return

@@ -198,7 +198,7 @@ def _write(
         "schema": 1,
         "outcome": flight.outcome.value,
         "reason": flight.reason,
-        "config": replace(config, goal_tolerance_m=flight.goal_tolerance_m).to_dict(),
+        "config": replace(config, goal_tolerance_m=flight.stack.goal_tolerance_m).to_dict(),
         "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "simulated_s": flight.end_s - flight.begun_s,
         "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal),
@@ -234,7 +234,7 @@ def _write(
 
 def _nodes(companion: Companion) -> dict[str, Any]:
     """Return the counters of the kernels, and the ends of their processes."""
-    nodes = companion.executor.nodes
+    nodes, losses = companion.executor.nodes, companion.executor.losses
     return {
         "kernels": {
             name: {
@@ -248,10 +248,10 @@ def _nodes(companion: Companion) -> dict[str, Any]:
             name: {
                 "crashes": [
                     {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
-                    for loss in node.losses
-                    if not loss.hung
+                    for loss in losses
+                    if loss.node == name and not loss.hung
                 ],
-                "hangs": sum(loss.hung for loss in node.losses),
+                "hangs": sum(loss.node == name and loss.hung for loss in losses),
                 "restarts": node.restarts,
             }
             for name, node in nodes.items()

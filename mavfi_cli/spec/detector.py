@@ -58,85 +58,83 @@ class DetectorConfig:
         if self.watch not in WATCHES:
             raise UnknownName("watch", self.watch, WATCHES)
 
+    @classmethod
+    def with_model(
+        cls, name: str, models: Path | None, protect: tuple[str, ...] = STAGES
+    ) -> DetectorConfig:
+        """Take the model from a folder of files `NAME.json`; None: the shipped one.
 
-def detector_with_model(
-    name: str, models: Path | None, protect: tuple[str, ...] = STAGES
-) -> DetectorConfig:
-    """Return a detector with its model from a folder of files `NAME.json`; None: the shipped one.
+        Raises:
+            ModelError: The folder has no such file.
+        """
+        path = None if models is None else models.absolute() / f"{name}.json"
+        if path is not None and not path.is_file():
+            raise ModelError("no such model file", path=path)
+        return cls(name=name, protect=protect, model=None if path is None else str(path))
 
-    Raises:
-        ModelError: The folder has no such file.
-    """
-    path = None if models is None else models.absolute() / f"{name}.json"
-    if path is not None and not path.is_file():
-        raise ModelError("no such model file", path=path)
-    return DetectorConfig(name=name, protect=protect, model=None if path is None else str(path))
+    def model_path(self, stack: str) -> Path | None:
+        """Return the model file; None if the detector has no model.
 
+        It is the configured file, or else the one shipped for the stack or for its nearest base
+        stack. `built` rejects the model of a base stack without `any_stack`.
 
-def model_path(config: DetectorConfig, stack: str) -> Path | None:
-    """Return the model file of a mission's detector; None if it has no model.
+        Args:
+            stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
+        """
+        from mavfi_cli.detect.base import shipped
 
-    It is the configured file, or else the one shipped for the stack or for its nearest base stack.
-    `detector_of` rejects the model of a base stack without `any_stack`.
-
-    Args:
-        stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
-    """
-    from mavfi_cli.detect.base import shipped
-
-    if config.model is not None:
-        return Path(config.model)
-    while stack:
-        flown = load_stack(stack)
-        if (path := shipped(config.name, flown.name)).is_file():
-            return path
-        stack = flown.base
-    return None
-
-
-def detector_of(config: DetectorConfig, stack: str) -> Detector:
-    """Create a new detector for a mission with the given stack.
-
-    Args:
-        stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
-
-    Raises:
-        UnknownName: No detector has this name. Suggests the nearest.
-        ModelError: The model cannot be used, or is for another stack without `any_stack`.
-        ConfigError: The threshold is out of range, or the model lacks ranges of extended states.
-    """
-    from mavfi_cli.detect.base import FittedDetector, find_detector
-
-    path = model_path(config, stack)
-    detector = find_detector(config.name, model=path, threshold=config.threshold)
-    made_for = detector.stack if isinstance(detector, FittedDetector) else None
-    if made_for is not None and not config.any_stack:
-        flown = load_stack(stack).mark
-        if made_for.digest != flown.digest:
-            other = f"{made_for.name} as it was" if made_for.name == flown.name else made_for.name
-            raise ModelError(
-                f"{config.name}: made for the stack {other!r}, not for {stack!r}; fit one with "
-                f"mavfi train --stack {shlex.quote(stack)}, or allow it with "
-                "--any-stack-model (any_stack in a campaign)",
-                path=path,
-            )
-    extended_ranges(config, detector)
-    return detector
-
-
-def extended_ranges(config: DetectorConfig, detector: Detector) -> Ranges | None:
-    """Return the ranges of the extended states in the detector's model; None if not configured.
-
-    Raises:
-        ConfigError: The model lacks ranges of the extended states.
-    """
-    from mavfi_cli.detect.base import FittedDetector
-
-    if config.watch == PAPER:
+        if self.model is not None:
+            return Path(self.model)
+        while stack:
+            flown = load_stack(stack)
+            if (path := shipped(self.name, flown.name)).is_file():
+                return path
+            stack = flown.base
         return None
-    ranges = detector.extended if isinstance(detector, FittedDetector) else None
-    if ranges is None:
-        raise ConfigError(
-            f"{EXTENDED} needs the ranges of a model, and {config.name} has none", key="watch"
-        )
-    return ranges
+
+    def built(self, stack: str) -> Detector:
+        """Create a new detector for a mission with the given stack.
+
+        Args:
+            stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
+
+        Raises:
+            UnknownName: No detector has this name. Suggests the nearest.
+            ModelError: The model cannot be used, or is for another stack without `any_stack`.
+            ConfigError: The threshold is out of range, or the model lacks ranges of extended
+                states.
+        """
+        from mavfi_cli.detect.base import FittedDetector, find_detector
+
+        path = self.model_path(stack)
+        detector = find_detector(self.name, model=path, threshold=self.threshold)
+        made_for = detector.stack if isinstance(detector, FittedDetector) else None
+        if made_for is not None and not self.any_stack:
+            flown = load_stack(stack).mark
+            if made_for.digest != flown.digest:
+                was = " as it was" if made_for.name == flown.name else ""
+                raise ModelError(
+                    f"{self.name}: made for the stack {made_for.name + was!r}, not for {stack!r}; "
+                    f"fit one with mavfi train --stack {shlex.quote(stack)}, or allow it with "
+                    "--any-stack-model (any_stack in a campaign)",
+                    path=path,
+                )
+        self.extended_ranges(detector)
+        return detector
+
+    def extended_ranges(self, detector: Detector) -> Ranges | None:
+        """Return the ranges of the extended states in the model; None if not configured.
+
+        Raises:
+            ConfigError: The model lacks ranges of the extended states.
+        """
+        from mavfi_cli.detect.base import FittedDetector
+
+        if self.watch == PAPER:
+            return None
+        ranges = detector.extended if isinstance(detector, FittedDetector) else None
+        if ranges is None:
+            raise ConfigError(
+                f"{EXTENDED} needs the ranges of a model, and {self.name} has none", key="watch"
+            )
+        return ranges

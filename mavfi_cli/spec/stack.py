@@ -146,15 +146,14 @@ class Stack:
                     raise ValueError(f"processes: {node} is in two of them")
                 seen.add(node)
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Return every key that affects a flight, with its value."""
-        return {key: getattr(self, key) for key in KEYS}
+    def settings_of(self, params: type) -> dict[str, Any]:
+        """Return the keys that the parameters of a kernel have by the same name, with values."""
+        return {each.name: getattr(self, each.name) for each in fields(params) if each.name in KEYS}
 
     @property
     def mark(self) -> StackMark:
         """Return the identity of the stack for a detector's model."""
-        text = json.dumps(self.settings, sort_keys=True)
+        text = json.dumps(self.settings_of(Stack), sort_keys=True)
         return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
 
 

@@ -25,7 +25,6 @@ from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ModelError, RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.detect.base import Model
-from mavfi_cli.spec.detector import detector_of, model_path
 from mavfi_cli.studies import fly
 
 SCHEMA = 1
@@ -78,8 +77,8 @@ def require_held_out(plan: EvaluationPlan) -> None:
         ModelError: a model cannot be used; the message names the training flight.
     """
     for detector in map(plan.detector_config, plan.protectors):
-        detector_of(detector, plan.base.stack)
-        path = model_path(detector, plan.base.stack)
+        detector.built(plan.base.stack)
+        path = detector.model_path(plan.base.stack)
         for flight in () if path is None else Model.read(path).training_flights:
             seed = flight.rpartition("/")[2]
             if seed.isdigit() and int(seed) in plan.seeds:

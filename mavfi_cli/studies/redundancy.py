@@ -27,7 +27,6 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import CannotLift, VehicleProcessError
-from mavfi_cli.spec.detector import detector_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import fly
@@ -57,7 +56,7 @@ def _plans_of(
         try:
             each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
             if each.mission.detector is not None:
-                detector_of(each.mission.detector, each.mission.stack)
+                each.mission.detector.built(each.mission.stack)
             each.write()
             if scheme.copies not in refused:
                 ask_vehicle(replace(each.mission, world=plan.worlds[0], seed=plan.first_seed))

@@ -24,7 +24,7 @@ from mavfi_cli.detect.base import Detector, FittedDetector
 from mavfi_cli.detect.preprocess import COUNT, DETECTED, LIMIT, NAN_CODE
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport
-from mavfi_cli.spec.detector import DetectorConfig, detector_of
+from mavfi_cli.spec.detector import DetectorConfig
 
 Deltas = NDArray[np.int16]
 _STAGES = list(Stage)
@@ -186,7 +186,7 @@ class DetectorContract:
 
     def test_a_mission_takes_the_model_of_its_stack_or_needs_none(self, name: str) -> None:
         for stack in ("mavbench", "hardened"):
-            detector = detector_of(DetectorConfig(name=name), stack)
+            detector = DetectorConfig(name=name).built(stack)
             if isinstance(detector, FittedDetector):
                 assert detector.stack is not None
                 assert detector.stack.name == stack
@@ -195,22 +195,22 @@ class DetectorContract:
         self, name: str
     ) -> None:
         asked = DetectorConfig(name=name, any_stack=True)
-        assert detector_of(asked, "mavbench-release").name == name
+        assert asked.built("mavbench-release").name == name
         if isinstance(base.find_detector(name), FittedDetector):
             with pytest.raises(ModelError, match="mavfi train --stack mavbench-release"):
-                detector_of(DetectorConfig(name=name), "mavbench-release")
+                DetectorConfig(name=name).built("mavbench-release")
         else:
-            assert detector_of(DetectorConfig(name=name), "mavbench-release").name == name
+            assert DetectorConfig(name=name).built("mavbench-release").name == name
 
     def test_extended_states_need_the_ranges_of_a_model(self, name: str) -> None:
         config = DetectorConfig(name=name, watch="extended")
         if isinstance(base.find_detector(name), FittedDetector):
-            assert detector_of(config, "mavbench").name == name
+            assert config.built("mavbench").name == name
         else:
             with pytest.raises(
                 ConfigError, match=f"needs the ranges of a model, and {name} has none"
             ):
-                detector_of(config, "mavbench")
+                config.built("mavbench")
 
 
 # Planners -----------------------------------------------------------------------------------------

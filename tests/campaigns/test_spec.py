@@ -11,7 +11,7 @@ from mavfi_cli.campaigns.begin import flyable
 from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, to_toml
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
-from mavfi_cli.spec.stack import load_stack
+from mavfi_cli.spec.stack import Stack, load_stack
 
 
 def spec_of(text):
@@ -291,10 +291,13 @@ def test_every_preset_expands_to_its_numbers(name):
 
 
 def test_the_ablation_changes_every_key_in_which_the_stacks_differ():
-    paper, ours = load_stack("mavbench").settings, load_stack("hardened").settings
+    paper, ours = (
+        load_stack("mavbench").settings_of(Stack),
+        load_stack("hardened").settings_of(Stack),
+    )
     changed = set()
     for text in load_spec("ablation").axes["stack"][1:]:
-        values = load_stack(text).settings
+        values = load_stack(text).settings_of(Stack)
         keys = set(re.findall(r"(\w+)=", text))
         assert {name for name in values if values[name] != paper[name]} == keys
         assert all(values[name] == ours[name] for name in keys)
@@ -306,12 +309,16 @@ def test_hardening_has_each_protection_alone_and_all_of_them():
     plain, *single, together = map(load_stack, load_spec("hardening").axes["stack"])
     assert plain.name == "mavbench"
     protections = [
-        {key for key, value in stack.settings.items() if value != plain.settings[key]}
+        {
+            key
+            for key, value in stack.settings_of(Stack).items()
+            if value != plain.settings_of(Stack)[key]
+        }
         for stack in single
     ]
     assert [len(keys) for keys in protections] == [1, 1, 1, 1]
     assert set.union(*protections) == {
-        key for key, value in together.settings.items() if value != plain.settings[key]
+        key for key, value in together.settings_of(Stack).items() if value != getattr(plain, key)
     }
 
 

@@ -261,7 +261,7 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
         (["--inject", "detector"], "--inject detector needs --detector NAME"),
         (["--link", "udpin:127.0.0.1:14540"], "--link: needs --goal X,Y,Z"),
-        (["--platform", "measured:2"], "--platform measured:2 needs --realtime"),
+        (["--platform", "measured:2"], "--platform: measured:2 needs --realtime"),
         ([*LINK, "--world", "dense"], "--world has no meaning with --link unless --eyes is given"),
         ([*LINK, "--vehicle", "solo"], "--vehicle has no meaning with --link unless --eyes"),
         ([*LINK, "--start", "1,2,0"], "--start has no meaning with --link unless --eyes"),

@@ -111,7 +111,7 @@ def flown():
     companion.take_frame(frame(made.now_s))
     made.advance(1.0)
     made.tick()
-    assert companion.sees
+    assert made.inputs
     return made
 
 

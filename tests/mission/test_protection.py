@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mavfi_cli.campaigns.specification_file import load_spec
-from mavfi_cli.companion import protection as protection_module
 from mavfi_cli.companion.protection import PASSED, Protection, Response
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, ModelError, UnknownName
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
@@ -18,7 +17,7 @@ from mavfi_cli.detect.preprocess import NAMES, REFERENCE, SPANS
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.spec.detector import DetectorConfig, detector_of, model_path
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.stack import load_stack
 
@@ -60,7 +59,7 @@ def per_stage(request):
 @pytest.fixture
 def limit(monkeypatch, per_stage):
     """The registry knows one detector."""
-    monkeypatch.setattr(protection_module, "detector_of", lambda *_: Limit(per_stage=per_stage))
+    monkeypatch.setattr(DetectorConfig, "built", lambda *_: Limit(per_stage=per_stage))
     return DetectorConfig(name="limit", alarms_max=3)
 
 
@@ -171,7 +170,7 @@ def test_a_flown_plan_gets_back_the_number_that_was_accepted(name):
 
 def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
     def path(stack, **asked):
-        return model_path(DetectorConfig(name="gad", **asked), stack)
+        return DetectorConfig(name="gad", **asked).model_path(stack)
 
     mine = tmp_path / "mine.toml"
     mine.write_text('name = "mine"\nbase = "hardened"\nguards_tracking = false\n')
@@ -182,7 +181,7 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
         (str(mine), "hardened"), ("hardened:guards_tracking=false", "hardened"),
     ):  # fmt: skip
         assert path(stack) == path(stack, any_stack=True) == shipped("gad", base)
-        assert detector_of(DetectorConfig(name="gad", any_stack=True), stack).stack.name == base
+        assert DetectorConfig(name="gad", any_stack=True).built(stack).stack.name == base
     assert path("hardened", model="my.json") == Path("my.json")
     assert path("hardened", model="my.json", any_stack=True) == Path("my.json")
 
@@ -198,16 +197,16 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
 )  # fmt: skip
 def test_a_model_of_another_stack_is_refused_in_one_line(stack, asked, problem):
     with pytest.raises(ModelError, match=problem) as caught:
-        detector_of(DetectorConfig(name="gad", **asked), stack)
+        DetectorConfig(name="gad", **asked).built(stack)
     assert "--any-stack-model" in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert detector_of(DetectorConfig(name="gad", any_stack=True, **asked), stack).name == "gad"
+    assert DetectorConfig(name="gad", any_stack=True, **asked).built(stack).name == "gad"
 
 
 def test_a_stack_that_differs_in_nothing_needs_no_model_of_its_own():
     same = "mavbench:guards_tracking=false"
     assert load_stack(same).mark.digest == load_stack("mavbench").mark.digest
-    assert detector_of(DetectorConfig(name="aad"), same).stack.name == "mavbench"
+    assert DetectorConfig(name="aad").built(same).stack.name == "mavbench"
     assert load_stack("hardened").mark.digest != load_stack("mavbench").mark.digest
 
 
@@ -217,7 +216,7 @@ def test_a_model_of_the_stack_as_it_once_was_is_refused(tmp_path):
     (tmp_path / "old.json").write_text(json.dumps(held))
     config = DetectorConfig(name="gad", model=str(tmp_path / "old.json"))
     with pytest.raises(ModelError, match="for the stack 'mavbench as it was', not for"):
-        detector_of(config, "mavbench")
+        config.built("mavbench")
 
 
 # Whole missions ------------------------------------------------------------------------------

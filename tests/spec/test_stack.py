@@ -3,7 +3,7 @@
 import pytest
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
-from mavfi_cli.spec.stack import KEYS, STACKS, load_stack
+from mavfi_cli.spec.stack import KEYS, STACKS, Stack, load_stack
 
 
 def test_the_shipped_stacks_say_every_key_and_where_it_is_from():
@@ -16,7 +16,10 @@ def test_the_shipped_stacks_say_every_key_and_where_it_is_from():
 
 
 def test_the_release_differs_in_the_two_claims_only():
-    paper, release = load_stack("mavbench").settings, load_stack("mavbench-release").settings
+    paper, release = (
+        load_stack("mavbench").settings_of(Stack),
+        load_stack("mavbench-release").settings_of(Stack),
+    )
     assert {key for key in KEYS if paper[key] != release[key]} == {
         "uses_time_to_collision", "feeds_acceleration_forward",
     }  # fmt: skip
@@ -26,7 +29,9 @@ def test_a_file_of_the_users_switches_one_key(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text('base = "mavbench"\nguards_tracking = true\n')
     mine, base = load_stack(str(file)), load_stack("mavbench")
-    assert {key for key in KEYS if mine.settings[key] != base.settings[key]} == {"guards_tracking"}
+    assert {
+        key for key in KEYS if mine.settings_of(Stack)[key] != base.settings_of(Stack)[key]
+    } == {"guards_tracking"}
     assert (mine.name, mine.description) == ("mine", "")  # not those of its base
     assert mine.sources["guards_tracking"] == "set in mine.toml"  # not the base's source
 
