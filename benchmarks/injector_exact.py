@@ -40,15 +40,15 @@ from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.arch import decode
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.fault import (
-    CountedStop,
     FaultModel,
     InstructionCorruption,
     InstructionFault,
     Role,
     Site,
-    strategy,
+    Strategy,
 )
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
@@ -147,7 +147,7 @@ def chi_square(
     """Chi-square of drawn instructions against the counts of a run that was not stepped."""
     addresses = sorted({int(each) for each in profile.strata[0].segments[0].trace})
     counts = np.array([counted(place, address) for address in addresses])
-    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
+    plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
     drawn = Counter(profile.image.address(profile.draw(plan, rng).target) for _ in range(draws))
     observed = np.array([drawn[address] for address in addresses], float)
     expected = counts * draws / counts.sum()

@@ -36,9 +36,9 @@ from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
 from mavfi_cli.attack.profile import detour_of
-from mavfi_cli.fi.tracer.arch import Detour
+from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.inject import instruction_at
-from mavfi_cli.fi.tracer.tracee import PerfBreakpoint, Tracee
+from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Tracee
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -69,7 +69,7 @@ def run(place: KernelPlace, way: str, detour: Detour | None) -> float:
     tracee = place.start()
     entry = place.layout.image.address(place.layout.scope.entry)
     if way in ("armed", "counted"):
-        counter = PerfBreakpoint(tracee.tid, NOWHERE if way == "armed" else entry, NEVER)
+        counter = ExecutionCounter(tracee.tid, NOWHERE if way == "armed" else entry, NEVER)
         finish(tracee)
         counter.close()
     elif way == "detoured":

@@ -262,10 +262,19 @@ def start(native_program, tmp_path):
 
 def register_corruption(register, bit, role=None):
     """The corruption of one bit of a general register or the flags."""
-    from mavfi_cli.fi.tracer.arch import register_kind
     from mavfi_cli.fi.tracer.fault import InstructionCorruption, Role, Site
 
     return InstructionCorruption(
-        site=Site(register_kind(register)), role=role or Role.SOURCE, register=register,
-        operand=register, bits=(bit,),
+        site=Site.FLAGS if register == "rflags" else Site.GENERAL, role=role or Role.SOURCE,
+        register=register, operand=register, bits=(bit,),
     )  # fmt: skip
+
+
+def all_registers():
+    """Every full register of this processor that can be flipped."""
+    from mavfi_cli.fi.tracer.registers import GENERAL, widest_vector
+
+    widest = widest_vector()
+    names = [*GENERAL, "rflags", "rip", *(f"st{number}" for number in range(8))]
+    names += [f"{widest}{number}" for number in range(32 if widest == "zmm" else 16)]
+    return (*names, *(f"k{number}" for number in range(8 if widest == "zmm" else 0)))

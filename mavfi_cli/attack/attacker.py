@@ -22,17 +22,12 @@ import numpy as np
 from mavfi_cli.attack.target import Golden, JudgedPlace, RunOutcome, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Rule, Strategy
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.fault import InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
-from mavfi_cli.fi.tracer.tracee import (
-    Ended,
-    ExecutionCounter,
-    Mechanism,
-    Tracee,
-    best_mechanism,
-)
+from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
@@ -325,7 +320,7 @@ class EntryCounter:
         self._pid, self._address, self._stops = pid, address, 0
         self._counter: ExecutionCounter | None = None
         self._tracer: TracerThread[None] | None = None
-        if best_mechanism() is Mechanism.PERF:
+        if Mechanism.best() is Mechanism.PERF:
             self._counter = ExecutionCounter(pid, address)
         else:
             self._tracer = TracerThread(self._count)

@@ -38,7 +38,7 @@ from mavfi_cli.attack.target import (
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy, strategy
+from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class Plan:
 
     def strategy(self) -> Strategy:
         """The sampling strategy."""
-        return strategy(self.rule, self.model, compat=self.compat)
+        return Strategy.of(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> dict[str, Any]:
         """The entries that results depend on, without number of runs and choice of targets."""
@@ -262,7 +262,7 @@ def completed(planned: Mapping[str, Any], result: RunResult) -> Record:
             "offset": fault.target.offset,
             "instruction": fault.instruction,
             "instruction_bytes": fault.instruction_bytes.hex(),
-            "corruption": record.corruption_to_json(fault.corruption),
+            "corruption": fault.corruption and fault.corruption.to_json(),
         }
     return record.completed(
         planned,

@@ -27,9 +27,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch, code_of
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.arch import Detour
-from mavfi_cli.fi.tracer.counted import CountedRun, detour_at
-from mavfi_cli.fi.tracer.fault import CountedStop
+from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Detour
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Segment, Stratum, record_window
 from mavfi_cli.fi.tracer.tracee import Tracee
@@ -215,7 +213,7 @@ def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
         with started(place) as tracee:
             return tracee.count_to_end(address)
 
-    return detour_at(address, lambda at: code[at - address :][:16], executions)
+    return Detour.at(address, lambda at: code[at - address :][:16], executions)
 
 
 @contextmanager

@@ -11,10 +11,12 @@ import resource
 import shutil
 import signal
 import stat
+import subprocess
 import tempfile
 import time
 import weakref
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -42,13 +44,11 @@ from mavfi_cli.attack.target import (
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.files import writing
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.counted import callgrind, read_counts, run_counted
-from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
-from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
+from mavfi_cli.fi.tracer.spawn import Program, Watched, run_to_entry, spawn, watch
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
-from mavfi_cli.fi.tracer.watched import Watched, watch
 
 
 def absolute_arguments(
@@ -237,7 +237,7 @@ class _Workplace:
 
     def scope(self, image: Image) -> Scope:
         """The code that may be hit."""
-        return scope_of(image, self.target.scope_objects)
+        return image.scope(self.target.scope_objects)
 
     def context(self) -> dict[str, Any]:
         """Entries of every record about the program."""
@@ -270,7 +270,7 @@ class _Workplace:
                 self, rng, [function_of(self, function)], windows=windows, limit=limit,
                 watch=watch, guard=self._guard,
             )  # fmt: skip
-        if callgrind() is None:
+        if _callgrind() is None:
             return profile_run(self, rng, limit=limit, watch=watch, guard=self._guard)
         try:
             short = min(limit, _SHORT)
@@ -293,12 +293,12 @@ class _Workplace:
         """Count the executions of a whole run by callgrind, and check some of them."""
         begun = time.perf_counter()
         self._renew_folder()
-        code = run_counted(
+        code = _run_counted(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
             wall_s=self._known_golden().wall_s, tell=watch or (lambda _: None),
         )  # fmt: skip
         self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
-        profile = profile_counted(self, rng, lambda paths: read_counts(self._counts, paths), begun)
+        profile = profile_counted(self, rng, lambda paths: _read_counts(self._counts, paths), begun)
         self._counts.unlink()
         return profile
 
@@ -439,3 +439,93 @@ class _Workplace:
 def _children_cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
+
+
+# -- counting by valgrind's callgrind
+
+_SLOWER = 200.0  # callgrind takes 10 to 60 times as long as the program
+_START_S = 60.0
+_TOLD_EVERY_S = 1.0
+
+
+def _callgrind() -> str | None:
+    """Path of valgrind; None if it is not installed."""
+    return shutil.which("valgrind")
+
+
+def _run_counted(
+    command: Program,
+    *,
+    stdout: Path,
+    stderr: Path,
+    counts: Path,
+    wall_s: float,
+    tell: Callable[[str], None] = lambda _: None,
+) -> int:
+    """Run a program under callgrind and return its exit code.
+
+    Args:
+        counts: file to which callgrind writes.
+        wall_s: duration of the program without it.
+        tell: called every second with how long it has been running, in words.
+
+    Raises:
+        TargetError: it does not end in time, or a signal kills it.
+    """
+    name, limit_s = Path(command.argv[0]).name, _SLOWER * wall_s + _START_S
+    tool = [
+        str(_callgrind()), "--quiet", "--tool=callgrind", "--dump-instr=yes", "--compress-pos=no",
+        "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
+        f"--callgrind-out-file={counts}", "--",
+    ]  # fmt: skip
+    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
+        process = subprocess.Popen(
+            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
+            stdin=given, stdout=out, stderr=err, start_new_session=True,
+        )  # fmt: skip
+    try:
+        code = _await_end(process, name, limit_s, tell)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    if code < 0:
+        raise TargetError(name, f"is killed by signal {-code} under callgrind")
+    return code
+
+
+def _await_end(
+    process: subprocess.Popen[bytes], name: str, limit_s: float, tell: Callable[[str], None]
+) -> int:
+    """Wait for the exit code; tell how long it takes."""
+    begun_s = time.monotonic()
+    while (elapsed_s := time.monotonic() - begun_s) < limit_s:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(min(_TOLD_EVERY_S, limit_s - elapsed_s))
+        tell(f"counted by callgrind, {elapsed_s:.0f} s of at most {limit_s:.0f} s")
+    raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s")
+
+
+def _read_counts(path: Path, objects: Iterable[str]) -> dict[str, Counter[int]]:
+    """Executions of each instruction, by the path of its object and its linked address.
+
+    Args:
+        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
+            the cost of the called function.
+        objects: paths of the wanted objects.
+    """
+    found: dict[str, Counter[int]] = {each: Counter() for each in objects}
+    current: Counter[int] | None = None
+    of_callee = False
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.startswith("0x"):
+                if current is not None and not of_callee:
+                    address, _, count = line.split()
+                    current[int(address, 16)] += int(count)
+                of_callee = False
+            elif line.startswith("ob="):
+                current = found.get(os.path.realpath(line[3:].rstrip("\n")))
+            elif line.startswith("calls="):
+                of_callee = True
+    return found

@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from mavfi_cli.attack.comparison import Difference
-from mavfi_cli.fi.tracer.counted import CountedRun
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
+from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop
+from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee

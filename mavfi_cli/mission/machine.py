@@ -21,7 +21,7 @@ from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.processes import PYTHON
 
 if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.arch import Registers
+    from mavfi_cli.fi.tracer.registers import Registers
     from mavfi_cli.fi.tracer.tracee import Mechanism
 
 OK = "ok"
@@ -148,7 +148,7 @@ def _physics() -> Check:
 
 def _injection() -> Iterator[Check]:
     """Test tracing and counted breakpoints on a real program."""
-    from mavfi_cli.fi.tracer.arch import SUPPORTED
+    from mavfi_cli.fi.tracer.linux import SUPPORTED
 
     if not SUPPORTED:
         remedy = "instruction-level injection is not available here"
@@ -189,7 +189,7 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
 
 def _flip_and_back(registers: Registers) -> str:
     """Flip a bit of two registers and restore them; return the problem, if there is one."""
-    from mavfi_cli.fi.tracer.arch import widest_vector
+    from mavfi_cli.fi.tracer.registers import widest_vector
 
     for register in ("rbx", f"{widest_vector()}15"):
         before = registers.read(register)

@@ -283,12 +283,12 @@ class InstructionConfig:
             UnknownName: A name does not exist.
             FaultSpecError: The rule is not repeatable.
         """
-        from mavfi_cli.fi.tracer.fault import FaultModel, Rule, strategy
+        from mavfi_cli.fi.tracer.fault import FaultModel, Rule, Strategy
 
         model = FaultModel.named(
             sites=self.sites, roles=self.roles, field=self.field, bits=self.bits
         )
-        chosen = strategy(self.sampling, model, compat=self.compat)
+        chosen = Strategy.of(self.sampling, model, compat=self.compat)
         if self.compat is None and chosen.rule is not Rule.INSTRUCTION:
             raise FaultSpecError(
                 f"sampling by {self.sampling} cannot be repeated; missions take "

@@ -6,7 +6,7 @@ from pathlib import Path
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.attack.target import Golden, RunLimits, RunVerdict, digest, judged
-from mavfi_cli.fi.tracer.image import Image, scope_of
+from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 
 
@@ -44,7 +44,7 @@ class OwnPlace:
         return Image(tracee.pid)
 
     def scope(self, image):
-        return scope_of(image, [self.target.program.name])
+        return image.scope([self.target.program.name])
 
     def context(self):
         return {"program": [str(self.target.program)]}

@@ -13,7 +13,6 @@ from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer import counted as counting
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.report.attacks import program_table, summarise_program
@@ -67,7 +66,7 @@ def test_a_long_program_is_attacked_whole(native_program):
 
 
 def test_it_tells_how_long_callgrind_counts_and_may_count(native_program, monkeypatch):
-    monkeypatch.setattr(counting, "_TOLD_EVERY_S", 0.01)
+    monkeypatch.setattr(programs, "_TOLD_EVERY_S", 0.01)
     told = []
     command = Program.of([str(native_program("counting")), "300000"])
     target = ProgramTarget(command=command, comparison=OutputComparison())
@@ -83,10 +82,10 @@ def test_it_tells_how_long_callgrind_counts_and_may_count(native_program, monkey
 
 def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
     where = place("counting", "60000")
-    true_counts = programs.read_counts
+    true_counts = programs._read_counts
     monkeypatch.setattr(
         programs,
-        "read_counts",
+        "_read_counts",
         lambda *given: {
             path: {at: n - (n > 50_000) for at, n in found.items()}
             for path, found in true_counts(*given).items()
@@ -97,7 +96,7 @@ def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
 
 
 def test_without_valgrind_a_long_program_is_refused_by_advice(place, monkeypatch):
-    monkeypatch.setattr(programs, "callgrind", lambda: None)
+    monkeypatch.setattr(programs, "_callgrind", lambda: None)
     monkeypatch.setattr(profiles, "STEPS", 1000)
     where = place("counting", "60000")
     where.limits = programs.RunLimits(profile_steps=1000)

@@ -14,9 +14,10 @@ from mavfi_cli.attack.attacker import EntryCounter, attack_live
 from mavfi_cli.attack.profile import profile_call, profile_calls
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux, record, tracee
-from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role, strategy
-from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping, scope_of
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import InstructionFault, Role, Strategy
+from mavfi_cli.fi.tracer.image import Image, Location, executable_mapping
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.tracee import Tracee
 
@@ -119,7 +120,7 @@ class FreshNodes:
         return Location("numba:kernel", int(self._told) - regions["numba:kernel"].start)
 
     def scope(self, image):
-        return scope_of(image, ["libkernel.so" if self._told == "ready" else "numba:kernel"])
+        return image.scope(["libkernel.so" if self._told == "ready" else "numba:kernel"])
 
     def close(self):
         for process in self._processes:
@@ -251,7 +252,7 @@ def test_a_fault_hits_exactly_its_invocation(profiled, node, tmp_path):
 
 
 def test_drawn_faults_repeat_in_the_node(profiled, node, tmp_path):
-    plan = strategy("instruction-uniform")
+    plan = Strategy.of("instruction-uniform")
     rng = np.random.default_rng(21)
     for _ in range(40):
         fault = profiled.draw(plan, rng)
@@ -269,7 +270,7 @@ def test_drawn_faults_repeat_in_the_node(profiled, node, tmp_path):
 
 
 def test_a_node_that_crashes_is_reported(profiled, node, tmp_path):
-    fault = profiled.draw(strategy("instruction-uniform"), np.random.default_rng(0))
+    fault = profiled.draw(Strategy.of("instruction-uniform"), np.random.default_rng(0))
     wild = replace(fault, corruption=register_corruption("rip", 45, Role.DESTINATION))
     tracer = Tracer(attack_live, node.pid, wild, path=tmp_path / "fault.json")
     node.stdin.write("1 2 3\n")
@@ -281,7 +282,7 @@ def test_a_node_that_crashes_is_reported(profiled, node, tmp_path):
 
 
 def test_a_null_injection_leaves_the_answers(profiled, node, tmp_path):
-    fault = profiled.draw(strategy("instruction-uniform"), np.random.default_rng(0))
+    fault = profiled.draw(Strategy.of("instruction-uniform"), np.random.default_rng(0))
     tracer = Tracer(
         attack_live, node.pid, replace(fault, corruption=None), path=tmp_path / "f.json"
     )

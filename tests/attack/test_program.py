@@ -22,15 +22,9 @@ from mavfi_cli.attack.target import RunLimits, RunOutcome, digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import (
-    DATA_REGISTERS,
-    CountedStop,
-    FaultModel,
-    InstructionFault,
-    Role,
-    Site,
-)
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import DATA_REGISTERS, FaultModel, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program

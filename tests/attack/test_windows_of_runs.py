@@ -10,7 +10,7 @@ from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.profile import function_of, profile_calls, profile_run, started
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError, UnknownName
-from mavfi_cli.fi.tracer.fault import FaultModel, Site, strategy
+from mavfi_cli.fi.tracer.fault import FaultModel, Site, Strategy
 from mavfi_cli.fi.tracer.sampling import WindowTooLong, record_window
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
@@ -193,7 +193,7 @@ def test_faults_are_drawn_evenly_over_all_windows(recursive):
     counts = Counter(whole.segments[0].trace.tolist())
     markers = functions(recursive, "leaf", "tree")
     profile = profile_run(recursive, rng, markers=markers, windows=100)
-    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
+    plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
     drawn = Counter(profile.image.address(profile.draw(plan, rng).target) for _ in range(3000))
     assert set(drawn) <= set(counts)
     frequent = [address for address, count in counts.items() if count >= 5]
@@ -208,7 +208,7 @@ def test_a_trigger_of_a_window_stops_before_its_execution(recursive):
     (only,) = profile_run(recursive, rng).strata
     whole = only.segments[0].trace
     profile = profile_run(recursive, rng, markers=markers, windows=100)
-    image, plan = profile.image, strategy("instruction-uniform")
+    image, plan = profile.image, Strategy.of("instruction-uniform")
     for _ in range(12):
         fault = profile.draw(plan, rng)
         first, begin = fault.trigger[0], 0

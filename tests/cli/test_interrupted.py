@@ -9,7 +9,7 @@ import pytest
 from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import write_parquet
-from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission import run as run_module
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher

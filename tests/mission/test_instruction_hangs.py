@@ -11,9 +11,11 @@ from mavfi_cli.attack.kernels.scope import kernel_scope
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion import node_process
 from mavfi_cli.fi.tracer import record as records
-from mavfi_cli.fi.tracer.arch import SUPPORTED, decode
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import InstructionFault, Role
 from mavfi_cli.fi.tracer.image import Image, Location
+from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission

@@ -19,8 +19,8 @@ from mavfi_cli.cli.runs import replay
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import BuildMismatch, FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.tracer import record as records
-from mavfi_cli.fi.tracer.arch import SUPPORTED
 from mavfi_cli.fi.tracer.fault import Rule
+from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission.instruction import PROGRAM
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing

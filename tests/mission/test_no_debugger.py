@@ -17,7 +17,7 @@ config = MissionConfig(
 )
 fly_mission(config, Path(sys.argv[1]), Watcher())
 import mavfi_cli.campaigns.run
-print([name for name in sys.modules if name.startswith(("capstone", "mavfi_cli.fi.tracer.arch"))])
+print([name for name in sys.modules if name.startswith(("capstone", "mavfi_cli.fi.tracer.decode"))])
 """
 
 

@@ -13,7 +13,7 @@ from mavfi_cli.attack.attacker import TracerThread
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.fi.tracer import record as records
-from mavfi_cli.fi.tracer.arch import SUPPORTED
+from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission.instruction.injection import (
     Rehearsal,
     draw_invocation,

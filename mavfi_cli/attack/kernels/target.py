@@ -37,7 +37,7 @@ from mavfi_cli.attack.target import (
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive
-from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
 
 _PROGRAM = "mavfi_cli.attack.kernels.template"
@@ -168,7 +168,7 @@ class KernelPlace:
 
     def scope(self, image: Image) -> Scope:
         """The code that may be hit."""
-        return scope_of(image, self.layout.scope.objects)
+        return image.scope(self.layout.scope.objects)
 
     def context(self) -> dict[str, Any]:
         """Entries of every record about the kernel."""

@@ -1,41 +1,193 @@
-"""A whole run as execution counts: the population of a program that is too long to be stepped.
+"""Executions of an instruction are counted: to one stop, by a detour, or over a whole run.
 
-The k-th execution of an instruction is reached by counting. Instructions that always execute
-together have the same counts; so a hot one is counted at a place among them where a detour fits,
-that is, where nothing jumps between the replaced instructions: one of them leads to the next, and
-both are executed equally often.
+The k-th execution of an instruction is reached by counting. A *detour* counts inside the target, at
+a few nanoseconds each. The bytes of the counted instruction are replaced by a jump to a page of
+ours. The code there counts down without changing flags or stack, executes the replaced instructions
+and jumps back. At zero it stops at a breakpoint instead. Nobody may jump between the replaced
+instructions. If they have fewer than five bytes, a short jump leads over five bytes nearby that
+nobody executes.
 
-valgrind's callgrind counts: exactly, in one run.
+A program that is too long to be stepped is known by its execution counts. Instructions that always
+execute together have the same counts. So a hot one is counted at a place among them where a detour
+fits: one of them leads to the next, and both are executed equally often.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
-import shutil
-import signal
-import subprocess
-import time
+import struct
 from bisect import bisect_left
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
+from capstone import x86
 from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.arch import TRAITS, Detour, Flow, flow
-from mavfi_cli.fi.tracer.fault import CountedStop
+from mavfi_cli.fi.tracer.decode import BRANCHES, engine
 from mavfi_cli.fi.tracer.image import Location
-from mavfi_cli.fi.tracer.spawn import Program
 
 Locate = Callable[[int], Location]
 CodeAt = Callable[[int], bytes]  # 16 bytes of code
+Executions = Callable[[int], int | None]  # of the instruction at an address
 
 _BY_BREAKPOINT = 100_000  # most executions that are counted by a breakpoint: about a second
+_JUMP_BYTES, _SHORT_JUMP_BYTES = 5, 2
+_SHORT_JUMP = range(-126, 130)  # where a short jump leads, from its own address
+_PAGE = 4096
+_SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets of the data
+_FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _DetourCode:
+    """The bytes of a detour."""
+
+    jumps: dict[int, bytes]  # by address, in the code of the program
+    pages: dict[int, bytes]  # by address
+    stop: int  # the instruction pointer when the count is over
+
+
+@dataclass(frozen=True, slots=True)
+class Detour:
+    """The place of a detour that counts the executions of an instruction.
+
+    Attributes:
+        size: bytes of the whole instructions that the detour replaces; nothing jumps between them.
+        via: distance from the instruction to unused bytes that hold a second jump; 0 if one jump
+            is enough.
+    """
+
+    size: int
+    via: int = 0
+
+    @classmethod
+    def at(cls, address: int, code_at: CodeAt, executions: Executions) -> Detour | None:
+        """The detour at one instruction; None if none fits there."""
+        size = _straight_bytes(address, code_at, executions)
+        return cls(size) if size >= _JUMP_BYTES else None
+
+    def code(self, code: bytes, address: int, pages: int, count: int) -> _DetourCode | None:
+        """Make the detour that stops before execution `count` of the instruction at `address`.
+
+        Args:
+            code: the replaced instructions; only the last may be a branch.
+            pages: address of two pages of memory, less than 2 GB away.
+
+        Returns:
+            None if an instruction cannot be executed elsewhere.
+        """
+        start = pages + _PAGE  # code beside data that is written would be slow
+        parts = [
+            _rcx(b"\x89", pages + _SAVED, start),
+            _rcx(b"\x8b", pages + _COUNTER, start + 7),
+            b"\x48\x8d\x49\xff",  # lea rcx, [rcx-1]
+            _rcx(b"\x89", pages + _COUNTER, start + 18),
+        ]
+        moved = _rcx(b"\x8b", pages + _SAVED, start + 27)
+        at = address
+        returns_to = address + len(code)
+        for found in engine.disasm(code, address):
+            piece = _moved(found, start + 27 + len(moved), pages + _RETURN)
+            if piece is None:
+                return None
+            moved += piece
+            at = found.address + found.size
+        if at != returns_to:
+            return None
+        moved += _jump(returns_to, start + 27 + len(moved))
+        if len(moved) > 127:
+            return None
+        stop = start + 27 + len(moved)
+        parts += [b"\xe3" + bytes([len(moved)]), moved]  # jrcxz
+        parts += [_rcx(b"\x8b", pages + _SAVED, stop), b"\xcc"]
+        jumps = {address + self.via: _jump(start, address + self.via)}
+        if self.via:
+            jumps[address] = b"\xeb" + struct.pack("<b", self.via - _SHORT_JUMP_BYTES)
+        return _DetourCode(
+            jumps=jumps,
+            pages={pages: struct.pack("<QQQ", 0, count, returns_to), start: b"".join(parts)},
+            stop=stop + 8,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CountedStop:
+    """Run until `location` is about to execute for the `count`-th time since the stage before."""
+
+    location: Location
+    count: int
+    detour: Detour | None = None  # None: the executions are counted by a breakpoint
+
+
+# -- how control flows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Flow:
+    """How control flows through one instruction, and whether it can be executed elsewhere."""
+
+    size: int
+    straight: bool  # the next instruction follows, always
+    movable: bool
+    repeated: bool  # a string instruction that may repeat itself
+
+
+@functools.lru_cache(maxsize=65536)
+def _flow(code: bytes, address: int) -> _Flow | None:
+    """How control flows through one instruction; None if the bytes are not an instruction."""
+    found = next(engine.disasm(code[:16], address, 1), None)
+    if found is None:
+        return None
+    leaves = not BRANCHES.isdisjoint(found.groups)
+    return _Flow(
+        size=found.size,
+        straight=not leaves and found.mnemonic not in _FIXED,
+        movable=_moved(found, address, address) is not None,
+        repeated=found.mnemonic.startswith("rep") and not leaves,
+    )
+
+
+def _rcx(opcode: bytes, place: int, at: int) -> bytes:
+    """Load rcx from memory or store it there, by an instruction at `at`."""
+    return b"\x48" + opcode + b"\x0d" + struct.pack("<i", place - at - 7)
+
+
+def _jump(target: int, at: int) -> bytes:
+    return b"\xe9" + struct.pack("<i", target - at - 5)
+
+
+def _moved(found: Any, at: int, return_slot: int) -> bytes | None:
+    """The instruction as it has to be at another address; None if it cannot be moved."""
+    raw = bytes(found.bytes)
+    if found.mnemonic in _FIXED:
+        return None
+    immediate = bool(found.operands) and found.operands[0].type == x86.X86_OP_IMM
+    if found.group(x86.X86_GRP_CALL):
+        if not immediate:
+            return None
+        push = b"\xff\x35" + struct.pack("<i", return_slot - at - 6)  # the true return address
+        return push + _jump(found.operands[0].imm, at + 6)
+    if found.group(x86.X86_GRP_JUMP) and immediate:
+        target = found.operands[0].imm
+        first, second = found.opcode[0], found.opcode[1]
+        if first in (0xE9, 0xEB):
+            return _jump(target, at)
+        if first >> 4 != 7 and not (first == 0x0F and second >> 4 == 8):
+            return None  # loop, jrcxz
+        condition = (first if first >> 4 == 7 else second) & 15
+        return bytes([0x0F, 0x80 | condition]) + struct.pack("<i", target - at - 6)
+    if any(op.type == x86.X86_OP_MEM and op.mem.base == x86.X86_REG_RIP for op in found.operands):
+        place = found.disp_offset
+        there = found.disp + found.address - at
+        if raw[place : place + 4] != struct.pack("<i", found.disp) or abs(there) >> 31:
+            return None
+        return raw[:place] + struct.pack("<i", there) + raw[place + 4 :]
+    return raw
+
+
+# -- a whole run
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +210,7 @@ class CountedRun:
     def of(cls, executions: Mapping[int, int], code_at: CodeAt) -> CountedRun:
         """Make the population from the number of executions of each address."""
         addresses = sorted(executions)
-        flows = [flow(code_at(address), address) for address in addresses]
+        flows = [_flow(code_at(address), address) for address in addresses]
         counts = _without_repeats(addresses, [executions[each] for each in addresses], flows)
         joined = _joined(addresses, counts, flows)
         known = dict(zip(addresses, counts, strict=True))
@@ -119,24 +271,12 @@ class CountedRun:
         return (*first, CountedStop(here, 1))
 
 
-def detour_at(
-    address: int, code_at: CodeAt, executions: Callable[[int], int | None]
-) -> Detour | None:
-    """The detour at one instruction; None if none fits there.
-
-    Args:
-        executions: function from an address to the number of its executions.
-    """
-    size = _straight_bytes(address, code_at, executions)
-    return Detour(size) if size >= TRAITS.jump_bytes else None
-
-
-def _straight_bytes(address: int, code_at: CodeAt, executions: Callable[[int], int | None]) -> int:
+def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> int:
     """Bytes of the instructions from one on that a detour can replace, as many as it needs."""
     size, expected = 0, None
-    while (how := flow(code_at(address + size), address + size)) is not None and how.movable:
+    while (how := _flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
-        if size >= TRAITS.jump_bytes or not how.straight:
+        if size >= _JUMP_BYTES or not how.straight:
             return size
         expected = expected or executions(address)
         if executions(address + size) != expected:
@@ -145,7 +285,7 @@ def _straight_bytes(address: int, code_at: CodeAt, executions: Callable[[int], i
 
 
 def _without_repeats(
-    addresses: list[int], counts: list[int], flows: list[Flow | None]
+    addresses: list[int], counts: list[int], flows: list[_Flow | None]
 ) -> list[int]:
     """Count a repeated string instruction once, however often it repeats itself."""
     counts = list(counts)
@@ -157,7 +297,7 @@ def _without_repeats(
     return counts
 
 
-def _joined(addresses: list[int], counts: list[int], flows: list[Flow | None]) -> list[bool]:
+def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) -> list[bool]:
     """Whether each instruction always leads to the next, and nothing else does."""
     joined = [
         how is not None
@@ -170,21 +310,21 @@ def _joined(addresses: list[int], counts: list[int], flows: list[Flow | None]) -
 
 
 def _detours(
-    addresses: list[int], sizes: list[int], flows: list[Flow | None]
+    addresses: list[int], sizes: list[int], flows: list[_Flow | None]
 ) -> Iterator[Detour | None]:
     """The detour at each instruction."""
     ends = [at + how.size if how else at for at, how in zip(addresses, flows, strict=True)]
     gaps = [
-        range(end, start - TRAITS.jump_bytes + 1)
+        range(end, start - _JUMP_BYTES + 1)
         for end, start in zip(ends, addresses[1:], strict=False)
-        if start - end >= TRAITS.jump_bytes
+        if start - end >= _JUMP_BYTES
     ]
     starts = [gap.start for gap in gaps]
     for address, size in zip(addresses, sizes, strict=True):
-        if size >= TRAITS.jump_bytes:
+        if size >= _JUMP_BYTES:
             yield Detour(size)
-        elif size >= TRAITS.short_jump_bytes:
-            near = range(address + TRAITS.short_jump.start, address + TRAITS.short_jump.stop)
+        elif size >= _SHORT_JUMP_BYTES:
+            near = range(address + _SHORT_JUMP.start, address + _SHORT_JUMP.stop)
             yield _over_gap(
                 address, size, gaps[max(0, bisect_left(starts, near.start) - 1) :], near
             )
@@ -214,93 +354,3 @@ def _places(detours: Sequence[Detour | None], joined: list[bool]) -> list[int]:
             places += [each if detours[each] or not fits else fits[0] for each in block]
             start = at + 1
     return places
-
-
-# -- counting by valgrind's callgrind
-
-_SLOWER = 200.0  # callgrind takes 10 to 60 times as long as the program
-_START_S = 60.0
-_TOLD_EVERY_S = 1.0
-
-
-def callgrind() -> str | None:
-    """Path of valgrind; None if it is not installed."""
-    return shutil.which("valgrind")
-
-
-def run_counted(
-    command: Program,
-    *,
-    stdout: Path,
-    stderr: Path,
-    counts: Path,
-    wall_s: float,
-    tell: Callable[[str], None] = lambda _: None,
-) -> int:
-    """Run a program under callgrind and return its exit code.
-
-    Args:
-        counts: file to which callgrind writes.
-        wall_s: duration of the program without it.
-        tell: called every second with how long it has been running, in words.
-
-    Raises:
-        TargetError: it does not end in time, or a signal kills it.
-    """
-    name, limit_s = Path(command.argv[0]).name, _SLOWER * wall_s + _START_S
-    tool = [
-        str(callgrind()), "--quiet", "--tool=callgrind", "--dump-instr=yes", "--compress-pos=no",
-        "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
-        f"--callgrind-out-file={counts}", "--",
-    ]  # fmt: skip
-    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
-        process = subprocess.Popen(
-            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
-            stdin=given, stdout=out, stderr=err, start_new_session=True,
-        )  # fmt: skip
-    try:
-        code = _await_end(process, name, limit_s, tell)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-    if code < 0:
-        raise TargetError(name, f"is killed by signal {-code} under callgrind")
-    return code
-
-
-def _await_end(
-    process: subprocess.Popen[bytes], name: str, limit_s: float, tell: Callable[[str], None]
-) -> int:
-    """Wait for the exit code; tell how long it takes."""
-    begun_s = time.monotonic()
-    while (elapsed_s := time.monotonic() - begun_s) < limit_s:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            return process.wait(min(_TOLD_EVERY_S, limit_s - elapsed_s))
-        tell(f"counted by callgrind, {elapsed_s:.0f} s of at most {limit_s:.0f} s")
-    raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s")
-
-
-def read_counts(path: Path, objects: Iterable[str]) -> dict[str, Counter[int]]:
-    """Executions of each instruction, by the path of its object and its linked address.
-
-    Args:
-        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
-            the cost of the called function.
-        objects: paths of the wanted objects.
-    """
-    found: dict[str, Counter[int]] = {each: Counter() for each in objects}
-    current: Counter[int] | None = None
-    of_callee = False
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if line.startswith("0x"):
-                if current is not None and not of_callee:
-                    address, _, count = line.split()
-                    current[int(address, 16)] += int(count)
-                of_callee = False
-            elif line.startswith("ob="):
-                current = found.get(os.path.realpath(line[3:].rstrip("\n")))
-            elif line.startswith("calls="):
-                of_callee = True
-    return found

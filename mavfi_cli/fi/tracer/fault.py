@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -19,16 +19,10 @@ import numpy as np
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.tracer.arch import (
-    JUMP_FLAGS,
-    TRAITS,
-    Detour,
-    Instruction,
-    RegisterUse,
-    register_kind,
-    width_of,
-)
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import Instruction, RegisterUse
 from mavfi_cli.fi.tracer.image import Location
+from mavfi_cli.fi.tracer.registers import FLAG_BITS, FLAGS, VECTOR_BITS, width_of
 
 
 class Site(Enum):
@@ -54,13 +48,15 @@ class Role(Enum):
     DESTINATION = "destination"  # corrupted after the instruction has written it
 
 
-@dataclass(frozen=True, slots=True)
-class CountedStop:
-    """Run until `location` is about to execute for the `count`-th time since the stage before."""
-
-    location: Location
-    count: int
-    detour: Detour | None = None  # None: the executions are counted by a breakpoint
+# The flags whose flip inverts a jump (Intel SDM volume 2, Jcc).
+JUMP_FLAGS = {
+    jump: tuple(FLAG_BITS[flag] for flag in flags.split())
+    for jumps, flags in (
+        ("jo jno", "of"), ("js jns", "sf"), ("jp jnp", "pf"), ("je jne", "zf"), ("jb jae", "cf"),
+        ("jl jge", "sf"), ("jbe ja", "cf zf"), ("jle jg", "zf sf"),
+    )
+    for jump in jumps.split()
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +69,29 @@ class InstructionCorruption:
     operand: str  # as the assembler names it
     bits: tuple[int, ...]  # of the full register, of the opcode bytes, or of the memory operand
     memory_operand: int = 0  # index among the instruction's memory operands
-    inverts: str = (
-        ""  # a conditional jump: those of `bits` are struck that make it go the other way
-    )
+    inverts: str = ""  # a conditional jump: only bits that make it go the other way are struck
+
+    def struck(self, flags: int) -> tuple[int, ...]:
+        """The bits that are inverted, given all flags if it inverts a jump.
+
+        Where the jump tests two conditions ("below" or "equal"), each that holds is undone; if none
+        does, "equal" is made to hold.
+        """
+        if not self.inverts:
+            return self.bits
+        carry, zero, sign, overflow = (FLAG_BITS[flag] for flag in ("cf", "zf", "sf", "of"))
+        less = carry if carry in self.bits else sign
+        below = flags >> less & 1 if less == carry else (flags >> sign ^ flags >> overflow) & 1
+        equal = flags >> zero & 1
+        if not (below or equal):
+            return (zero,)
+        return tuple(sorted([less] * below + [zero] * equal))
+
+    def to_json(self) -> dict[str, Any]:
+        """The corruption part of a record."""
+        names = {"site": self.site.value, "role": self.role.value, "bits": list(self.bits)}
+        told = asdict(self) | names
+        return told if self.inverts else {k: v for k, v in told.items() if k != "inverts"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,7 +217,7 @@ def _field_mask(instruction: Instruction, model: FaultModel, role: Role, site: S
     lane = bits.mask_of(kind.field_bits(model.field), kind)
     if instruction.scalar:
         return lane
-    return sum(lane << shift for shift in range(0, TRAITS.vector_bits, kind.width))
+    return sum(lane << shift for shift in range(0, VECTOR_BITS, kind.width))
 
 
 def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Operand]:
@@ -217,10 +233,8 @@ def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Op
 def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
     found = []
     if Site.INSTRUCTION_POINTER in model.sites:
-        pointer = TRAITS.instruction_pointer
-        mask = (1 << width_of(pointer)) - 1
-        site = Site.INSTRUCTION_POINTER
-        found.append(_operand(site, Role.DESTINATION, mask, pointer, pointer))
+        mask = (1 << width_of("rip")) - 1
+        found.append(_operand(Site.INSTRUCTION_POINTER, Role.DESTINATION, mask, "rip", "rip"))
     if Site.OPCODE in model.sites:
         mask = (1 << 8 * len(instruction.raw)) - 1
         found.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
@@ -229,7 +243,13 @@ def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
 
 def _site_of(register: str) -> Site:
     """The site that a full register is."""
-    return Site(register_kind(register))
+    return _SITES.get(register.rstrip("0123456789"), Site.GENERAL)
+
+
+_SITES = {
+    "rflags": Site.FLAGS, "rip": Site.INSTRUCTION_POINTER, "st": Site.X87, "mm": Site.X87,
+    "k": Site.MASK, **dict.fromkeys(("xmm", "ymm", "zmm"), Site.VECTOR),
+}  # fmt: skip
 
 
 # -- strategies
@@ -261,6 +281,27 @@ class Strategy:
     whole_process: bool = False  # hits code out of scope as well
     in_system_calls: bool = False  # hits a thread that waits in the operating system as well
 
+    @classmethod
+    def of(
+        cls, name: str, model: FaultModel | None = None, *, compat: str | None = None
+    ) -> Strategy:
+        """The strategy of a sampling rule, or of another injector that is imitated.
+
+        Raises:
+            UnknownName: no such rule or compatibility mode; names the nearest.
+            FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
+        """
+        if compat is not None:
+            if compat not in _COMPAT:
+                raise UnknownName("compatibility mode", compat, _COMPAT)
+            if model not in (None, FaultModel()):
+                raise FaultSpecError(
+                    f"{compat} chooses sites, roles, field and bits by its own rule"
+                )
+            return _COMPAT[compat]
+        rule = named_member(Rule, "sampling rule", name)
+        return cls(name=rule.value, rule=rule, model=model or FaultModel())
+
     def draw_at(
         self,
         instruction: Instruction,
@@ -271,23 +312,6 @@ class Strategy:
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
         return _draw_corruption(instruction, self.model, rng)
-
-
-def strategy(name: str, model: FaultModel | None = None, *, compat: str | None = None) -> Strategy:
-    """The strategy of a sampling rule, or of another injector that is imitated.
-
-    Raises:
-        UnknownName: no such rule or compatibility mode; names the nearest.
-        FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
-    """
-    if compat is not None:
-        if compat not in _COMPAT:
-            raise UnknownName("compatibility mode", compat, _COMPAT)
-        if model not in (None, FaultModel()):
-            raise FaultSpecError(f"{compat} chooses sites, roles, field and bits by its own rule")
-        return _COMPAT[compat]
-    rule = named_member(Rule, "sampling rule", name)
-    return Strategy(name=rule.value, rule=rule, model=model or FaultModel())
 
 
 # -- other injectors
@@ -341,7 +365,7 @@ def _draw_pinfi(
                 bits=(bit,), memory_operand=index,
             )  # fmt: skip
     bit = int(rng.integers(_FLAGS_WIDTH))
-    return _flags((bit,) if bit in bits.bits_of(TRAITS.flags) else ())
+    return _flags((bit,) if bit in bits.bits_of(FLAGS) else ())
 
 
 def _draw_pinfi_with_bugs(
@@ -374,7 +398,7 @@ def _inverted_jump(jump: str) -> InstructionCorruption:
 
 
 def _flags(struck: tuple[int, ...]) -> InstructionCorruption:
-    name = TRAITS.flags_register
+    name = "rflags"
     return InstructionCorruption(
         site=Site.FLAGS, role=Role.DESTINATION, register=name, operand=name, bits=struck
     )

@@ -199,6 +199,17 @@ class Part:
     text: tuple[range, ...]  # offsets, ascending
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scope:
+    """The code that may be hit: the text of these objects, as addresses of one process."""
+
+    objects: tuple[str, ...]
+    spans: tuple[range, ...]
+
+    def __contains__(self, address: int) -> bool:
+        return any(address in span for span in self.spans)
+
+
 Regions = Mapping[str, "range | Region | Part"]
 
 
@@ -307,16 +318,19 @@ class Image:
             known += [function.name for function in loaded.facts.functions]
         raise UnknownName("function", name, known[:200])
 
+    def scope(self, objects: Iterable[str]) -> Scope:
+        """The text of the named objects.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scope:
-    """The code that may be hit: the text of these objects, as addresses of one process."""
-
-    objects: tuple[str, ...]
-    spans: tuple[range, ...]
-
-    def __contains__(self, address: int) -> bool:
-        return any(address in span for span in self.spans)
+        Raises:
+            UnknownName: an object is not loaded; names the nearest.
+        """
+        names = tuple(objects)
+        spans = [
+            range(loaded.bias + text.start, loaded.bias + text.stop)
+            for loaded in map(self.named, names)
+            for text in loaded.text
+        ]
+        return Scope(objects=names, spans=tuple(sorted(spans, key=lambda span: span.start)))
 
 
 def executable_mapping(pid: int, address: int) -> range:
@@ -331,21 +345,6 @@ def executable_mapping(pid: int, address: int) -> range:
         if low <= address < high and "x" in access:
             return range(low, high)
     raise FaultError(f"no executable code at {address:#x} in process {pid}")
-
-
-def scope_of(image: Image, objects: Iterable[str]) -> Scope:
-    """The text of the named objects.
-
-    Raises:
-        UnknownName: an object is not loaded; names the nearest.
-    """
-    names = tuple(objects)
-    spans = [
-        range(loaded.bias + text.start, loaded.bias + text.stop)
-        for loaded in map(image.named, names)
-        for text in loaded.text
-    ]
-    return Scope(objects=names, spans=tuple(sorted(spans, key=lambda span: span.start)))
 
 
 def _files(pid: int) -> dict[str, list[_FileMapping]]:

@@ -8,17 +8,10 @@ from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
-from mavfi_cli.fi.tracer.arch import (
-    TRAITS,
-    Instruction,
-    address_of,
-    decode,
-    erase_trap,
-    inverting_bits,
-    width_of,
-)
+from mavfi_cli.fi.tracer.decode import Instruction, address_of, decode
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.registers import TRAP_FLAG, VECTOR_BITS, width_of
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
@@ -87,8 +80,25 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
     if instruction is not None and instruction.run_over:
         tracee.run_to(instruction.next_address)
     elif tracee.step() is None and instruction is not None:
-        erase_trap(tracee.registers, tracee.memory, instruction)
+        _erase_trap(tracee, instruction)
     return tracee.ended
+
+
+def _erase_trap(tracee: Tracee, instruction: Instruction) -> None:
+    """Remove the trap flag that a single step of `instruction` left in the target.
+
+    `pushf` has pushed the trap flag, and a system call has saved it in r11.
+    """
+    registers, memory = tracee.registers, tracee.memory
+    if instruction.mnemonic in ("pushfq", "pushf"):
+        stack = registers.sp
+        size = 2 if instruction.mnemonic == "pushf" else 8
+        image = int.from_bytes(memory.read(stack, size), "little")
+        memory.write(stack, (image & ~TRAP_FLAG).to_bytes(size, "little"))
+    elif instruction.mnemonic == "syscall":
+        saved = registers.read("r11")
+        if saved & TRAP_FLAG:
+            registers.write("r11", saved & ~TRAP_FLAG)
 
 
 def _apply(
@@ -110,7 +120,7 @@ def _apply(
         before, after = _invert(tracee, instruction, corruption, place)
     except OSError as error:
         return _not_applied(f"refused by the operating system: {error.strerror}", place, 0, start)
-    lost = [bit for bit in _struck(corruption, before) if not (before ^ after) >> bit & 1]
+    lost = [bit for bit in corruption.struck(before) if not (before ^ after) >> bit & 1]
     reason = f"discarded by the operating system: bits {lost}" if lost else ""
     stop_s = (time.perf_counter_ns() - start) * 1e-9
     return Injection(
@@ -142,13 +152,9 @@ def _invert(
     registers = tracee.registers
     before = registers.read(corruption.register)
     kind = bits.raw(width_of(corruption.register) // 8)
-    struck = _struck(corruption, before)
+    struck = corruption.struck(before)
     registers.write(corruption.register, bits.flip_pattern(before, struck, kind))
     return before, registers.read(corruption.register)
-
-
-def _struck(corruption: InstructionCorruption, before: int) -> tuple[int, ...]:
-    return inverting_bits(corruption.inverts, before) if corruption.inverts else corruption.bits
 
 
 def _execute_corrupted(
@@ -183,7 +189,7 @@ def _follow(
         return Followed(
             activation=BitActivation.READ, after_instructions=0, instruction=instruction.text
         )
-    remaining = bits.mask_of(corruption.bits, bits.raw(TRAITS.vector_bits))
+    remaining = bits.mask_of(corruption.bits, bits.raw(VECTOR_BITS))
     for distance in range(1, window + 1):
         current = instruction_at(tracee, tracee.registers.ip)
         if current is None:

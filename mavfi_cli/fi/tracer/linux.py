@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import signal
 import threading
 import time
@@ -40,7 +41,8 @@ _personality = _libc.personality
 _personality.restype = ctypes.c_int
 _personality.argtypes = [ctypes.c_ulong]
 
-REMEDY = (
+SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
+_REMEDY = (
     "run as the parent of the target, set kernel.yama.ptrace_scope to 0 or 1, or start the "
     "container with --cap-add=SYS_PTRACE"
 )
@@ -65,6 +67,20 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
     return result & 0xFFFF_FFFF_FFFF_FFFF
 
 
+def require_supported() -> None:
+    """Refuse to trace on a processor that the tracer does not know.
+
+    Raises:
+        TracingForbidden: this is not x86-64 Linux.
+    """
+    if not SUPPORTED:
+        raise TracingForbidden(
+            "instruction-level injection",
+            f"this machine is {platform.machine()}",
+            "use an x86-64 Linux machine, or source-level faults",
+        )
+
+
 def seize(tid: int, *, kill_with_tracer: bool) -> None:
     """Attach without stopping; new threads and children are attached by the kernel.
 
@@ -72,11 +88,12 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
         TracingForbidden: the operating system refuses; the error says how to allow it.
         ProcessLookupError: no such thread.
     """
+    require_supported()
     options = TRACE_OPTIONS | (OPTION_EXITKILL if kill_with_tracer else 0)
     try:
         request(SEIZE, tid, 0, options)
     except PermissionError as error:
-        raise TracingForbidden("tracing a process", str(error), REMEDY) from None
+        raise TracingForbidden("tracing a process", str(error), _REMEDY) from None
 
 
 def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
@@ -95,13 +112,6 @@ def set_registers(tid: int, note: int, data: bytes) -> None:
     buffer = ctypes.create_string_buffer(data, len(data))
     vector = _IoVector(ctypes.addressof(buffer), len(data))
     request(SETREGSET, tid, note, ctypes.addressof(vector))
-
-
-def signal_code(tid: int) -> int:
-    """The `si_code` of a signal-delivery stop."""
-    buffer = (ctypes.c_int * 32)()
-    request(GETSIGINFO, tid, 0, ctypes.addressof(buffer))
-    return int(buffer[2])
 
 
 class Memory:
@@ -144,14 +154,6 @@ def fixed_addresses() -> Iterator[None]:
         yield
     finally:
         _personality(before)
-
-
-def threads_of(pid: int) -> list[int]:
-    """The thread ids of a process, ascending; empty when it has ended."""
-    try:
-        return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
-    except FileNotFoundError:
-        return []
 
 
 def share_processor(pid: int) -> None:

@@ -15,9 +15,8 @@ from typing import Any
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError
 from mavfi_cli.core.files import write_text
-from mavfi_cli.fi.tracer.arch import Detour
+from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
-    CountedStop,
     InstructionCorruption,
     InstructionFault,
     Role,
@@ -48,7 +47,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
         "instruction_bytes": fault.instruction_bytes.hex(),
         "k": fault.execution,
         "trigger": [_stage_to_json(stage) for stage in fault.trigger],
-        "corruption": corruption_to_json(fault.corruption),
+        "corruption": fault.corruption and fault.corruption.to_json(),
         "build_ids": {
             name: image.named(name).build_id
             for name in sorted({stage.location.object for stage in fault.trigger})
@@ -60,15 +59,6 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
 def _stage_to_json(stage: CountedStop) -> dict[str, Any]:
     told = {"object": stage.location.object, "offset": stage.location.offset, "count": stage.count}
     return told | ({} if stage.detour is None else {"detour": asdict(stage.detour)})
-
-
-def corruption_to_json(corruption: InstructionCorruption | None) -> dict[str, Any] | None:
-    """The corruption part of a record; null for a null injection."""
-    if corruption is None:
-        return None
-    names = {"site": corruption.site.value, "role": corruption.role.value}
-    told = asdict(corruption) | names | {"bits": list(corruption.bits)}
-    return told if corruption.inverts else {k: v for k, v in told.items() if k != "inverts"}
 
 
 def completed(

@@ -18,21 +18,15 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch import (
-    TRAITS,
-    Detour,
-    decode,
-    record_steps,
-    return_address,
-)
-from mavfi_cli.fi.tracer.arch.interface import StepEnd
-from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, Locate, detour_at
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Strategy
+from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, CountedStop, Detour, Locate
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Tracee
 
 _CHUNK = 16384
+_BREAKPOINT = b"\xcc"  # the instruction
 _STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20
 _NEAR = 16  # instructions before the target at which a detour is looked for
@@ -136,7 +130,8 @@ def record_window(
     """
     stop = np.array([-1, 0, *markers], np.int64)
     if until_return:
-        stop[:2] = return_address(tracee.registers, tracee.memory), tracee.registers.sp
+        returns_to = tracee.memory.read(tracee.registers.sp, 8)
+        stop[:2] = int.from_bytes(returns_to, "little"), tracee.registers.sp
     parts: list[NDArray[np.int64]] = []
     if tracee.registers.ip in markers:
         parts.append(np.array([tracee.registers.ip], np.int64))
@@ -153,21 +148,23 @@ def record_window(
 
 
 def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
+
     spans = np.array([[span.start, span.stop] for span in scope.spans], np.int64)
     blanket = _Blanket(tracee, scope)
     while tracee.ended is None:
         trace = np.empty(_CHUNK, np.int64)
         tracee.registers.forget()
-        recorded, why, status = record_steps(tracee.tid, spans, trace, stop)
+        recorded, why, status = stepper.record_steps(tracee.tid, spans, trace, stop)
         yield trace[:recorded]
-        if why is StepEnd.WINDOW_END:
+        if why == stepper.WINDOW_END:
             return
-        if why is StepEnd.OTHER_STATUS:
+        if why == stepper.OTHER_STATUS:
             tracee.handle(linux.Status(tracee.tid, status), linux.SINGLESTEP)
-        elif why is StepEnd.NEEDS_CARE:
+        elif why == stepper.NEEDS_CARE:
             yield np.array([tracee.registers.ip], np.int64)
             clean_step(tracee, instruction_at(tracee, tracee.registers.ip))
-        elif why is StepEnd.OUT_OF_SCOPE and not blanket.run_native(stop):
+        elif why == stepper.OUT_OF_SCOPE and not blanket.run_native(stop):
             return
 
 
@@ -190,9 +187,9 @@ class _Blanket:
             while True:
                 if tracee.resume() is not None:
                     return False
-                entered = tracee.registers.ip - TRAITS.breakpoint_advance
+                entered = tracee.registers.ip - len(_BREAKPOINT)
                 if entered in self._scope:
-                    tracee.registers.write(TRAITS.instruction_pointer, entered)
+                    tracee.registers.write("rip", entered)
                     return True
                 if tracee.registers.ip == stop[0] and tracee.registers.sp > stop[1]:
                     return False
@@ -207,7 +204,7 @@ class _Blanket:
 
     def _write(self, *, covered: bool) -> None:
         for start, code in self._code:
-            data = TRAITS.breakpoint * len(code) if covered else code
+            data = _BREAKPOINT * len(code) if covered else code
             self._tracee.memory.write(start, data)
 
 
@@ -261,7 +258,7 @@ def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> 
         return int(np.count_nonzero(segment.trace == address))
 
     for place in range(index, max(-1, index - _NEAR), -1):
-        detour = detour_at(int(segment.trace[place]), code_at, executions)
+        detour = Detour.at(int(segment.trace[place]), code_at, executions)
         if detour is not None:
             yield _through(segment, place, index, locate, detour)
             return

@@ -1,4 +1,9 @@
-"""Starts a program under the tracer, stopped at its first instruction or its entry point."""
+"""Starts a program under the tracer, and watches once what else it does than compute.
+
+It is stopped at its first instruction or its entry point. The system calls of a fault-free run tell
+whether the program starts threads or other programs, which are not followed, what it writes where,
+and why it may have failed.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,13 @@ import signal
 import socket
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee, best_mechanism
+from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS
+from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee
 
 # The shell says that it runs (so that its own exec is over) and waits for one line (so that the
 # tracer is attached before the program starts).
@@ -96,7 +102,7 @@ def spawn(
     with ours:
         with theirs:
             pid = _launch(command, stdout, stderr, theirs.fileno())
-        tracee = Tracee(pid, pid, -pid, mechanism or best_mechanism())
+        tracee = Tracee(pid, pid, -pid, mechanism or Mechanism.best())
         with contextlib.ExitStack() as undo:
             undo.callback(os.waitpid, pid, 0)
             undo.callback(os.kill, pid, signal.SIGKILL)
@@ -167,3 +173,125 @@ def _auxiliary(pid: int, key: int) -> int | None:
     """A value of the auxiliary vector of a program (getauxval(3))."""
     words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
     return next((value for name, value in words if name == key), None)
+
+
+# -- what it does in one run
+
+_CALL_STOP = signal.SIGTRAP | 0x80  # PTRACE_O_TRACESYSGOOD
+_STARTS = {
+    linux.EVENT_CLONE: "starts a thread",
+    linux.EVENT_FORK: "starts a child process",
+    linux.EVENT_VFORK: "starts a child process",
+    linux.EVENT_EXEC: "replaces itself by another program",
+}
+_DEVICES = ("/dev/", "/proc/", "pipe:", "socket:")
+_HERE = -100  # AT_FDCWD
+_NO_MEMORY = -12  # ENOMEM
+_WRITING = 0o3 | 0o100 | 0o1000  # access mode, O_CREAT, O_TRUNC
+_TERMINAL_IOCTLS = frozenset((0x5401, 0x5402, 0x5403, 0x5404, 0x5413))  # TCGETS ... TIOCGWINSZ
+_IOCTL, _MAPS = 16, (9, 25)  # mmap, mremap
+_NAMES = {56: "clone", 57: "fork", 58: "vfork", 59: "execve", 322: "execveat", 435: "clone3"}
+
+# Number: arguments with the folder's descriptor (-1: none), the path, and the flags of an opening.
+_PATHS = {
+    2: (-1, 0, 1), 257: (0, 1, 2),  # open, openat
+    437: (0, 1, -1), 85: (-1, 0, -1), 76: (-1, 0, -1),  # openat2, creat, truncate
+    82: (-1, 1, -1), 264: (2, 3, -1), 316: (2, 3, -1),  # rename, renameat, renameat2
+    87: (-1, 0, -1), 263: (0, 1, -1), 84: (-1, 0, -1),  # unlink, unlinkat, rmdir
+    83: (-1, 0, -1), 258: (0, 1, -1), 133: (-1, 0, -1),  # mkdir, mkdirat, mknod
+    86: (-1, 1, -1), 265: (2, 3, -1), 88: (-1, 1, -1), 266: (1, 2, -1),  # links
+}  # fmt: skip
+
+
+@dataclass(slots=True)
+class Watched:
+    """What a program did in one run.
+
+    Attributes:
+        company: the first thread, child or other program that it started, in words; empty if none.
+            The run was not watched any further.
+        written: absolute paths that it wrote, made, renamed or removed, in order.
+        terminal: whether it asked for a terminal.
+        lacked_memory: whether it was refused memory.
+    """
+
+    company: str = ""
+    written: list[str] = field(default_factory=list)
+    terminal: bool = False
+    lacked_memory: bool = False
+
+
+def watch(tracee: Tracee, *, wall_s: float) -> Watched:
+    """Run a stopped program to its end, at most `wall_s`, and watch its system calls."""
+    watched, entering, number = Watched(), True, 0
+    with linux.ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
+        while True:
+            tracee.registers.forget()
+            linux.request(linux.SYSCALL, tracee.pid, 0, number)
+            status = linux.wait(tracee.pid)
+            if status.ended:
+                tracee.handle(status, linux.CONT)
+                break
+            number = 0
+            if status.event in _STARTS:
+                call = _NAMES.get(tracee.registers.system_call or 0, "a system call")
+                watched.company = f"{_STARTS[status.event]} (system call {call})"
+                break
+            if status.signal == _CALL_STOP:
+                (_note_request if entering else _note_answer)(tracee, watched)
+                entering = not entering
+            elif status.event == 0:
+                number = status.signal
+    if alarm.fired:
+        tracee.kill()
+    return watched
+
+
+def _note_request(tracee: Tracee, watched: Watched) -> None:
+    """Note what a system call asks for, at its entry."""
+    registers = tracee.registers
+    number = registers.system_call
+    if number == _IOCTL:
+        fd, request = (registers.read(name) for name in CALL_ARGUMENTS[:2])
+        watched.terminal |= fd <= 2 and request & 0xFFFF_FFFF in _TERMINAL_IOCTLS
+    if number not in _PATHS:
+        return
+    folder, path, flags = _PATHS[number]
+    name = _text(tracee.memory, registers.read(CALL_ARGUMENTS[path]))
+    watched.terminal |= name == "/dev/tty"
+    if name and (flags < 0 or registers.read(CALL_ARGUMENTS[flags]) & _WRITING):
+        base = _HERE if folder < 0 else _signed(registers.read(CALL_ARGUMENTS[folder]), 32)
+        whole = _absolute(tracee.pid, base, name)
+        if whole not in watched.written and not whole.startswith(_DEVICES):
+            watched.written.append(whole)
+
+
+def _note_answer(tracee: Tracee, watched: Watched) -> None:
+    """Note whether a system call was refused memory, at its end."""
+    refused = _signed(tracee.registers.read("rax"), 64) == _NO_MEMORY
+    watched.lacked_memory |= refused and tracee.registers.system_call in _MAPS
+
+
+def _absolute(pid: int, folder: int, path: str) -> str:
+    """The path that a process names, relative to its folder or to that of a descriptor."""
+    base = f"/proc/{pid}/cwd" if folder == _HERE else f"/proc/{pid}/fd/{folder}"
+    try:
+        return os.path.normpath(Path(os.readlink(base)) / path)
+    except OSError:
+        return os.path.normpath(path)
+
+
+def _signed(value: int, bits: int) -> int:
+    value &= (1 << bits) - 1
+    return value - (value >> bits - 1 << bits)
+
+
+def _text(memory: linux.Memory, address: int) -> str:
+    """The text at an address; empty if there is none."""
+    try:
+        data = memory.read(address, 4096 - address % 4096)
+        if b"\0" not in data:
+            data += memory.read(address + len(data), 4096)
+    except (OSError, OverflowError):
+        return ""
+    return data.partition(b"\0")[0].decode(errors="replace")

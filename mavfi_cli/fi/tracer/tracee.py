@@ -28,25 +28,24 @@ from enum import Enum
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch import (
-    TRAITS,
-    DebugBreakpoint,
-    Detour,
-    Registers,
-    detour_code,
-    prepare_system_call,
-)
+from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.linux import ProcessTimer
+from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS, Registers
 
 DETOUR_COST = 20  # counted hits from which a detour is quicker; to make one takes some 15 hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
+_MMAP, _MUNMAP, _PERF_EVENT_OPEN = 9, 11, 298  # system calls
+_SYSTEM_CALL = b"\x0f\x05"  # the instruction
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
 
-_TYPE_BREAKPOINT, _EXECUTE, _CLOSE_ON_EXEC = 5, 4, 8
+_TYPE_BREAKPOINT, _EXECUTE, _LENGTH, _CLOSE_ON_EXEC = 5, 4, 8, 8
 _DISABLED_AT_EXEC_END = 1 << 36 | 1 << 37  # remove_on_exec, sigtrap
 _USER_ONLY = 1 << 5 | 1 << 6  # exclude_kernel, exclude_hv
 _ATTRIBUTES = struct.Struct("<IIQQQQQIIQQ56x")  # perf_event_attr, version 7: 128 bytes
+
+_DEBUG_REGISTERS = 848  # offset of debug register 0 in `struct user`
+_TAKEN = 3 | 0xF << 16  # bits of debug register 7 that belong to it
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -57,50 +56,74 @@ class Mechanism(Enum):
     PERF = "perf"
     DEBUG = "debug-registers"
 
+    @classmethod
+    def best(cls) -> Mechanism:
+        """The best mechanism that this machine allows."""
+        return cls.PERF if perf_allowed() is None else cls.DEBUG
 
-def _open_event(tid: int, address: int, period: int, extra: int) -> int:
+
+def _open_event(tid: int, address: int, period: int) -> int:
+    linux.require_supported()
+    extra = _DISABLED_AT_EXEC_END if period else 0
     attributes = _ATTRIBUTES.pack(
-        _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | extra, 0, _EXECUTE, address,
-        TRAITS.breakpoint_length,
+        _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | extra, 0, _EXECUTE, address, _LENGTH,
     )  # fmt: skip
     flags = ctypes.c_ulong(_CLOSE_ON_EXEC)
-    fd = int(_libc.syscall(TRAITS.perf_event_open, attributes, tid, -1, -1, flags))
+    fd = int(_libc.syscall(_PERF_EVENT_OPEN, attributes, tid, -1, -1, flags))
     if fd < 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
     return fd
 
 
-class PerfBreakpoint:
-    """Traps the thread before execution number `count` of the instruction at `address`."""
+class _DebugBreakpoint:
+    """Debug register 0 of a *stopped* thread: traps before every execution at `address`.
 
-    def __init__(self, tid: int, address: int, count: int) -> None:
-        self._fd = _open_event(tid, address, count, _DISABLED_AT_EXEC_END)
+    Intel SDM volume 3, section 18.2.
+    """
+
+    def __init__(self, tid: int, address: int) -> None:
+        self._tid = tid
+        self._enable(0)
+        self._poke(0, address)
+        self._enable(1)  # for the thread; type execute, length 1: zeros
 
     def close(self) -> None:
-        """Remove the breakpoint."""
-        os.close(self._fd)
+        """Remove the breakpoint; the thread must be stopped or gone."""
+        with contextlib.suppress(ProcessLookupError):
+            self._enable(0)
+
+    def _enable(self, bits: int) -> None:
+        others = linux.request(linux.PEEKUSER, self._tid, _DEBUG_REGISTERS + 8 * 7) & ~_TAKEN
+        self._poke(7, others | bits)
+
+    def _poke(self, register: int, value: int) -> None:
+        linux.request(linux.POKEUSER, self._tid, _DEBUG_REGISTERS + 8 * register, value)
 
 
 class ExecutionCounter:
-    """Counts the executions of one instruction without stopping it, for checks."""
+    """Counts the executions of one instruction.
 
-    def __init__(self, tid: int, address: int) -> None:
-        self._fd = _open_event(tid, address, 0, 0)
+    Args:
+        stop_at: the thread traps before this execution; 0: never.
+    """
+
+    def __init__(self, tid: int, address: int, stop_at: int = 0) -> None:
+        self._fd = _open_event(tid, address, stop_at)
 
     def read(self) -> int:
         """Executions since the counter was opened; valid after the thread's end too."""
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
-        """Remove the counter."""
+        """Remove the counter, or the breakpoint that it is."""
         os.close(self._fd)
 
 
 def perf_allowed() -> str | None:
     """None if counted breakpoints can be opened, else the reason why not."""
     try:
-        os.close(_open_event(0, 0x1000, 1_000_000, _DISABLED_AT_EXEC_END))
+        os.close(_open_event(0, 0x1000, 1_000_000))
     except OSError as error:
         return str(error)
     return None
@@ -109,6 +132,21 @@ def perf_allowed() -> str | None:
 _TRACER_TRAPS = frozenset((1, 2, 4, 6, 0x80))  # TRAP_BRKPT, _TRACE, _HWBKPT, _PERF, SI_KERNEL
 _NOT_FROM_OTHERS = 0x2000_0000  # __WNOTHREAD: only tracees and children of this thread
 _ANY_CHILD = -1
+
+
+def _signal_code(tid: int) -> int:
+    """The `si_code` of a signal-delivery stop."""
+    buffer = (ctypes.c_int * 32)()
+    linux.request(linux.GETSIGINFO, tid, 0, ctypes.addressof(buffer))
+    return int(buffer[2])
+
+
+def _threads_of(pid: int) -> list[int]:
+    """The thread ids of a process, ascending; empty when it has ended."""
+    try:
+        return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
+    except FileNotFoundError:
+        return []
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +190,7 @@ class Tracee:
             TargetError: no such process.
         """
         seized: set[int] = set()
-        while missing := [t for t in linux.threads_of(pid) if t not in seized]:
+        while missing := [t for t in _threads_of(pid) if t not in seized]:
             for thread in missing:
                 # It may have ended between the listing and the attach.
                 with contextlib.suppress(ProcessLookupError):
@@ -160,7 +198,7 @@ class Tracee:
                 seized.add(thread)
         if not seized:
             raise TargetError(f"process {pid}", "does not exist")
-        tracee = cls(pid, pid, _ANY_CHILD, mechanism or best_mechanism())
+        tracee = cls(pid, pid, _ANY_CHILD, mechanism or Mechanism.best())
         tracee.interrupt()
         return tracee
 
@@ -229,16 +267,16 @@ class Tracee:
         finally:
             breakpoint_.close()
 
-    def breakpoint_at(self, address: int) -> PerfBreakpoint | DebugBreakpoint:
+    def breakpoint_at(self, address: int) -> ExecutionCounter | _DebugBreakpoint:
         """A breakpoint that stops at the next execution of `address`, until it is closed."""
         if self.mechanism is Mechanism.PERF:
-            return PerfBreakpoint(self.tid, address, 1)
-        return DebugBreakpoint(self.tid, address)
+            return ExecutionCounter(self.tid, address, 1)
+        return _DebugBreakpoint(self.tid, address)
 
     def detach(self) -> None:
         """Let the process go on without a tracer; the target thread must be stopped."""
         self.memory.close()
-        for thread in linux.threads_of(self.pid):
+        for thread in _threads_of(self.pid):
             if thread != self.tid:
                 self._detach_running(thread)
         linux.request(linux.DETACH, self.tid, 0, self._take_signal())
@@ -330,7 +368,7 @@ class Tracee:
         if status.event == linux.EVENT_STOP:
             return self._interrupting
         if status.trapped:
-            code = linux.signal_code(self.tid)
+            code = _signal_code(self.tid)
             sent = self._expecting_alarm and code <= 0  # by a process
             return sent or code in _TRACER_TRAPS
         if self._interrupting and status.event == 0:
@@ -370,17 +408,17 @@ class Tracee:
         if pages is None:
             return None
         code = self.memory.read(address, detour.size)
-        way = detour_code(code, address, pages, count, detour.via)
+        way = detour.code(code, address, pages, count)
         if way is None:
-            self._system_call(TRAITS.munmap, pages, _PAGES_BYTES)
+            self._system_call(_MUNMAP, pages, _PAGES_BYTES)
             return None
         replaced = {place: self.memory.read(place, len(jump)) for place, jump in way.jumps.items()}
         self._write({**way.pages, **way.jumps})
         while self.resume() is None:
             if self.registers.ip == way.stop:
                 self._write(replaced)
-                self.registers.write(TRAITS.instruction_pointer, address)
-                self._system_call(TRAITS.munmap, pages, _PAGES_BYTES)
+                self.registers.write("rip", address)
+                self._system_call(_MUNMAP, pages, _PAGES_BYTES)
                 return True
         return False
 
@@ -393,7 +431,7 @@ class Tracee:
         for distance in _DISTANCES:
             pages = (address - distance) & ~4095
             if pages > 0 and self._system_call(
-                TRAITS.mmap, pages, _PAGES_BYTES, _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE, 0
+                _MMAP, pages, _PAGES_BYTES, _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE, 0
             ) == pages:  # fmt: skip
                 return pages
         return None
@@ -401,9 +439,10 @@ class Tracee:
     def _system_call(self, number: int, *arguments: int) -> int:
         """Make the stopped target execute a system call; nothing else of it changes."""
         before, here = self.registers.general(), self.registers.ip
-        code = self.memory.read(here, len(TRAITS.system_call))
-        self.memory.write(here, TRAITS.system_call)
-        prepare_system_call(self.registers, number, *arguments)
+        code = self.memory.read(here, len(_SYSTEM_CALL))
+        self.memory.write(here, _SYSTEM_CALL)
+        names = ("rax", *CALL_ARGUMENTS[: len(arguments)])
+        self.registers.write_together(dict(zip(names, (number, *arguments), strict=True)))
         self.step()
         result = self.registers.read("rax")
         self.memory.write(here, code)
@@ -412,7 +451,7 @@ class Tracee:
 
     def _run_to_counted(self, address: int, count: int) -> bool:
         try:
-            breakpoint_ = PerfBreakpoint(self.tid, address, count)
+            breakpoint_ = ExecutionCounter(self.tid, address, count)
         except OSError:
             self.mechanism = Mechanism.DEBUG
             return self._run_to_stepwise(address, count)
@@ -426,7 +465,7 @@ class Tracee:
             breakpoint_.close()
 
     def _run_to_stepwise(self, address: int, count: int) -> bool:
-        breakpoint_ = DebugBreakpoint(self.tid, address)
+        breakpoint_ = _DebugBreakpoint(self.tid, address)
         try:
             while count:
                 if self.resume() is not None:
@@ -435,8 +474,3 @@ class Tracee:
             return True
         finally:
             breakpoint_.close()
-
-
-def best_mechanism() -> Mechanism:
-    """The best counting mechanism that this machine allows."""
-    return Mechanism.PERF if perf_allowed() is None else Mechanism.DEBUG

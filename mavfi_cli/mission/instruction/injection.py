@@ -36,8 +36,9 @@ from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.tracer import linux, record
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault
-from mavfi_cli.fi.tracer.image import Image, Scope, scope_of
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.fault import InstructionFault
+from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM
@@ -232,7 +233,7 @@ class Rehearsal:
 
     def scope(self, image: Image) -> Scope:
         """The code that may be hit."""
-        return scope_of(image, self.scope_of_node.objects)
+        return image.scope(self.scope_of_node.objects)
 
     def profile(self, rng: np.random.Generator) -> TargetProfile:
         """Step the invocation, or a sample of it.

@@ -16,8 +16,9 @@ from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import CountedStop, InstructionFault, Role
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import InstructionFault, Role
 
 TAKING = """
 import numpy as np

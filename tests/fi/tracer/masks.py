@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from probe import NAMES, WINDOW, decoded, random_state, relocated, with_immediate
 
-from mavfi_cli.fi.tracer.arch import TRAITS
-from mavfi_cli.fi.tracer.arch.x86_64.registers import FLAG_BITS
+from mavfi_cli.fi.tracer.registers import FLAG_BITS, FLAGS
 
 STATES, AT_LEAST, ATTEMPTS = 150, 4, 2000
 _EVERY = (1 << 512) - 1
@@ -76,7 +75,7 @@ class _Check:
         self.probe, self.code, self.rng = probe, code, np.random.default_rng(seed)
         self.instruction = decoded(code, probe.slot)
         self.verdict = Verdict(text=self.instruction.text)
-        flags = probe.bits("rflags", TRAITS.flags)
+        flags = probe.bits("rflags", FLAGS)
         registers = sum(probe.bits(name, _EVERY) for name in NAMES if name != "rflags")
         self.flippable = registers | flags | ((1 << 8 * WINDOW) - 1) << probe.memory_at
         undefined = (1 << FLAG_BITS[u.operand] for u in self.instruction.writes if not u.mask

@@ -14,17 +14,20 @@ import struct
 import capstone
 import numpy as np
 from elftools.elf.elffile import ELFFile
+from native_programs import all_registers
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch import TRAITS, Registers, address_of, all_registers, decode
-from mavfi_cli.fi.tracer.arch.x86_64.registers import (
+from mavfi_cli.fi.tracer.decode import address_of, decode
+from mavfi_cli.fi.tracer.image import Image
+from mavfi_cli.fi.tracer.registers import (
     _SLOT,
+    FLAGS,
     GENERAL,
     NT_PRSTATUS,
     NT_X86_XSTATE,
     XSTATE_BV,
+    Registers,
 )
-from mavfi_cli.fi.tracer.image import Image
 
 WINDOW = 4096
 WORDS = 27
@@ -88,9 +91,7 @@ class Probe:
         state &= ~everything
         for name, value in values.items():
             if name == "rflags":
-                state = state & ~self.bits(name, TRAITS.flags) | self.bits(
-                    name, value & TRAITS.flags
-                )
+                state = state & ~self.bits(name, FLAGS) | self.bits(name, value & FLAGS)
             else:
                 state |= self.bits(name, value)
         state = state & ~self.ip_bits | self.slot << 64 * _SLOT["rip"]

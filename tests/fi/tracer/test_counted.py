@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavfi_cli.fi.tracer.arch import Detour, decode
-from mavfi_cli.fi.tracer.counted import CountedRun
-from mavfi_cli.fi.tracer.image import Image, scope_of
+from mavfi_cli.fi.tracer.counted import CountedRun, Detour
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.sampling import record_window
 
 RESUME_FLAG = 1 << 16
@@ -21,7 +21,7 @@ def counted(start):
     def make(name, *arguments):
         tracee = start(name, *arguments)
         image = Image(tracee.pid)
-        scope = scope_of(image, [name])
+        scope = image.scope([name])
         code = {
             at: tracee.memory.read(at, 16)
             for span in scope.spans

@@ -7,7 +7,8 @@ arch = pytest.importorskip("platform")
 if arch.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
-from mavfi_cli.fi.tracer.arch import address_of, decode, widest_vector  # noqa: E402
+from mavfi_cli.fi.tracer.decode import address_of, decode  # noqa: E402
+from mavfi_cli.fi.tracer.registers import widest_vector  # noqa: E402
 
 FULL = (1 << 64) - 1
 

@@ -10,8 +10,8 @@ if platform.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import FaultModel, Role, Site, strategy
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import FaultModel, Role, Site, Strategy
 
 
 def of(code):
@@ -19,7 +19,7 @@ def of(code):
 
 
 def drawn(instruction, model, count=300, seed=1):
-    plan, rng = strategy("instruction-uniform", model), np.random.default_rng(seed)
+    plan, rng = Strategy.of("instruction-uniform", model), np.random.default_rng(seed)
     return [plan.draw_at(instruction, rng) for _ in range(count)]
 
 

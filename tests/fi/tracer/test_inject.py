@@ -5,14 +5,9 @@ import signal
 import pytest
 from native_programs import register_corruption
 
-from mavfi_cli.fi.tracer.arch import decode
-from mavfi_cli.fi.tracer.fault import (
-    CountedStop,
-    InstructionCorruption,
-    InstructionFault,
-    Role,
-    Site,
-)
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation, instruction_at, strike
 from mavfi_cli.fi.tracer.tracee import Ended

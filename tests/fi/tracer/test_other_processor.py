@@ -27,11 +27,11 @@ def test_missions_and_source_level_faults_need_no_tracer():
     assert (done.stdout.strip(), done.stderr) == ("['limited']", "")
 
 
-@pytest.mark.parametrize("use", ["decode(b'', 0)", "Registers(1)", "TRAITS.breakpoint"])
+@pytest.mark.parametrize("use", ["Tracee.attach(os.getpid())", "ExecutionCounter(0, 0)"])
 def test_using_it_says_which_machine_this_is(use):
     done = elsewhere(
-        f"import mavfi_cli.fi.tracer.arch as arch\n"
+        f"import os\nfrom mavfi_cli.fi.tracer.tracee import ExecutionCounter, Tracee\n"
         f"from mavfi_cli.core.errors import TracingForbidden\n"
-        f"try:\n    arch.{use}\nexcept TracingForbidden as error:\n    print(error)"
+        f"try:\n    {use}\nexcept TracingForbidden as error:\n    print(error)"
     )
     assert "this machine is aarch64" in done.stdout

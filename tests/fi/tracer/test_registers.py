@@ -1,6 +1,7 @@
 """Every bit of every register class is flipped and read back; nothing else changes."""
 
 import pytest
+from native_programs import all_registers as all_names
 
 from mavfi_cli.fi.tracer.image import Image
 
@@ -27,14 +28,8 @@ def flip_every_bit(tracee, name, width, others, step=1):
     assert registers.read(name) == original
 
 
-def all_names():
-    from mavfi_cli.fi.tracer.arch import all_registers
-
-    return all_registers()
-
-
 def test_every_bit_of_every_general_register(start):
-    from mavfi_cli.fi.tracer.arch.x86_64.registers import GENERAL
+    from mavfi_cli.fi.tracer.registers import GENERAL
 
     tracee = start("counting")
     for name in GENERAL:
@@ -43,7 +38,7 @@ def test_every_bit_of_every_general_register(start):
 
 @pytest.mark.parametrize("family", ["st", "xmm", "ymm", "zmm", "k"])
 def test_every_bit_of_every_wide_register(start, family):
-    from mavfi_cli.fi.tracer.arch import width_of
+    from mavfi_cli.fi.tracer.registers import width_of
 
     tracee = start("counting")
     known = all_names()
@@ -77,7 +72,7 @@ def test_a_part_of_a_vector_register_leaves_the_rest(start):
 
 
 def test_the_upper_half_of_ymm_is_written_while_its_component_is_unused(start):
-    from mavfi_cli.fi.tracer.arch.x86_64.registers import AVX, XSTATE_BV
+    from mavfi_cli.fi.tracer.registers import AVX, XSTATE_BV
 
     tracee = start("counting")
     area = tracee.registers.extended()

@@ -14,8 +14,8 @@ from test_inject import stop_at
 from test_inject import struck as injected
 
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.arch import JUMP_FLAGS, decode, inverting_bits
-from mavfi_cli.fi.tracer.fault import Role, Site, strategy
+from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.fault import JUMP_FLAGS, Role, Site, Strategy
 from mavfi_cli.fi.tracer.inject import BitActivation
 
 
@@ -24,7 +24,7 @@ def of(code):
 
 
 def struck(code, following="90", compat="pinfi", count=600):
-    plan, rng = strategy("", compat=compat), np.random.default_rng(3)
+    plan, rng = Strategy.of("", compat=compat), np.random.default_rng(3)
     return [plan.draw_at(of(code), rng, of(following)) for _ in range(count)]
 
 
@@ -37,7 +37,7 @@ CMP, TEST, JE, JLE, JA = "4839d8", "4885c0", "7405", "7e05", "7705"
 
 
 def test_rosfi_2021_hits_the_low_byte_of_few_registers():
-    plan = strategy("wall-clock", compat="rosfi-2021")
+    plan = Strategy.of("wall-clock", compat="rosfi-2021")
     rng = np.random.default_rng(3)
     hits = [hit for _ in range(200) if (hit := plan.draw_at(ADDSD, rng)) is not None]
     assert len(hits) == 200
@@ -138,11 +138,14 @@ def taken(jump, flags):
 
 def test_every_conditional_jump_is_inverted_whatever_the_flags_are():
     assert len(JUMP_FLAGS) == 16
+    codes = {of(code).mnemonic: code for code in (f"{0x70 + n:x}05" for n in range(16))}
     for jump, ones in itertools.product(JUMP_FLAGS, itertools.product((0, 1), repeat=5)):
         flags = sum(one << bit for one, bit in zip(ones, PLACES.values(), strict=True))
-        changed = flags ^ sum(1 << bit for bit in inverting_bits(jump, flags))
+        (corruption,) = struck(CMP, codes[jump], count=1)
+        inverted = corruption.struck(flags)
+        changed = flags ^ sum(1 << bit for bit in inverted)
         assert taken(jump, changed) != taken(jump, flags), (jump, flags)
-        assert set(inverting_bits(jump, flags)) <= set(JUMP_FLAGS[jump])
+        assert set(inverted) <= set(JUMP_FLAGS[jump])
 
 
 def test_the_flags_are_chosen_at_the_stop(start):
@@ -164,11 +167,11 @@ def test_a_bit_that_is_no_flag_changes_nothing(start):
 
 def test_a_record_names_the_inverted_jump_and_gives_it_back():
     (corruption,) = struck(CMP, JLE, count=1)
-    told = record.corruption_to_json(corruption)
+    told = corruption.to_json()
     assert (told["inverts"], told["bits"]) == ("jle", [6, 7])
     entry = {
         "version": record.VERSION, "trigger": [{"object": "a", "offset": 0, "count": 1}], "k": 1,
         "instruction": "cmp", "instruction_bytes": CMP, "corruption": told,
     }  # fmt: skip
     assert record.fault_of(entry).corruption == corruption
-    assert "inverts" not in record.corruption_to_json(struck(CMP, JE, count=1)[0])
+    assert "inverts" not in struck(CMP, JE, count=1)[0].to_json()

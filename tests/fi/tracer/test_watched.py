@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from mavfi_cli.fi.tracer.watched import watch
+from mavfi_cli.fi.tracer.spawn import watch
 
 
 @pytest.mark.parametrize("name", ["out", "./below/../out", "{}/far", "../far"])
@@ -13,14 +13,14 @@ def test_written_paths_are_absolute(start, tmp_path, monkeypatch, name):
     given = name.format(tmp_path)
     os.mkdir(tmp_path / "below")
     watched = watch(start("guest", "writes", given), wall_s=20.0)
-    assert watched.written == (os.path.normpath(tmp_path / given),)
+    assert watched.written == [os.path.normpath(tmp_path / given)]
     assert not watched.company
 
 
 def test_what_is_only_read_is_not_written(start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "in").write_text("text\n")
-    assert watch(start("guest", "reads"), wall_s=20.0).written == ()
+    assert watch(start("guest", "reads"), wall_s=20.0).written == []
 
 
 def test_a_program_that_goes_on_is_ended(start):

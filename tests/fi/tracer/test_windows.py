@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.errors import FaultError, UnknownName
-from mavfi_cli.fi.tracer.fault import FaultModel, Site, strategy
-from mavfi_cli.fi.tracer.image import Image, scope_of
+from mavfi_cli.fi.tracer.fault import FaultModel, Site, Strategy
+from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.sampling import (
     Segment,
@@ -22,7 +22,7 @@ from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Mechanism
 def profile_of(start, name, *arguments, limit=100_000):
     tracee = start(name, *arguments)
     image = Image(tracee.pid)
-    scope = scope_of(image, [name])
+    scope = image.scope([name])
     return record_window(tracee, scope, limit=limit, program=name), image, scope
 
 
@@ -34,7 +34,7 @@ def whole(trace):
 def stepped_in_python(start, name, *arguments):
     """The slow twin: every instruction of the process, also out of scope, one by one."""
     tracee = start(name, *arguments)
-    scope = scope_of(Image(tracee.pid), [name])
+    scope = Image(tracee.pid).scope([name])
     trace = []
     while True:
         here = tracee.registers.ip
@@ -73,7 +73,7 @@ def test_a_function_window_ends_with_its_return(start):
     body = image.address(image.function("body", ["counting"]))
     assert tracee.run_to(body, 7)
     window = record_window(
-        tracee, scope_of(image, ["counting"]), limit=1000, program="", until_return=True
+        tracee, image.scope(["counting"]), limit=1000, program="", until_return=True
     )
     assert window[0] == body
     assert (window == body).sum() == 1
@@ -89,7 +89,7 @@ def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
     compare = image.address(image.function("compare", ["sorting"]))
     assert tracee.run_to(compare, 2)
     window = record_window(
-        tracee, scope_of(image, ["sorting"]), limit=1000, program="", until_return=True
+        tracee, image.scope(["sorting"]), limit=1000, program="", until_return=True
     )
     assert window[0] == compare
     assert image.locate(tracee.registers.ip).object.startswith("libc")
@@ -115,7 +115,7 @@ def test_every_trigger_stops_before_its_execution(start, name, arguments):
         for stage in trigger:
             assert tracee.run_to(image.address(stage.location), stage.count, stage.detour)
         detours += any(stage.detour is not None for stage in trigger)
-        rest = record_window(tracee, scope_of(image, [name]), limit=100_000, program=name)
+        rest = record_window(tracee, image.scope([name]), limit=100_000, program=name)
         assert np.array_equal(rest, trace[index:])
     assert detours > 4
 
@@ -145,7 +145,7 @@ def test_faults_are_uniform_over_executed_instructions(start):
 
     trace, image, _ = profile_of(start, "counting", "40")
     tracee = start("counting", "40")
-    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
+    plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.OPCODE,))))
     profile = whole(trace)
     rng = np.random.default_rng(11)
     drawn = Counter(
@@ -172,12 +172,12 @@ def test_faults_are_uniform_over_executed_instructions(start):
 
 def test_unknown_rules_objects_and_functions_name_the_nearest(start):
     with pytest.raises(UnknownName, match="did you mean 'cpu-time'"):
-        strategy("cpu-tim")
+        Strategy.of("cpu-tim")
     with pytest.raises(UnknownName, match="did you mean 'rosfi-2021'"):
-        strategy("wall-clock", compat="rosfi-2020")
+        Strategy.of("wall-clock", compat="rosfi-2020")
     image = Image(start("counting").pid)
     with pytest.raises(UnknownName, match="did you mean 'counting'"):
-        scope_of(image, ["countin"])
+        image.scope(["countin"])
     with pytest.raises(UnknownName, match="did you mean 'body'"):
         image.function("bodi", ["counting"])
 
@@ -186,7 +186,7 @@ def test_a_scope_without_a_matching_operand_is_an_error(start):
     trace, image, _ = profile_of(start, "sorting")
     tracee = start("sorting")
     profile = whole(trace)
-    plan = strategy("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
+    plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
     with pytest.raises(FaultError, match="no executed instruction in scope has an operand"):
         draw_fault(
             profile,

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.arch.interface import Traits
 
 # void f(uint32_t leaf /*edi*/, uint32_t subleaf /*esi*/, uint32_t *out /*rdx*/)
 _CODE = bytes.fromhex(
@@ -33,14 +32,6 @@ _CODE = bytes.fromhex(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Component:
-    """Offset and size of one XSAVE component in the standard (not compacted) format, bytes."""
-
-    offset: int
-    size: int
-
-
 def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
     """EAX, EBX, ECX, EDX of one CPUID leaf."""
     page = mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
@@ -54,16 +45,11 @@ def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
 
 
 @functools.lru_cache(maxsize=1)
-def _xsave_components() -> dict[int, _Component]:
-    """The user components from 2 on (AVX 2, opmask 5, ZMM_Hi256 6, Hi16_ZMM 7, PKRU 9)."""
+def _xsave_offsets() -> dict[int, int]:
+    """Offsets of the XSAVE components from 2 on, in the standard (not compacted) format, bytes."""
     low, _, _, high = _cpuid(0xD, 0)
     enabled = low | high << 32
-    found: dict[int, _Component] = {}
-    for number in range(2, 63):
-        if enabled >> number & 1:
-            size, offset, _, _ = _cpuid(0xD, number)
-            found[number] = _Component(offset, size)
-    return found
+    return {n: _cpuid(0xD, n)[1] for n in range(2, 63) if enabled >> n & 1}
 
 
 NT_PRSTATUS, NT_X86_XSTATE = 1, 0x202
@@ -74,40 +60,23 @@ _USER_REGS = (
     "r15 r14 r13 r12 rbp rbx r11 r10 r9 r8 rax rcx rdx rsi rdi orig_rax rip cs rflags rsp ss "
     "fs_base gs_base ds es fs gs"
 )
-_GENERAL_NAMES = "rax rbx rcx rdx rsi rdi rbp rsp r8 r9 r10 r11 r12 r13 r14 r15"
-_GENERAL_ORDER = _USER_REGS.split()
-_SLOT = {name: index for index, name in enumerate(_GENERAL_ORDER)}
-GENERAL = tuple(_GENERAL_NAMES.split())
+_SLOT = {name: index for index, name in enumerate(_USER_REGS.split())}
+_GENERAL = "rax rbx rcx rdx rsi rdi rbp rsp r8 r9 r10 r11 r12 r13 r14 r15"
+GENERAL = tuple(_GENERAL.split())
 FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
-TRAP_FLAG = 1 << 8
-RESUME_FLAG = 1 << 16
 _VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
 _X87 = re.compile(r"(st|mm|k)(\d)$")
-
-
-TRAITS = Traits(
-    instruction_pointer="rip",
-    flags_register="rflags",
-    flags=sum(1 << bit for bit in FLAG_BITS.values()),
-    vector_bits=512,
-    breakpoint=b"\xcc",
-    breakpoint_advance=1,
-    breakpoint_length=8,
-    perf_event_open=298,
-    mmap=9,
-    munmap=11,
-    system_call=b"\x0f\x05",
-    jump_bytes=5,
-    short_jump_bytes=2,
-    short_jump=range(-126, 130),
-)
+FLAGS = sum(1 << bit for bit in FLAG_BITS.values())  # that instructions read and write
+TRAP_FLAG, _RESUME_FLAG = 1 << 8, 1 << 16
+VECTOR_BITS = 512  # no vector register is wider
+CALL_ARGUMENTS = ("rdi", "rsi", "rdx", "r10", "r8", "r9")  # of a system call
 
 
 @functools.lru_cache(maxsize=1)
 def widest_vector() -> str:
     """The name of the full vector registers of this processor."""
-    components = _xsave_components()
-    return "zmm" if ZMM_HIGH in components else "ymm" if AVX in components else "xmm"
+    offsets = _xsave_offsets()
+    return "zmm" if ZMM_HIGH in offsets else "ymm" if AVX in offsets else "xmm"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,30 +103,17 @@ def width_of(name: str) -> int:
     raise KeyError(name)
 
 
-def register_kind(name: str) -> str:
-    """The class of a full register, as the value of its `Site`."""
-    if name == "rflags":
-        return "flags"
-    if name == "rip":
-        return "instruction-pointer"
-    if name.startswith(("xmm", "ymm", "zmm")):
-        return "vector"
-    if name.startswith(("st", "mm")):
-        return "x87"
-    return "mask" if name.startswith("k") else "general"
-
-
 def _vector_spans(kind: str, index: int) -> list[_Span]:
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
-    components = _xsave_components()
+    offsets = _xsave_offsets()
     if index >= 16:
-        base = components[ZMM_UPPER].offset + 64 * index - 1024
+        base = offsets[ZMM_UPPER] + 64 * index - 1024
         return [_Span(ZMM_UPPER, base, {"xmm": 16, "ymm": 32, "zmm": 64}[kind])]
     spans = [_Span(SSE, 160 + 16 * index, 16)]
     if parts > 1:
-        spans.append(_Span(AVX, components[AVX].offset + 16 * index, 16))
+        spans.append(_Span(AVX, offsets[AVX] + 16 * index, 16))
     if parts > 2:
-        spans.append(_Span(ZMM_HIGH, components[ZMM_HIGH].offset + 32 * index, 32))
+        spans.append(_Span(ZMM_HIGH, offsets[ZMM_HIGH] + 32 * index, 32))
     return spans
 
 
@@ -255,7 +211,7 @@ class Registers:
         if match[1] == "mm":  # MMX names physical registers
             top = self.extended()[3] >> 3 & 7
             return [_Span(X87, 32 + 16 * ((index - top) & 7), 8)]
-        return [_Span(OPMASK, _xsave_components()[OPMASK].offset + 8 * index, 8)]
+        return [_Span(OPMASK, _xsave_offsets()[OPMASK] + 8 * index, 8)]
 
     def rearm(self) -> None:
         """Let a breakpoint on the very next instruction hit.
@@ -264,8 +220,8 @@ class Registers:
         execution (Intel SDM volume 3, section 18.3.1.1).
         """
         flags = self.read("rflags")
-        if flags & RESUME_FLAG:
-            self.write("rflags", flags & ~RESUME_FLAG)
+        if flags & _RESUME_FLAG:
+            self.write("rflags", flags & ~_RESUME_FLAG)
 
     @property
     def ip(self) -> int:
@@ -282,44 +238,3 @@ class Registers:
         """Number of the system call that this stop interrupted, or None outside a system call."""
         number = self.read("orig_rax")
         return None if number >> 63 else number
-
-
-def all_registers() -> tuple[str, ...]:
-    """Every full register of this processor that can be flipped."""
-    components = _xsave_components()
-    names = [*GENERAL, "rflags", "rip", *(f"st{i}" for i in range(8))]
-    names += [f"{widest_vector()}{i}" for i in range(32 if ZMM_UPPER in components else 16)]
-    if OPMASK in components:
-        names += [f"k{i}" for i in range(8)]
-    return tuple(names)
-
-
-# -- conditional jumps
-
-
-# The flags whose flip inverts a jump (Intel SDM volume 2, Jcc).
-JUMP_FLAGS = {
-    jump: tuple(FLAG_BITS[flag] for flag in flags.split())
-    for jumps, flags in (
-        ("jo jno", "of"), ("js jns", "sf"), ("jp jnp", "pf"), ("je jne", "zf"), ("jb jae", "cf"),
-        ("jl jge", "sf"), ("jbe ja", "cf zf"), ("jle jg", "zf sf"),
-    )
-    for jump in jumps.split()
-}  # fmt: skip
-
-
-def inverting_bits(jump: str, flags: int) -> tuple[int, ...]:
-    """The flags to flip so that a conditional jump goes the other way, given all flags.
-
-    Where it tests two conditions ("below" or "equal"), each that holds is undone; if none does,
-    "equal" is made to hold.
-    """
-    if len(JUMP_FLAGS[jump]) == 1:
-        return JUMP_FLAGS[jump]
-    carry, zero, sign, overflow = (FLAG_BITS[flag] for flag in ("cf", "zf", "sf", "of"))
-    less = carry if carry in JUMP_FLAGS[jump] else sign
-    below = flags >> less & 1 if less == carry else (flags >> sign ^ flags >> overflow) & 1
-    equal = flags >> zero & 1
-    if not (below or equal):
-        return (zero,)
-    return tuple(sorted([less] * below + [zero] * equal))

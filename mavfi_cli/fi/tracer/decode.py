@@ -21,9 +21,8 @@ from typing import Any
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.tracer.arch.interface import Instruction, MemoryUse, RegisterUse
-from mavfi_cli.fi.tracer.arch.x86_64.registers import FLAG_BITS, GENERAL, widest_vector
-from mavfi_cli.fi.tracer.arch.x86_64.vectors import (
+from mavfi_cli.fi.tracer.registers import FLAG_BITS, GENERAL, widest_vector
+from mavfi_cli.fi.tracer.vectors import (
     ALL,
     VECTOR,
     Touched,
@@ -34,8 +33,62 @@ from mavfi_cli.fi.tracer.arch.x86_64.vectors import (
 
 engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
 engine.detail = True
-_BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
+BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
 _FULL = low(64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterUse:
+    """Bits of a full register that an instruction reads or writes."""
+
+    register: str
+    mask: int  # bits that the instruction reads, or that hold a part of its result
+    clears: int  # for a write: every bit that always gets a new value
+    explicit: bool
+    operand: str  # as the assembler names it: eax, xmm1, zf
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryUse:
+    """Bytes that an instruction reads or writes: base + index * scale + displacement."""
+
+    base: str | None
+    index: str | None
+    scale: int
+    displacement: int
+    segment: str | None
+    size: int
+    mask: int  # bits of it that are read or written
+    reads: bool
+    writes: bool
+
+    @property
+    def operand(self) -> str:
+        """The operand as text, for a record."""
+        parts = [part for part in (self.segment, self.base, self.index) if part]
+        return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instruction:
+    """One decoded instruction."""
+
+    address: int
+    raw: bytes
+    mnemonic: str
+    text: str
+    reads: tuple[RegisterUse, ...]
+    writes: tuple[RegisterUse, ...]
+    memory: tuple[MemoryUse, ...]
+    elements: tuple[str | None, str | None]  # float64 or float32, if it reads or writes them
+    scalar: bool  # it computes with the lowest element of its registers only
+    branches: bool  # it is a jump, a call or a return
+    run_over: bool  # one single step is not enough or leaves a trace: run past it
+
+    @property
+    def next_address(self) -> int:
+        """Address of the following instruction."""
+        return self.address + len(self.raw)
 
 
 def decode(code: bytes, address: int) -> Instruction | None:
@@ -59,14 +112,9 @@ def _decode(code: bytes, address: int) -> Instruction | None:
         memory=(*_memory(found, operands), *_stack(found)),
         elements=_elements(found.mnemonic),
         scalar=found.mnemonic.endswith(("sd", "ss")) and "broadcast" not in found.mnemonic,
-        branches=branches(found),
+        branches=not BRANCHES.isdisjoint(found.groups),
         run_over=_run_over(found),
     )
-
-
-def branches(found: Any) -> bool:
-    """True for a jump, a call or a return, as capstone decodes it."""
-    return bool(_BRANCHES.intersection(found.groups))
 
 
 def _run_over(found: Any) -> bool:
@@ -76,7 +124,7 @@ def _run_over(found: Any) -> bool:
     After a step over a pop of the flags, Linux takes the trap flag for the program's own
     (`enable_single_step` in arch/x86/kernel/step.c), and would leave it set.
     """
-    repeated = found.mnemonic.startswith("rep") and not branches(found)
+    repeated = found.mnemonic.startswith("rep") and BRANCHES.isdisjoint(found.groups)
     return repeated or found.mnemonic in ("popfq", "popf")
 
 

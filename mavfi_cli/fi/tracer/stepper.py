@@ -9,13 +9,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numpy.typing import NDArray
 
-PEEKTEXT, PEEKUSER, SINGLESTEP, WALL = 1, 3, 9, 0x4000_0000
-STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
+from mavfi_cli.core.compiled import compiled
 
+_PEEKTEXT, _PEEKUSER, _SINGLESTEP, _WALL = 1, 3, 9, 0x4000_0000
+_STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
+
+# Why the recording of steps returned: no room for more, foreign code is next, the next instruction
+# leaves traces of the stepping, the wait status was not that of a step, the window is over.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
+_IP, _SP = 128, 152  # offsets in `struct user`
 
 _ptrace: Any = types.ExternalFunction(
     "ptrace", types.int64(types.int64, types.int64, types.uint64, types.uint64)
@@ -25,6 +30,7 @@ _wait4: Any = types.ExternalFunction(
 )
 
 
+@compiled
 def _is_repeated(word: int) -> bool:
     """True for F2 or F3, an optional REX prefix and a string opcode (Intel SDM volume 2, REP)."""
     first = word & 0xFF
@@ -36,6 +42,7 @@ def _is_repeated(word: int) -> bool:
     return 0xA4 <= code <= 0xA7 or 0xAA <= code <= 0xAF
 
 
+@compiled
 def _needs_care(word: int) -> bool:
     """True for a push or a pop of the flags, or a system call."""
     first = word & 0xFF
@@ -44,37 +51,19 @@ def _needs_care(word: int) -> bool:
     return code == 0x9C or code == 0x9D or (first == 0x0F and second == 0x05)
 
 
-is_repeated: Any = njit(cache=True)(_is_repeated)
-needs_care: Any = njit(cache=True)(_needs_care)
-
-
+@compiled
 def _run(
     tid: int,
     spans: NDArray[np.int64],
     trace: NDArray[np.int64],
     stop: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    status: NDArray[np.int32],
+    status: NDArray[np.int32],  # (1,) the last wait status, if it is not a plain step
 ) -> tuple[int, int]:
-    """Step and record the address of each instruction in scope, before it executes.
-
-    Args:
-        tid: the stopped thread.
-        spans: (n, 2) addresses in scope.
-        trace: (m,) filled from the start.
-        stop: (2 + m,) the window ends at the first address once the stack pointer is above the
-            second number, and at each of the other addresses.
-        offsets: (2,) offsets of instruction and stack pointer in `struct user`.
-        status: (1,) the last wait status, if it is not a plain step.
-
-    Returns:
-        The number of recorded addresses, and why the loop ended.
-    """
     recorded = 0
     repeating = np.int64(-1)
     while True:
-        ip = _ptrace(PEEKUSER, tid, offsets[0], 0)
-        if ip == stop[0] and _ptrace(PEEKUSER, tid, offsets[1], 0) > stop[1]:
+        ip = _ptrace(_PEEKUSER, tid, _IP, 0)
+        if ip == stop[0] and _ptrace(_PEEKUSER, tid, _SP, 0) > stop[1]:
             return recorded, WINDOW_END
         for place in range(2, stop.shape[0]):
             if ip == stop[place]:
@@ -88,17 +77,33 @@ def _run(
                 return recorded, OUT_OF_SCOPE
             if recorded == trace.shape[0]:
                 return recorded, FULL
-            word = _ptrace(PEEKTEXT, tid, ip, 0)
-            if needs_care(word):
+            word = _ptrace(_PEEKTEXT, tid, ip, 0)
+            if _needs_care(word):
                 return recorded, NEEDS_CARE
             trace[recorded] = ip
             recorded += 1
-            if is_repeated(word):
+            if _is_repeated(word):
                 repeating = ip
-        _ptrace(SINGLESTEP, tid, 0, 0)
-        _wait4(tid, status.ctypes.data, WALL, 0)
-        if status[0] != STOPPED_BY_STEP:
+        _ptrace(_SINGLESTEP, tid, 0, 0)
+        _wait4(tid, status.ctypes.data, _WALL, 0)
+        if status[0] != _STOPPED_BY_STEP:
             return recorded, OTHER_STATUS
 
 
-run: Any = njit(cache=True)(_run)
+def record_steps(
+    tid: int, spans: NDArray[np.int64], trace: NDArray[np.int64], stop: NDArray[np.int64]
+) -> tuple[int, int, int]:
+    """Single-step a stopped thread and record the address of each instruction before it executes.
+
+    Args:
+        spans: (n, 2) addresses in scope.
+        trace: (m,) filled from the start; a repeated string instruction is one entry.
+        stop: (2 + n,) the window ends at the first address once the stack pointer is above the
+            second number, and at each of the other addresses.
+
+    Returns:
+        The number of recorded addresses, why the recording ended, and the last wait status.
+    """
+    status = np.zeros(1, np.int32)
+    recorded, why = _run(tid, spans, trace, stop, status)
+    return int(recorded), int(why), int(status[0])

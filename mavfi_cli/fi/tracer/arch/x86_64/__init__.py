@@ -1,1 +1,0 @@
-"""x86-64: registers, instructions, and the traces that single steps leave."""
