@@ -15,10 +15,10 @@ from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams, PlanRequest
-from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState, waypoint_index
 from mavfi_cli.companion.executor import Executor, LatencyModel, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
@@ -39,8 +39,7 @@ from mavfi_cli.core.types import (
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.source.injector import Moment
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import PlatformProfile
-from mavfi_cli.spec.stack import Stack
+from mavfi_cli.spec.platform import load_platform
 
 M = TypeVar("M", PointCloud, MapSnapshot, CollisionReport, Trajectory, Command)
 
@@ -67,7 +66,7 @@ class _Withheld(TurnOver):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setpoint:
+class _Setpoint:
     """A computed command and its inputs."""
 
     due_s: float  # end of control's computation
@@ -89,14 +88,12 @@ class Companion:
     def __init__(
         self,
         config: MissionConfig,
-        stack: Stack,
-        platform: PlatformProfile,
-        planner: Planner,
         briefing: Briefing,
         wall: WallClock,
         injection: NoInjection,
         protection: NoProtection,
     ) -> None:
+        stack, platform = config.loaded_stack(), load_platform(config.platform)
         self._config, self._stack = config, stack
         self._injection, self._injector = injection, injection.injector
         self._follower = injection.injector.follower
@@ -119,7 +116,10 @@ class Companion:
             restart_s=config.node_restart_s,
             watchdog_s=config.node_watchdog_s,
         )
-        kernels, add = Kernels(config, stack, planner, briefing), self.executor.add
+        kernels, add = (
+            Kernels(config, stack, planners.find(config.planner), briefing),
+            self.executor.add,
+        )
         self._point_cloud = add(Node("point_cloud", kernels.point_cloud))
         self._octomap = add(Node("octomap", kernels.octomap, on_restart=self._octomap_is_up))
         self._collision_check = add(
@@ -133,7 +133,7 @@ class Companion:
         self._map: MapSnapshot | None = None
         self._heard_seq = 0  # newest future_collision_seq known to the planner
         self._queued: Trajectory | None = None  # control's copy of the plan
-        self._setpoints: deque[Setpoint] = deque()  # computed, not yet due
+        self._setpoints: deque[_Setpoint] = deque()  # computed, not yet due
         self._state: VehicleState | None = None
         self._fresh_frame_s: float | None = None
         self._takeover_s: float | None = None
@@ -236,7 +236,7 @@ class Companion:
 
     def _track(
         self, inputs: TrackingInputs, attempt: int = 0, fresh: TrackingState | None = None
-    ) -> Setpoint | None:
+    ) -> _Setpoint | None:
         """Compute a command, which is due after control's latency.
 
         Args:
@@ -257,7 +257,7 @@ class Companion:
         self._queued = followed
         command, latency_s = called
         frame_s, self._fresh_frame_s = self._fresh_frame_s, None
-        return Setpoint(
+        return _Setpoint(
             due_s=self._now_s + (latency_s if latency_s >= SAME_TICK_S else 0.0),
             command=command,
             inputs=inputs,
@@ -266,7 +266,7 @@ class Companion:
             frame_s=frame_s,
         )
 
-    def _send(self, setpoint: Setpoint) -> None:
+    def _send(self, setpoint: _Setpoint) -> None:
         """Let a due command take effect."""
         try:
             command = self.command = self.publish(setpoint.command, setpoint)
@@ -283,7 +283,7 @@ class Companion:
                 Reaction(frame_stamp_s=setpoint.frame_s, setpoint_stamp_s=self._now_s)
             )
 
-    def _track_again(self, setpoint: Setpoint, decision: Decision) -> None:
+    def _track_again(self, setpoint: _Setpoint, decision: Decision) -> None:
         """Recompute a withheld command, in this tick if the platform is fast enough.
 
         If that did not help, or the waypoint is at fault, drop the waypoint and begin with a fresh
@@ -317,7 +317,7 @@ class Companion:
 
     # Every message
 
-    def publish(self, message: M, setpoint: Setpoint | None = None) -> M:
+    def publish(self, message: M, setpoint: _Setpoint | None = None) -> M:
         """Give a kernel's output to its receivers. Return it as they get it.
 
         Raises:
@@ -334,7 +334,7 @@ class Companion:
                 raise _Withheld(decision)
         return message
 
-    def _judge(self, message: Message, setpoint: Setpoint | None) -> Decision:
+    def _judge(self, message: Message, setpoint: _Setpoint | None) -> Decision:
         """Have the detector judge a message. A plan that is no longer needed is not judged."""
         if isinstance(message, CollisionReport):
             return self.protection.report(message, self._now_s)

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
-from mavfi_cli.autonomy.planners import Planner
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection, Protection
@@ -37,8 +36,6 @@ from mavfi_cli.mission.progress import FlightLogger, Recorder, Watcher
 from mavfi_cli.mission.run_folder import Trace
 from mavfi_cli.mission.vehicle import signing_of
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
-from mavfi_cli.spec.platform import PlatformProfile
-from mavfi_cli.spec.stack import Stack
 
 SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
 BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
@@ -103,18 +100,13 @@ class Flight:
     def __init__(
         self,
         config: MissionConfig,
-        stack: Stack,
         transport: Transport,
-        platform: PlatformProfile,
-        planner: Planner,
         watcher: Watcher,
         interrupts: Sequence[int],
         injection: NoInjection,
     ) -> None:
         self._config = config
-        self.stack = stack
-        self._platform = platform
-        self._planner = planner
+        self.stack = config.loaded_stack()
         self._interrupts = interrupts
         self.link = RecordedLink(
             transport,
@@ -194,16 +186,7 @@ class Flight:
             turn_s = TURN_S if self.stack.turns_before_departure else 0.0
             shortest_s = way_m / config.v_max_mps + turn_s  # no flight takes less
             self.injection = SourceInjection(config.fault, shortest_s, protection)
-        self.companion = Companion(
-            config,
-            self.stack,
-            self._platform,
-            self._planner,
-            briefing,
-            self.wall,
-            self.injection,
-            protection,
-        )
+        self.companion = Companion(config, briefing, self.wall, self.injection, protection)
         if recorder is not None:
             recorder.briefing = briefing
             self.companion.executor.on_start = recorder.on_start

@@ -64,8 +64,7 @@ def fly_mission(
             or its record could not be written.
     """
     config = config.with_firmware()
-    platform, stack = load_platform(config.platform), config.loaded_stack()
-    planner = planners.find(config.planner)
+    load_platform(config.platform), planners.find(config.planner)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
     with (
@@ -73,7 +72,7 @@ def fly_mission(
         interruptible() as interrupt,
         other_end(config, launch) as (link, vehicle),
     ):
-        flight = Flight(config, stack, link, platform, planner, watcher, interrupt, injection)
+        flight = Flight(config, link, watcher, interrupt, injection)
         companion = _begin(flight, config, vehicle, recorder)
         folder = RunFolder.new(out, config.world if config.link is None else "link", config.seed)
         flight.injection.begin(folder.fault)

@@ -30,7 +30,8 @@ from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
 
-START_LIMIT_S = 120.0  # of a camera; its first start compiles
+_START_LIMIT_S = 120.0  # of a camera; its first start compiles
+_END_LIMIT_S = 20.0
 
 
 class Vehicle:
@@ -113,9 +114,8 @@ class VehicleInProcess(Vehicle):
         if error is None:
             return None
         known = isinstance(error, MavfiError)
-        return VehicleProcessError(
-            str(error) if known else f"the vehicle ended with {described(error)}"
-        )
+        why = str(error) if known else f"the vehicle ended with {described(error)}"
+        return VehicleProcessError(why)
 
 
 class VehicleProcess(Vehicle):
@@ -156,11 +156,11 @@ class VehicleProcess(Vehicle):
             line.append("--lockstep")
         return [*line, "--speed", "1"] if config.realtime else line
 
-    def end(self, timeout_s: float = 20.0) -> VehicleProcessError | None:
+    def end(self) -> VehicleProcessError | None:
         """See `Vehicle`; a vehicle that does not end is killed."""
         self.link.close()
         try:
-            self._process.wait(timeout_s)
+            self._process.wait(_END_LIMIT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -177,8 +177,9 @@ class VehicleProcess(Vehicle):
         told = [line for line in lines if line.startswith("error: ")]
         if told:
             return VehicleProcessError(told[-1].removeprefix("error: "), code)
-        killed = code < 0
-        how = f"was killed by {signal.Signals(-code).name}" if killed else f"ended with code {code}"
+        how = f"ended with code {code}"
+        if code < 0:
+            how = f"was killed by {signal.Signals(-code).name}"
         last = f": {lines[-1]}" if lines else ""
         return VehicleProcessError(f"the {self._name} process {how}{last}")
 
@@ -190,7 +191,7 @@ class _EyesProcess(VehicleProcess):
 
     def __init__(self, config: MissionConfig, folder: Path) -> None:
         super().__init__(config, folder)
-        select.select([self.link.fileno()], [], [], START_LIMIT_S)  # its first word, or its end
+        select.select([self.link.fileno()], [], [], _START_LIMIT_S)  # its first word, or its end
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -202,7 +203,12 @@ class _EyesProcess(VehicleProcess):
 
 def _arguments(config: MissionConfig) -> list[str]:
     """Return the arguments of `python -m sitl`, but for the link and the folder of the truth."""
-    return _of_the_world(config, "--camera-size", "--camera-rate") + _firmware_arguments(config)
+    line = _of_the_world(config, "--camera-size", "--camera-rate")
+    if config.autopilot != OWN_AUTOPILOT:
+        line += ["--hil" if config.autopilot == "px4" else "--json", config.autopilot]
+        line += ["--firmware", str(config.with_firmware().firmware), "--firmware-seed"]
+        line.append(str(Stream.SENSOR.seed(config.seed, "firmware")))
+    return line
 
 
 def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
@@ -217,18 +223,6 @@ def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
 def _place(name: str, config: MissionConfig) -> list[str]:
     place = getattr(config, name)
     return [] if place is None else [f"--{name}={','.join(f'{value:.9g}' for value in place)}"]
-
-
-def _firmware_arguments(config: MissionConfig) -> list[str]:
-    """Options that let a real autopilot fly; none for our own."""
-    if config.autopilot == OWN_AUTOPILOT:
-        return []
-    option = "--hil" if config.autopilot == "px4" else "--json"
-    seed = Stream.SENSOR.seed(config.seed, "firmware")
-    return [
-        option, config.autopilot, "--firmware", str(config.with_firmware().firmware),
-        "--firmware-seed", str(seed),
-    ]  # fmt: skip
 
 
 StartVehicle = Callable[[MissionConfig, Path], Vehicle]

@@ -88,27 +88,24 @@ class FaultConfig:
         Args:
             struck: the state that was drawn from the target; None if none was.
         """
+        where = struck or self.target
+        where = where.partition(".")[2] if self.strikes_queue and "." in where else where
+        where = f"each component of {where}" if self.together else where
+        where = f"{where} in control's queue" if self.strikes_queue else where
+        bits = _bits_in_words(self.bits, self.field)
+        if self.exact_bits:
+            numbers = " and ".join(map(str, self.exact_bits))
+            bits = f"bit{'s'[len(self.exact_bits) == 1 :]} {numbers}"
+        what = {
+            Effect.FLIP.value: f"{bits} of {where}",
+            Effect.ZERO.value: f"{where} set to zero",
+            Effect.RANDOM.value: f"{where} drawn anew",
+        }[self.effect]
         if self.killed_node is not None:
             what = f"the process of {self.killed_node} is killed"
-        elif self.effect == Effect.FLIP.value:
-            what = f"{self._bits()} of {self._place(struck or self.target)}"
-        else:
-            change = {Effect.ZERO.value: "set to zero", Effect.RANDOM.value: "drawn anew"}
-            what = f"{self._place(struck or self.target)} {change[self.effect]}"
         held = [self.persistence] if self.persistence != Persistence.TRANSIENT.value else []
         when = [f"at {self.at.replace('=', ' ')}"] if self.at != When.RANDOM.value else []
         return ", ".join([what.replace("_", " "), *held, *when])
-
-    def _bits(self) -> str:
-        if self.exact_bits:
-            numbers = " and ".join(map(str, self.exact_bits))
-            return f"bit{'s'[len(self.exact_bits) == 1 :]} {numbers}"
-        return _bits_in_words(self.bits, self.field)
-
-    def _place(self, target: str) -> str:
-        where = target.partition(".")[2] if self.strikes_queue else target
-        what = f"each component of {where}" if self.together else where
-        return f"{what} in control's queue" if self.strikes_queue else what
 
     def check(self) -> None:
         """Validate the configuration. Raises as `draw`."""
@@ -143,8 +140,26 @@ class FaultConfig:
             )
 
     def trigger(self) -> Trigger:
-        """Return the trigger. Raises UnknownName and FaultSpecError."""
-        return _parse_trigger(self.at)
+        """Parse the trigger.
+
+        Raises:
+            UnknownName: The kind of trigger or the phase does not exist.
+            FaultSpecError: The number is missing or invalid.
+        """
+        from mavfi_cli.autonomy.pilot import PilotMode
+
+        kind, _, value = self.at.partition("=")
+        if not value and kind.replace(".", "", 1).isdigit():
+            raise FaultSpecError(f"at {kind}: a number needs its kind, as in time={kind} (s)")
+        when = named_member(When, "trigger", kind)
+        if when in (When.RANDOM, When.FORESEEN):
+            return Trigger(when=when)
+        if when is When.PHASE:
+            return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
+        try:
+            return Trigger(when=when, number=float(value))
+        except ValueError:
+            raise FaultSpecError(f"{self.at!r}: {kind} needs a number, as in {kind}=12") from None
 
     def corruption(self) -> Corruption:
         """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
@@ -194,29 +209,6 @@ def _bits_in_words(count: int, field: str) -> str:
     if count > 1:
         return f"{count} {kind}s"
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
-
-
-def _parse_trigger(text: str) -> Trigger:
-    """Parse a trigger such as `time=12.5`.
-
-    Raises:
-        UnknownName: The kind of trigger or the phase does not exist.
-        FaultSpecError: The number is missing or invalid.
-    """
-    from mavfi_cli.autonomy.pilot import PilotMode
-
-    kind, _, value = text.partition("=")
-    if not value and kind.replace(".", "", 1).isdigit():
-        raise FaultSpecError(f"at {text}: a number needs its kind, as in time={text} (s)")
-    when = named_member(When, "trigger", kind)
-    if when in (When.RANDOM, When.FORESEEN):
-        return Trigger(when=when)
-    if when is When.PHASE:
-        return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
-    try:
-        return Trigger(when=when, number=float(value))
-    except ValueError:
-        raise FaultSpecError(f"{text!r}: {kind} needs a number, as in {kind}=12") from None
 
 
 UNIFORM = "instruction-uniform"  # the one rule whose draws can be repeated

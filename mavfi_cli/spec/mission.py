@@ -49,6 +49,10 @@ LIMITS = {  # minimum and maximum of each number
     "camera_rate_hz": (0.1, 50.0),
     "loss_limit_s": (0.1, 3600.0),
 }
+_SEEDS, _PIXELS = (0, 2**31, "0 and 2^31 - 1"), (4, 1025, "4 and 1024 pixels")
+_WHOLE = {
+    "seed": _SEEDS, "world_seed": _SEEDS, "camera_columns": _PIXELS, "camera_rows": _PIXELS,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,13 +133,10 @@ class MissionConfig:
         object.__setattr__(self, "planner", canonical_planner(self.planner))
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
-            if value is None:
-                continue
-            if not (math.isfinite(value) and low <= value <= high):
+            if value is not None and not low <= value <= high:
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
-        places = (("start", self.start), ("goal", self.goal), ("origin", self.origin))
-        for name, place in places:
-            if place is not None and not all(map(math.isfinite, place)):
+        for name in ("start", "goal", "origin"):
+            if not all(map(math.isfinite, getattr(self, name) or ())):
                 raise ConfigError("must be three finite numbers", key=name)
         if self.fault is not None and self.instruction is not None:
             raise ConfigError("one mission takes one fault", key="instruction")
@@ -147,18 +148,10 @@ class MissionConfig:
         for node in self.isolate:
             if node not in KERNELS:
                 raise UnknownName("node", node, KERNELS)
-        self._check_seeds()
-        for name, size in (
-            ("camera_columns", self.camera_columns),
-            ("camera_rows", self.camera_rows),
-        ):
-            if not 4 <= size <= 1024:
-                raise ConfigError(f"must be within 4 and 1024 pixels, got {size}", key=name)
-
-    def _check_seeds(self) -> None:
-        for name, seed in (("seed", self.seed), ("world_seed", self.world_seed)):
-            if seed is not None and not 0 <= seed < 2**31:
-                raise ConfigError(f"must be within 0 and 2^31 - 1, got {seed}", key=name)
+        for name, (low, end, span) in _WHOLE.items():
+            number = getattr(self, name)
+            if number is not None and not low <= number < end:
+                raise ConfigError(f"must be within {span}, got {number}", key=name)
 
     def _check_link(self) -> None:
         if self.eyes and self.link is None:

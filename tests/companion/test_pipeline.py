@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import ATTEMPTS, Companion
@@ -15,8 +14,6 @@ from mavfi_cli.core.types import Briefing, DepthFrame, Stage, Trajectory, Vehicl
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.spec.stack import load_stack
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -95,15 +92,14 @@ class Flown:
 
 @pytest.fixture
 def flown():
-    config, gate = MissionConfig(stack="hardened"), Told()
+    config, gate = MissionConfig(stack="hardened", planner="rrtconnect"), Told()
     briefing = Briefing(
         start_enu_m=np.zeros(3), goal_enu_m=np.array([40.0, 0.0, 5.0]),
         bounds_enu_m=np.array([-5.0, -10.0, 1.0, 45.0, 10.0, 10.0]),
         camera_offset_flu_m=np.zeros(3),
     )  # fmt: skip
     companion = Companion(
-        config, load_stack(config.stack), load_platform("x86"), planners.find("rrtconnect"),
-        briefing, WallClock(), NoInjection(), gate,
+        config, briefing, WallClock(), NoInjection(), gate,
     )  # fmt: skip
     made = Flown(companion, gate, [])
     companion.executor.nodes["control"].on_start = lambda job, _start_s: made.inputs.append(job)

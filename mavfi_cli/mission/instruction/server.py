@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.attack.served import channel, newest_cache_ns
-from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import serve
@@ -18,7 +17,6 @@ from mavfi_cli.core.processes import receive, send
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,16 +55,7 @@ def main() -> None:
     except (OSError, EOFError):
         return
     config = setup.config
-    companion = Companion(
-        config,
-        config.loaded_stack(),
-        load_platform(config.platform),
-        planners.find(config.planner),
-        setup.briefing,
-        WallClock(),
-        NoInjection(),
-        NoProtection(),
-    )
+    companion = Companion(config, setup.briefing, WallClock(), NoInjection(), NoProtection())
     send(connection, (node_scope(setup.node, config.planner), newest_cache_ns()))
     serve(connection, companion.executor.process_of(setup.node))
 
