@@ -1,7 +1,7 @@
 """The paper's tables, figures and claims: what is flown for them, and our numbers beside its own.
 
 items     the tables and figures, their missions, the form of their tables, the paper's numbers
-flying    flies the missions and runs the isolated kernels; tells the cost before
+flying    flies the missions and runs the isolated kernels
 flights   flown missions as one table, each beside the flights that it is compared with
 layouts   the rows of each item's table, from flights
 figures   the figure of each item

@@ -1,4 +1,4 @@
-"""Flies the missions that items need and runs the kernels of Fig. 6, and tells the cost before."""
+"""Flies the missions that items need and runs the kernels of Fig. 6."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.kernel_plot import draw_kernel_plot
 
-_MEASURED = 12  # missions that are flown before the forecast
-_FOLDER_BYTES = 2_000_000  # of a kept run folder, until one is there
+_TELLING = 0.05  # share of the missions that must be over for a forecast
+_ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +33,9 @@ class Forecast:
 
     Attributes:
         missions, over: missions of the items; those of them that are over.
-        seconds: wall time of the rest.
+        seconds: wall time of the rest; without missions that are left if too few are over to tell.
         disk_bytes: space for the rest.
-        measured: number of missions that the forecast is from.
+        measured: number of missions that the forecast is from; 0 if too few are over to tell.
         jobs: missions or runs at the same time.
         runs: runs of isolated kernels that are missing.
     """
@@ -57,6 +57,8 @@ class Forecast:
         done = "; ".join(parts)
         if not (left or self.runs):
             return done
+        if left and not self.measured:
+            return f"{done}; what is left takes about {self.disk_bytes / 1e6:.0f} MB"
         measured = f", from {self.measured} missions" if left else ""
         return (
             f"{done}; what is left takes about {duration(self.seconds)} on this machine "
@@ -73,7 +75,7 @@ def reproduce(
     """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
 
     Args:
-        on_forecast: hears what is left before it begins, after a little of it is measured.
+        on_forecast: hears what is left before it begins.
 
     Raises:
         ConfigError: the folder holds another stack, more missions, or another campaign.
@@ -86,12 +88,11 @@ def reproduce(
     if any(item.source is Source.KERNELS for item in plan.items) and (runs := kernels.missing()):
         spectator.on_note("measuring a few runs of a kernel")
         seconds = kernels.forecast_s()
-        left = replace(left, runs=runs, seconds=seconds, disk_bytes=kernels.disk_bytes)
+        left = replace(left, runs=runs, seconds=seconds, disk_bytes=runs * _RECORD_BYTES)
     if any(item.preset for item in plan.items):
         with _opened(plan) as ledger:
             wanted = frozenset(plan.numbers(ledger))
             options = replace(options, only=wanted, kept=frozenset(plan.kept(ledger)))
-            _measure(ledger, wanted, options, spectator)
             whole = _with_flights(left, ledger, wanted, options)
             on_forecast(whole)
             _require_room(plan.out, whole)
@@ -139,72 +140,42 @@ def _opened(plan: FlightsPlan) -> Ledger:
 
 def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
     if stored is None:
-        raise ConfigError(
-            "holds a campaign that is not a reproduction; choose another --out", path=plan.folder
-        )
-    if stored.stack != plan.stack:
-        raise ConfigError(
-            f"flies the stack {stored.stack}, not {plan.stack}; choose another --out",
-            path=plan.folder,
-        )
-    if plan.scale < stored.scale:
-        raise ConfigError(
-            f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}; "
-            "choose another --out",
-            path=plan.folder,
-        )
-
-
-def _missing(ledger: Ledger, wanted: frozenset[int]) -> list[int]:
-    return [number for number, _, _ in ledger.missing() if number in wanted]
-
-
-def _measure(
-    ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
-) -> None:
-    """Fly a few missions for the forecast, unless enough are over or few are missing."""
-    missing = _missing(ledger, wanted)
-    if len(wanted) - len(missing) < _MEASURED and len(missing) > _MEASURED:
-        spectator.on_note(f"measuring {_MEASURED} missions")
-        fly_missing(ledger, replace(options, only=_spread(missing, ledger)), Spectator())
-
-
-def _spread(missing: Sequence[int], ledger: Ledger) -> frozenset[int]:
-    """Missions of as many settings as possible: of the first repetition, evenly."""
-    first = missing[: len(ledger.cells())]
-    step = max(1, len(first) // _MEASURED)
-    return frozenset(first[::step][:_MEASURED])
+        problem = "holds a campaign that is not a reproduction"
+    elif stored.stack != plan.stack:
+        problem = f"flies the stack {stored.stack}, not {plan.stack}"
+    elif plan.scale < stored.scale:
+        problem = f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}"
+    else:
+        return
+    raise ConfigError(f"{problem}; choose another --out", path=plan.folder)
 
 
 def _with_flights(
     forecast: Forecast, ledger: Ledger, wanted: frozenset[int], options: Options
 ) -> Forecast:
     """A forecast with what the missing missions take beside it."""
-    missing = _missing(ledger, wanted)
-    over = sorted(wanted - set(missing))
-    flown = list(ledger.results(over[-2000:]))
-    each_s = sum(each.wall_s for each in flown) / len(flown) if flown else 0.0
-    losses = sum(each.outcome != "success" for each in flown) / len(flown) if flown else 0.0
-    kept = sum(number in options.kept for number in missing)
+    missing = wanted.intersection(number for number, _, _ in ledger.missing())
+    over = sorted(wanted - missing)
+    flown = [*ledger.results(over[-2000:])] if len(over) >= _TELLING * len(wanted) else []
+    each_s = sum(each.wall_s for each in flown) / max(1, len(flown))
+    losses = sum(each.outcome != "success" for each in flown) / max(1, len(flown))
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
-    runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()]
-    run_bytes = _size(runs[-20:]) / len(runs[-20:]) if runs else _FOLDER_BYTES
+    row_bytes = rows / ledger.over() if flown else _ROW_BYTES
+    runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()][-20:]
+    run_bytes = sum(map(_size, runs)) / len(runs) if runs else _FOLDER_BYTES
+    kept = len(missing & options.kept) + losses * len(missing)
     return replace(
         forecast,
         missions=len(wanted),
         over=len(over),
         seconds=forecast.seconds + len(missing) * each_s / forecast.jobs,
-        disk_bytes=forecast.disk_bytes
-        + len(missing) * rows / max(1, ledger.over())
-        + (kept + losses * len(missing)) * run_bytes,
+        disk_bytes=forecast.disk_bytes + len(missing) * row_bytes + kept * run_bytes,
         measured=len(flown),
     )
 
 
-def _size(folders: Sequence[Path]) -> int:
-    return sum(
-        path.stat().st_size for each in folders for path in each.rglob("*") if path.is_file()
-    )
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _require_room(out: Path, forecast: Forecast) -> None:
@@ -254,11 +225,6 @@ class _KernelRuns:
             return self.runs * len(select(()))
         done = {each["kernel"]: each["runs"] for each in kernel_summary(path)["kernels"]}
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
-
-    @property
-    def disk_bytes(self) -> int:
-        """Space for the missing runs."""
-        return self.missing() * _RECORD_BYTES
 
     def forecast_s(self) -> float:
         """Wall time of the missing runs, from a few runs of the quickest kernel."""
