@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mavfi_cli.cli.grouped import (
-    CheckedCommand,
     GroupedCommand,
     GroupedOption,
     GroupOfCommands,
@@ -220,7 +219,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         click.echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
 
 
-@campaign.command(cls=CheckedCommand)
+@campaign.command(cls=GroupedCommand)
 @click.argument("what", metavar="[WHAT]", required=False)
 @click.option("--scale", type=float, help="Fraction of the repetitions to run.")
 @_SET

@@ -19,8 +19,8 @@ class GroupedOption(click.Option):
         self.group = group
 
 
-class CheckedCommand(click.Command):
-    """A command whose errors name options."""
+class GroupedCommand(click.Command):
+    """A command whose errors name options, and whose help shows them by group."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Call the command. An invalid value is a usage error that names the option."""
@@ -32,17 +32,15 @@ class CheckedCommand(click.Command):
                 raise
             raise click.UsageError(f"{option}: {error.problem}") from None
 
-
-class GroupedCommand(CheckedCommand):
-    """A command whose help shows its options by group, in the order of declaration."""
-
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write one section per group."""
+        """Write one section per group, in the order of declaration."""
         sections: dict[str, list[tuple[str, str]]] = {}
-        for param in self.get_params(ctx):
+        params = self.get_params(ctx)
+        rest = "Output" if any(isinstance(each, GroupedOption) for each in params) else "Options"
+        for param in params:
             record = None if isinstance(param, click.Argument) else param.get_help_record(ctx)
             if record is not None:
-                sections.setdefault(getattr(param, "group", "Output"), []).append(record)
+                sections.setdefault(getattr(param, "group", rest), []).append(record)
         for title, records in sections.items():
             with formatter.section(title):
                 formatter.write_dl(records)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import click
 
-from mavfi_cli.cli.grouped import CheckedCommand, refuse_given
+from mavfi_cli.cli.grouped import GroupedCommand, refuse_given
 
 _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 
 
-@click.command(cls=CheckedCommand)
+@click.command(cls=GroupedCommand)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
               show_default=True, help="Folder for flights, data set and models.")  # fmt: skip
 @click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",

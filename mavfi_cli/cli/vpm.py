@@ -218,12 +218,13 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
         out.mkdir(parents=True, exist_ok=True)
     write_json(out / "vpm.json", told)
     write_text(out / "vpm.csv", model_csv(told))
-    tables, pictures = ["vpm.json", "vpm.csv"], [*PICTURES]
-    if "flights" in told:
-        write_text(out / "flights.csv", redundancy_csv(told["flights"]))
-        tables.append("flights.csv")
-    else:
-        pictures.remove("flights.svg")
-    for name in pictures:
-        write_figure(PICTURES[name](told), out / name)
-    return [*tables, *pictures]
+    names = ["vpm.json", "vpm.csv"]
+    for name, draw in PICTURES.items():
+        if name == "flights.svg":
+            if "flights" not in told:
+                continue
+            write_text(out / "flights.csv", redundancy_csv(told["flights"]))
+            names.append("flights.csv")
+        write_figure(draw(told), out / name)
+        names.append(name)
+    return names

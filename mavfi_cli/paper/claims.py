@@ -59,19 +59,11 @@ class _Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Claim:
-    """A claim of the paper.
+    """A claim of the paper, as claims.toml explains.
 
     Attributes:
-        name: unique, such as `table4-dense`.
         item: table or figure, by its name in `mavfi reproduce`.
-        words: the claim as a sentence.
-        paper: its numbers; empty if the paper prints none.
-        effect: the number that decides, in words.
         find: the effect of a stack's flights, or of the isolated kernels.
-        low, high: the claimed range of the effect.
-        unit: `points` of a rate, `percent` of a whole, or `number`.
-        paper_tells: what the paper's own number of missions can tell.
-        isolated: whether it is about isolated kernels.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
 _Row = tuple[str, str | None, Flights]  # of a panel: label, detector, flights
+_Panels = Mapping[str, Sequence[Strip]]
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
 _NOTHING = "nothing to draw: no mission of the figure has flown yet"
 
@@ -78,23 +79,31 @@ def _number(name: str, *keys: object) -> float | None:
     return found if isinstance(found, float) else None
 
 
-def _fig7(flights: Flights, columns: str) -> Figure:
+def _strips(panels: Callable[[Flights], _Panels]) -> Callable[[Flights, str], Figure]:
+    def draw_panels(flights: Flights, columns: str) -> Figure:
+        found = panels(flights)
+        if not any(found.values()):
+            raise RecordError(_NOTHING)
+        return draw_strips(found, OVER_GOLDEN, columns)
+
+    return draw_panels
+
+
+def _fig7(flights: Flights) -> _Panels:
+    level = "instruction"
     rows = (
-        (title, None, flights.faulty(fault_target=node, planner=planner, level="instruction"))
+        (title, None, flights.faulty(fault_target=node, planner=planner, level=level))
         for title, (node, planner) in KERNELS_FLOWN.items()
     )
-    return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
+    return {"fault in": panel(rows)}
 
 
-def _by_value(column: str) -> Callable[[Flights, str], Figure]:
-    def draw_values(flights: Flights, columns: str) -> Figure:
+def _by_value(column: str) -> Callable[[Flights], _Panels]:
+    def panels(flights: Flights) -> _Panels:
         groups = flights.faulty().by(column)
-        if not groups:
-            raise RecordError(_NOTHING)
-        rows = ((str(value), None, those) for (value,), those in groups.items())
-        return draw_strips({"fault in": panel(rows)}, OVER_GOLDEN, columns)
+        return {"fault in": panel((str(value), None, x) for (value,), x in groups.items())}
 
-    return draw_values
+    return panels
 
 
 def _beside_detectors(flights: Flights, paper: float | None) -> list[Strip]:
@@ -103,18 +112,17 @@ def _beside_detectors(flights: Flights, paper: float | None) -> list[Strip]:
     return panel(rows, paper)
 
 
-def _fig12(flights: Flights, columns: str) -> Figure:
-    flights = flights.comparable
-    panels = {
+def _fig12(flights: Flights) -> _Panels:
+    return {
         world: _beside_detectors(
-            flights.chosen(world=world), _number("fig12", "worst_increase_percent", world)
+            flights.comparable.chosen(world=world),
+            _number("fig12", "worst_increase_percent", world),
         )
-        for world in flights.worlds
+        for world in flights.comparable.worlds
     }
-    return draw_strips(panels, OVER_GOLDEN, columns)
 
 
-def _fig14(flights: Flights, columns: str) -> Figure:
+def _fig14(flights: Flights) -> _Panels:
     panels = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
@@ -125,7 +133,7 @@ def _fig14(flights: Flights, columns: str) -> Figure:
             for stages in PROTECTED
         ]
         panels[world] = panel(rows)
-    return draw_strips(panels, OVER_GOLDEN, columns)
+    return panels
 
 
 def _short(stages: str) -> str:
@@ -135,13 +143,10 @@ def _short(stages: str) -> str:
     return "".join(stage[0].upper() for stage in stages.split("+"))
 
 
-def _fig16(flights: Flights, columns: str) -> Figure:
-    panels = {}
-    for (platform,), here in flights.by("platform").items():
-        ratio = _number("fig16", "worst_ratio", platform)
-        worst = None if ratio is None else PERCENT * (ratio - 1.0)
-        panels[platform] = _beside_detectors(here, worst)
-    return draw_strips(panels, OVER_GOLDEN, columns)
+def _fig16(flights: Flights) -> _Panels:
+    ratios = {x: _number("fig16", "worst_ratio", x) for (x,) in flights.by("platform")}
+    worst = {x: None if ratio is None else PERCENT * (ratio - 1.0) for x, ratio in ratios.items()}
+    return {x: _beside_detectors(flights.chosen(platform=x), worst[x]) for x in ratios}
 
 
 def _fig11(flights: Flights, columns: str) -> Figure:
@@ -167,12 +172,12 @@ def _fig13(flights: Flights, columns: str) -> Figure:
 
 
 DRAWN: Mapping[str, Callable[[Flights, str], Figure]] = {
-    "fig7": _fig7,
-    "fig8": _by_value("fault_target"),
-    "fig9": _by_value("fault_field"),
+    "fig7": _strips(_fig7),
+    "fig8": _strips(_by_value("fault_target")),
+    "fig9": _strips(_by_value("fault_field")),
     "fig11": _fig11,
-    "fig12": _fig12,
+    "fig12": _strips(_fig12),
     "fig13": _fig13,
-    "fig14": _fig14,
-    "fig16": _fig16,
+    "fig14": _strips(_fig14),
+    "fig16": _strips(_fig16),
 }

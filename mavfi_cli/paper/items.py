@@ -44,10 +44,7 @@ class Item:
 
     Attributes:
         name: as on the command line, such as `fig6`.
-        title: what it shows.
-        labels: headings of its table's labels.
-        columns: of its table; a column without a title stands for one of each world.
-        notes: below its table.
+        labels, columns, notes: of its table, as paper.toml explains.
         origin: where the paper prints its numbers, and what it only draws.
         preset: the campaign that flies it; empty if its source is not flights.
     """

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -89,12 +90,6 @@ def _fig7(flights: Flights) -> Iterator[PaperRow]:
             yield _row(title, cells=[*_effects(those), energy])
 
 
-def _fig7_told(table: PaperTable) -> str:
-    worst = printed("fig7", "worst_increase_percent")
-    lost = printed("fig7", "success_lost_points")
-    return f"{_worst_told(table)}; paper: up to +{worst} % and -{lost} points"
-
-
 def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
     """Faults by the values of a column, and what the paper says of each."""
 
@@ -105,19 +100,6 @@ def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]
             yield _row(value, critical, cells=_effects(those))
 
     return rows
-
-
-def _worst_told(table: PaperTable) -> str:
-    """The row with the longest flight, and the one with the lowest success."""
-    struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
-    longest = table.ranked(2)
-    if not longest:
-        return _NOTHING
-    lowest = min(struck, key=lambda row: row.cells[0].value)
-    return (
-        f"longest flight {table.told(longest[0], 2)} over its own golden one "
-        f"({longest[0].labels[0]}); lowest success {table.told(lowest, 0)} ({lowest.labels[0]})"
-    )
 
 
 _QUALITY = {  # the paper's name of a measure, its column, and its scale
@@ -142,12 +124,6 @@ def _table3(flights: Flights) -> Iterator[PaperRow]:
         yield _row(bits or f"0 ({_GOLDEN})", cells=[*means, won])
 
 
-def _table3_told(table: PaperTable) -> str:
-    most = table.rows[-1]
-    time_s, won = table.told(most, 0, " s"), table.told(most, -1)
-    return f"{most.labels[0]} bits: flight time {time_s}, success {won}"
-
-
 # Detection and recovery in four worlds: Table IV, Figs. 12 and 14, Table V -----------------------
 
 
@@ -161,12 +137,6 @@ def _table4(flights: Flights) -> Iterator[PaperRow]:
             for world in flights.worlds
         )
         yield _row(title, cells=cells)
-
-
-def _table4_told(table: PaperTable) -> str:
-    world = table.columns[-1].title if table.columns else "no world"
-    told = (f"{row.labels[0]} {table.told(row, -1)}" for row in table.rows if row.cells)
-    return f"{world}: {', '.join(told)}"
 
 
 def _fig12(flights: Flights) -> Iterator[PaperRow]:
@@ -190,14 +160,6 @@ def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[P
         yield _recovery(flights.faulty(name), measure, printed(item, unit, name, place))
 
 
-def _fig12_told(table: PaperTable) -> str:
-    if not (worst := table.ranked(1)):
-        return _NOTHING
-    longest, gad, aad = (table.told(worst[0], *each) for each in ((1,), (3, ""), (4, "")))
-    world = worst[0].labels[0]
-    return f"worst flight {longest} in {world}, GAD recovers {gad} and AAD {aad} points"
-
-
 def _fig14(flights: Flights) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
     for detector, told in DETECTOR_TITLES.items():
@@ -214,14 +176,6 @@ def _fig14(flights: Flights) -> Iterator[PaperRow]:
             yield _row(told, stages, cells=cells)
 
 
-def _fig14_told(table: PaperTable) -> str:
-    protected = [row for row in table.rows if row.labels[1] == EVERY_STAGE and row.cells]
-    return "all stages, " + "; ".join(
-        f"{row.labels[0]} recovers {table.told(row, 0)} in {table.columns[0].title}"
-        for row in protected
-    )
-
-
 def _table5(flights: Flights) -> Iterator[PaperRow]:
     """Shares of the flight time that detection and recovery take."""
     for detector in DETECTOR_TITLES:
@@ -234,13 +188,6 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
                 for world in flights.worlds
             )
             yield _row(detector.upper(), title, cells=cells)
-
-
-def _table5_told(table: PaperTable) -> str:
-    sums = [row for row in table.rows if row.labels[1] == "sum" and row.cells]
-    return "detection and recovery, " + "; ".join(
-        f"{row.labels[0]} {table.told(row, -1)} in {table.columns[-1].title}" for row in sums
-    )
 
 
 def _unknown_costs(flights: Flights) -> list[str]:
@@ -300,11 +247,6 @@ def _fig11(flights: Flights) -> Iterator[PaperRow]:
         yield _row(state, cells=cells)
 
 
-def _fig11_told(table: PaperTable) -> str:
-    told = (f"{table.told(row, 2)} ({row.labels[0]})" for row in table.rows)
-    return f"range reduced by {', '.join(told)}"
-
-
 def _span(values: FloatArray, share: float) -> float:
     """The range of the middle share of the values; NaN without any."""
     if not len(values):
@@ -325,13 +267,6 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
             _maximum(_with(struck, flights.faulty("aad", fault_target=stage))),
             PaperCell.of_mean(struck.increases),
         ])  # fmt: skip
-
-
-def _fig13_told(table: PaperTable) -> str:
-    return "; ".join(
-        f"{row.labels[0]}: {table.told(row, 0)}, with AAD {table.told(row, 1)}"
-        for row in table.rows
-    ) or _NOTHING  # fmt: skip
 
 
 def _with(struck: Flights, protected: Flights) -> FloatArray:
@@ -357,23 +292,77 @@ def _fig16(flights: Flights) -> Iterator[PaperRow]:
         ])  # fmt: skip
 
 
-def _fig16_told(table: PaperTable) -> str:
-    return "; ".join(
-        f"{row.labels[0]}: worst x {table.told(row, 2, '')}, GAD recovers "
-        f"{table.told(row, 3)}, AAD {table.told(row, 4)}"
-        for row in table.rows
-    ) or _NOTHING  # fmt: skip
-
-
 OF_FLIGHTS: Mapping[str, Callable[[Flights], Iterator[PaperRow]]] = {
     "fig7": _fig7, "fig8": _by_value("fig8", "fault_target"),
     "fig9": _by_value("fig9", "fault_field"), "fig11": _fig11, "fig12": _fig12, "fig13": _fig13,
     "fig14": _fig14, "fig16": _fig16, "table3": _table3, "table4": _table4, "table5": _table5,
 }  # fmt: skip
+
+
+# Results in one line ------------------------------------------------------------------------------
+
+
+def _joined(
+    form: str,
+    before: str = "",
+    between: str = "; ",
+    rows: Callable[[PaperTable], Sequence[PaperRow]] = attrgetter("rows"),
+) -> Callable[[PaperTable], str]:
+    """A part for each of some rows.
+
+    Args:
+        form: format of a part: the row's labels, its numbers `c` in per cent, `s` in seconds and
+            `n` without a unit, the `last` of them, and the titles of the first and last column.
+    """
+
+    def told(table: PaperTable) -> str:
+        names = [column.title for column in table.columns]
+        titles = {"one": names[0], "end": names[-1]} if names else {}
+        parts = []
+        for row in rows(table):
+            if row.cells:
+                c, s, n = (
+                    [table.told(row, place, unit) for place in range(len(row.cells))]
+                    for unit in (" %", " s", "")
+                )
+                parts.append(form.format(*row.labels, c=c, s=s, n=n, last=c[-1], **titles))
+        return before.format(**titles) + between.join(parts) if parts else _NOTHING
+
+    return told
+
+
+def _labelled(label: str) -> Callable[[PaperTable], Sequence[PaperRow]]:
+    return lambda table: [row for row in table.rows if row.labels[1] == label]
+
+
+def _worst_told(table: PaperTable) -> str:
+    """The row with the longest flight, and the one with the lowest success."""
+    struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
+    longest = table.ranked(2)
+    if not longest:
+        return _NOTHING
+    lowest = min(struck, key=lambda row: row.cells[0].value)
+    told = (
+        f"longest flight {table.told(longest[0], 2)} over its own golden one "
+        f"({longest[0].labels[0]}); lowest success {table.told(lowest, 0)} ({lowest.labels[0]})"
+    )
+    worst, lost = (printed("fig7", x) for x in ("worst_increase_percent", "success_lost_points"))
+    paper = f"; paper: up to +{worst} % and -{lost} points"
+    return told + (paper if table.name == "fig7" else "")
+
+
 _RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
-    "fig7": _fig7_told, "fig8": _worst_told, "fig9": _worst_told, "fig11": _fig11_told,
-    "fig12": _fig12_told, "fig13": _fig13_told, "fig14": _fig14_told, "fig16": _fig16_told,
-    "table3": _table3_told, "table4": _table4_told, "table5": _table5_told,
+    **dict.fromkeys(("fig7", "fig8", "fig9"), _worst_told),
+    "fig11": _joined("{c[2]} ({0})", "range reduced by ", ", "),
+    "fig12": _joined("worst flight {c[1]} in {0}, GAD recovers {n[3]} and AAD {n[4]} points",
+                     rows=lambda table: table.ranked(1)[:1]),
+    "fig13": _joined("{0}: {c[0]}, with AAD {c[1]}"),
+    "fig14": _joined("{0} recovers {c[0]} in {one}", "all stages, ", rows=_labelled(EVERY_STAGE)),
+    "fig16": _joined("{0}: worst x {n[2]}, GAD recovers {c[3]}, AAD {c[4]}"),
+    "table3": _joined("{0} bits: flight time {s[0]}, success {last}",
+                      rows=lambda table: table.rows[-1:]),
+    "table4": _joined("{0} {last}", "{end}: ", ", "),
+    "table5": _joined("{0} {last} in {end}", "detection and recovery, ", rows=_labelled("sum")),
 }  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from mavfi_cli.paper.status import of_kernels
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _EXPORT, _SPEC = ".parquet", ".toml"
+_Kernels = Mapping[str, Any]
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
 
 
@@ -49,8 +50,8 @@ class CampaignSource:
     path: Path
     name: str
     spec: Spec | None
-    planned: int | None
     flights: Flights
+    planned: int | None = None
     errors: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
@@ -70,23 +71,16 @@ class CampaignSource:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _KernelSource:
-    """Attacked kernels: the summary that `mavfi kernels --out` writes."""
-
-    path: Path
-    summary: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """All that was found.
 
     Attributes:
+        kernels: path and summary of attacked kernels, which `mavfi kernels --out` writes.
         problems: what could not be read, is incomplete, or does not fit, a sentence each.
     """
 
     campaigns: Sequence[CampaignSource]
-    kernels: Sequence[_KernelSource]
+    kernels: Sequence[_Kernels]
     problems: Sequence[str]
 
     @classmethod
@@ -100,7 +94,7 @@ class Evidence:
             RecordError: a place does not exist, or nothing in them can be read.
         """
         campaigns: list[CampaignSource] = []
-        kernels: list[_KernelSource] = []
+        kernels: list[_Kernels] = []
         problems: list[str] = []
         for place in places:
             before = len(campaigns) + len(kernels) + len(problems)
@@ -110,10 +104,10 @@ class Evidence:
                 except (MavfiError, OSError) as error:
                     problems.append(f"Not read: {error}.")
                     continue
-                if isinstance(each, _KernelSource):
-                    kernels.append(each)
-                else:
+                if isinstance(each, CampaignSource):
                     campaigns.append(each)
+                else:
+                    kernels.append(each)
             if len(campaigns) + len(kernels) + len(problems) == before:
                 problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
         if not any(len(each.flights) for each in campaigns) and not kernels:
@@ -125,7 +119,9 @@ class Evidence:
     @property
     def isolated(self) -> Mapping[str, Mapping[str, Any]]:
         """The summary of each attacked kernel; of several, that of the last source."""
-        return {part["kernel"]: part for each in self.kernels for part in each.summary["kernels"]}
+        return {
+            part["kernel"]: part for each in self.kernels for part in each["summary"]["kernels"]
+        }
 
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
@@ -154,7 +150,7 @@ def _inside_campaign(path: Path, place: Path) -> bool:
     return any((each / LEDGER).is_file() for each in above)
 
 
-def _read(path: Path) -> CampaignSource | _KernelSource:
+def _read(path: Path) -> CampaignSource | _Kernels:
     if path.name == LEDGER:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
@@ -166,19 +162,19 @@ def _from_ledger(folder: Path) -> CampaignSource:
     with Ledger(folder) as ledger:
         table, origin, spec = flights(ledger), provenance(ledger), stored_spec(ledger)
         plan = FlightsPlan.stored(ledger)
-    found = _campaign(folder, origin["name"] or folder.name, spec, table, origin)
     again = "" if spec is None else shlex.join(["mavfi", "campaign", "run", str(folder)])
-    return replace(found, again=again if plan is None else plan.command)
+    again = again if plan is None else plan.command
+    return _campaign(folder, origin["name"] or folder.name, spec, table, origin, again=again)
 
 
-def _from_summary(path: Path) -> _KernelSource:
+def _from_summary(path: Path) -> _Kernels:
     summary = kernel_summary(path)
     try:  # all that the page shows of it
         of_kernels(summary), [part["runs"] + 0 for part in summary["kernels"]]
         summary["plan"]["seed"], summary["plan"]["flight"]
     except (KeyError, TypeError, ValueError) as error:
         raise RecordError(f"{path}: not a whole summary of `mavfi kernels` ({error!r})") from None
-    return _KernelSource(path=path, summary=summary)
+    return {"path": path, "summary": summary}
 
 
 def _from_export(path: Path) -> CampaignSource:
@@ -188,24 +184,24 @@ def _from_export(path: Path) -> CampaignSource:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
     try:
-        found = _campaign(path, path.stem, spec, table, provenance(table))
+        origin, digest = provenance(table), file_digest(path)
+        return _campaign(path, path.stem, spec, table, origin, digest=digest)
     except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise RecordError(f"{path}: not an export of a campaign ({error})") from None
-    return replace(found, digest=file_digest(path))
 
 
 def _campaign(
-    path: Path, name: str, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any]
+    path: Path,
+    name: str,
+    spec: Spec | None,
+    table: pa.Table,
+    origin: Mapping[str, Any],
+    **more: str,
 ) -> CampaignSource:
+    errors = table["state"].to_pylist().count(ResultState.ERROR.value)
+    told = {each: origin[each] for each in ("planned", "versions", "host") if each in origin}
     return CampaignSource(
-        path=path,
-        name=name,
-        spec=spec,
-        planned=origin.get("planned"),
-        flights=Flights.of(table),
-        errors=table["state"].to_pylist().count(ResultState.ERROR.value),
-        versions=origin.get("versions", {}),
-        host=origin.get("host", {}),
+        path=path, name=name, spec=spec, flights=Flights.of(table), errors=errors, **told, **more
     )
 
 
@@ -233,14 +229,14 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
             yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
 
 
-def _repeated(kernels: Sequence[_KernelSource]) -> Iterator[str]:
+def _repeated(kernels: Sequence[_Kernels]) -> Iterator[str]:
     first: dict[str, Path] = {}
     for each in kernels:
-        for part in each.summary["kernels"]:
+        for part in each["summary"]["kernels"]:
             name = part["kernel"]
             if name in first:
-                yield f"{first[name]} and {each.path} both have {name}; the latter counts."
-            first[name] = each.path
+                yield f"{first[name]} and {each['path']} both have {name}; the latter counts."
+            first[name] = each["path"]
 
 
 def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:

@@ -6,7 +6,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.report.drawing import GRID, INK, KERNELS, NOTE, PLATFORMS, new_figure, open_frame
+from mavfi_cli.report.drawing import (
+    GRID,
+    INK,
+    KERNELS,
+    NOTE,
+    PLATFORMS,
+    legend_above,
+    new_figure,
+    note_at,
+    open_frame,
+    whisker,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,10 +56,7 @@ def _draw_comparison(comparison: Row) -> Figure:
                                label=f"{row['title']}: {row['description']}")[0]
         for row in comparison["plan"]["platforms"]
     ]  # fmt: skip
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=min(3, len(handles)), frameon=False,
-        fontsize=9.5,
-    )  # fmt: skip
+    legend_above(figure, handles=handles, ncols=min(3, len(handles)), fontsize=9.5)
     figure.supxlabel(_caption(comparison), fontsize=8, color=NOTE)
     return figure
 
@@ -67,11 +75,8 @@ def _caption(comparison: Row) -> str:
 
 
 def _frame(axes: Axes, title: str, grid: str) -> None:
-    axes.set_title(title, fontsize=10, loc="left", color=INK)
-    axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.7)  # type: ignore[arg-type]
-    axes.set_axisbelow(True)
+    open_frame(axes, title, grid, fontsize=10, loc="left")
     axes.tick_params(labelsize=8.5)
-    open_frame(axes)
 
 
 def _places(comparison: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
@@ -110,16 +115,13 @@ def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
         axes.plot(spread, times, "o", color=colour, markersize=4.2, alpha=0.45, markeredgewidth=0.0)
         middle = row["quantities"]["flight_time_s"]["median"]
         axes.hlines(middle["value"], x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)
-        _whisker(axes, x, middle, 1.0)
+        whisker(axes, x, middle["value"], (middle["low"], middle["high"]))
         worst = times.index(max(times))
         axes.plot(
             spread[worst], times[worst], "o", markersize=8, markerfacecolor="none",
             markeredgecolor=colour, markeredgewidth=1.2,
         )  # fmt: skip
-        axes.annotate(
-            f"{times[worst]:.1f} s", (x, times[worst]), xytext=(0, 8), textcoords="offset points",
-            ha="center", fontsize=8.5, color=colour,
-        )  # fmt: skip
+        note_at(axes, f"{times[worst]:.1f} s", (x, times[worst]), 8, color=colour)
     axes.set_ylim(min(flown) - 2.2 * room, max(flown) + 1.2 * room)
     axes.set_ylabel("flight time, s", fontsize=9)
     _setting_ticks(axes, settings)
@@ -132,24 +134,13 @@ def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
     if not math.isnan(replans):
         lines.append(f"{replans:.1f} replans")
     for height, text in zip((4, 15), reversed(lines), strict=False):
-        axes.annotate(
-            text, (x, 0.0), xycoords=("data", "axes fraction"), xytext=(0, height),
-            textcoords="offset points", ha="center", fontsize=8,
-            color=NOTE if text.endswith("failed") else colour,
-        )  # fmt: skip
+        look = NOTE if text.endswith("failed") else colour
+        foot = {"xycoords": ("data", "axes fraction"), "fontsize": 8, "color": look}
+        note_at(axes, text, (x, 0.0), height, **foot)
 
 
 def _shown(flight: Row) -> bool:
     return bool(flight["counted"] and flight["outcome"] == "success")
-
-
-def _whisker(axes: Axes, x: float, each: Row, scale: float) -> None:
-    if not math.isnan(each["low"]):
-        axes.errorbar(
-            x, scale * each["value"],
-            [[scale * (each["value"] - each["low"])], [scale * (each["high"] - each["value"])]],
-            color=INK, elinewidth=1.1, capsize=3.0,
-        )  # fmt: skip
 
 
 def _success(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
@@ -160,8 +151,7 @@ def _success(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
         if not share["total"]:
             continue
         axes.bar(x, 100 * share["share"], width=0.9 * width, color=colours[row["platform"]])
-        wilson = {**share, "value": share["share"]}
-        _whisker(axes, x, wilson, 100.0)
+        whisker(axes, x, 100 * share["share"], (100 * share["low"], 100 * share["high"]))
         axes.text(
             x, 3.0, f"{share['count']}/{share['total']}", ha="center", va="bottom", fontsize=7.5,
             color="white", rotation=90,
@@ -264,15 +254,12 @@ def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
         axes.bar(x, height, width=0.9 * width, color=colours[row["platform"]])
         percent = {key: 100 * (late[key] - 1.0) for key in ("value", "low", "high")}
         top = max(0.0, height, *(end for end in percent.values() if not math.isnan(end)))
-        axes.annotate(
-            f"{height:+.1f}", (x, top), xytext=(0, 6 if percent["value"] >= 0.9 * top else 2),
-            textcoords="offset points", ha="center", fontsize=8.5, color=INK,
-        )  # fmt: skip
+        note_at(axes, f"{height:+.1f}", (x, top), 6 if percent["value"] >= 0.9 * top else 2)
         axes.plot(
             x, percent["value"], "D", markersize=5, color="white", markeredgecolor=INK,
             label="95th percentile" if number == 0 else None,
         )  # fmt: skip
-        _whisker(axes, x, percent, 1.0)
+        whisker(axes, x, percent["value"], (percent["low"], percent["high"]))
         ends += [height, *(value for value in percent.values() if not math.isnan(value))]
     _recovered(axes, rows, settings, colours)
     low, high = min(ends), max(1.0, *ends)

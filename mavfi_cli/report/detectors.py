@@ -19,7 +19,15 @@ from mavfi_cli.report.columns import (
     rate,
     spread,
 )
-from mavfi_cli.report.drawing import GRID, INK, NOTE, detector_colours, new_figure, open_frame
+from mavfi_cli.report.drawing import (
+    NOTE,
+    detector_colours,
+    legend_above,
+    new_figure,
+    note_at,
+    open_frame,
+    whisker,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -222,7 +230,7 @@ def _draw_roc(evaluation: Row) -> Figure:
             f"{counts['positives']} harmful faults against {counts['negatives']} error-free "
             "flights; score of a flight: its highest; dots: own threshold"
         )
-        figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=8)
+        legend_above(figure, ncols=2)
     else:
         caption = "no harmful fault: no curve"
     figure.supxlabel(caption, fontsize=7.5, color=NOTE)
@@ -243,8 +251,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x, fontsize=8.5)
     axes.set_ylabel(y, fontsize=8.5)
     axes.tick_params(labelsize=8)
-    axes.grid(visible=True, color=GRID, linewidth=0.6)
-    open_frame(axes)
+    open_frame(axes, grid="both")
 
 
 def _draw_recovery(evaluation: Row) -> Figure:
@@ -264,14 +271,12 @@ def _draw_recovery(evaluation: Row) -> Figure:
     shares.set_ylabel("harmful faults whose harm is undone, %", fontsize=8.5)
     _bars(
         times, [row for row in rows if row["by"] == "world"], names, colours,
-        lambda row: (row["worst"]["protected"], None, None),
+        lambda row: (row["worst"]["protected"], math.nan, math.nan),
         lambda row: row["active"],
     )  # fmt: skip
     times.set_ylabel("worst flight time over the golden flight's, %", fontsize=8.5)
     handles = [shares.bar(0, 0, color=colours[name], label=name) for name in names]
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=len(names), frameon=False, fontsize=8.5
-    )
+    legend_above(figure, handles=handles, ncols=len(names), fontsize=8.5)
     figure.supxlabel(
         "left: whiskers are 95 % Wilson intervals, n harmful faults; right: successful flights "
         "with n active faults", fontsize=7.5, color=NOTE,
@@ -304,23 +309,16 @@ def _bars(
         value, low, high = measure(row)
         if not np.isfinite(value):
             if count(row):
-                axes.annotate(
-                    "no success", (place, 0.0), xytext=(0, 2), textcoords="offset points",
-                    ha="center", va="bottom", fontsize=7, color=NOTE, rotation=90.0,
-                )  # fmt: skip
+                absent = {"va": "bottom", "fontsize": 7, "color": NOTE, "rotation": 90.0}
+                note_at(axes, "no success", (place, 0.0), 2, **absent)
             continue
         axes.bar(place, 100.0 * value, width=0.9 * width, color=colours[row["detector"]])
-        if low is not None:
-            axes.errorbar(
-                place, 100.0 * value, [[100.0 * (value - low)], [100.0 * (high - value)]],
-                color=INK, elinewidth=0.9, capsize=2.0,
-            )  # fmt: skip
+        ends = (100.0 * low, 100.0 * high)
+        whisker(axes, place, 100.0 * value, ends, elinewidth=0.9, capsize=2.0)
     axes.set_xticks(range(len(values)), [ticks[value] for value in values], fontsize=8)
     axes.set_xlim(-0.6, max(0.6, len(values) - 0.4))
     axes.tick_params(labelsize=8)
-    axes.grid(visible=True, axis="y", color=GRID, linewidth=0.6)
-    axes.set_axisbelow(True)
-    open_frame(axes)
+    open_frame(axes, grid="y")
 
 
 def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.files import require_output, write_atomically
 
@@ -64,9 +65,35 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def open_frame(axes: Axes) -> None:
-    """Leave out the frame's upper and right line."""
+def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -> None:
+    """Leave out the frame's upper and right line; draw a grid of an axis, or of `both`."""
     axes.spines[["top", "right"]].set_visible(False)
+    if grid:
+        axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.6)  # type: ignore[arg-type]
+        axes.set_axisbelow(True)
+    if title:
+        axes.set_title(title, **{"fontsize": 9.5, "color": INK, **title_look})
+
+
+def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
+    """Draw the legend of a figure above it; of all its labels unless others are given."""
+    shape = {"loc": "outside upper center", "ncols": 4, "frameon": False, "fontsize": 8}
+    figure.legend(*what, **{**shape, **look})
+
+
+def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **look: Any) -> None:
+    """Draw an interval round a value, if it has one."""
+    if math.isfinite(value) and not any(map(math.isnan, ends)):
+        low, high = (abs(end - value) for end in ends)
+        shape = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 3.0}
+        axes.errorbar(x, value, [[low], [high]], **{**shape, **look})
+
+
+def note_at(axes: Axes, text: str, place: tuple[float, float], up: float, **look: Any) -> None:
+    """Write a text so many points above a place."""
+    shape = {"ha": "center", "fontsize": 8.5, "color": INK}
+    offset = {"xytext": (0, up), "textcoords": "offset points"}
+    axes.annotate(text, place, **{**shape, **offset, **look})
 
 
 def write_figure(figure: Figure, path: Path) -> None:

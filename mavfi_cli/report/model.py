@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.columns import columns, csv_text, wrapped
-from mavfi_cli.report.drawing import INK, NOTE, SCHEMES, new_figure, open_frame
+from mavfi_cli.report.drawing import (
+    INK,
+    NOTE,
+    SCHEMES,
+    legend_above,
+    new_figure,
+    note_at,
+    open_frame,
+    whisker,
+)
 from mavfi_cli.vpm.report import RATIOS
 
 if TYPE_CHECKING:
@@ -320,9 +329,7 @@ def _draw_roofline(report: Mapping[str, Any]) -> Figure:
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(
-        handles.values(), handles, loc="outside upper center", ncols=4, frameon=False, fontsize=8
-    )
+    legend_above(figure, handles.values(), handles)
     share = 100.0 * report["knee_velocity_over_roof_ratio"]
     figure.supxlabel(
         f"action throughput, Hz\n{report['model']}; knee: {share:g} % of the roof", fontsize=9
@@ -383,13 +390,10 @@ def _log_axes(axes: Axes, one: Mapping[str, Any]) -> None:
     axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(color="#e6e9ee", linewidth=0.6)
-    open_frame(axes)
     tmr = next((row for row in one["schemes"] if row["boards"] == 3), None)
     heavy = "; TMR cannot be lifted" if tmr is not None and tmr["problem"] else ""
     bound = next(row["bound"] for row in one["schemes"] if row["boards"] == 1)
-    axes.set_title(
-        f"{one['vehicle']}, board {one['board']}: {bound} bound{heavy}", fontsize=9.5, color=INK
-    )
+    open_frame(axes, f"{one['vehicle']}, board {one['board']}: {bound} bound{heavy}")
 
 
 # Cost of redundancy: flight time and energy over detection and recovery ---------------------------
@@ -407,9 +411,7 @@ def _draw_redundancy(report: Mapping[str, Any]) -> Figure:
         _cost_panel(axes, one)
     panels[0].set_ylabel("times that with detection (autoencoder)")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8
-    )
+    legend_above(figure, handles, labels, ncols=len(labels))
     figure.supxlabel(_cost_caption(report), fontsize=7.5, color=NOTE)
     return figure
 
@@ -425,16 +427,13 @@ def _cost_panel(axes: Axes, one: Mapping[str, Any]) -> None:
             color=SCHEMES[row["scheme"]], label=row["title"],
         )  # fmt: skip
         for place, height in zip(places, heights, strict=True):
-            axes.annotate(
-                "cannot be lifted" if height is None else f"{height:.2f}", (place, height or 0.0),
-                xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=7.5,
-                color=INK, rotation=90.0 if height is None else 0.0,
-            )  # fmt: skip
+            told = "cannot be lifted" if height is None else f"{height:.2f}"
+            look = {"va": "bottom", "fontsize": 7.5, "rotation": 90.0 if height is None else 0.0}
+            note_at(axes, told, (place, height or 0.0), 2, **look)
     axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))
     axes.set_xticks(range(len(_QUANTITIES)), [title for _, title in _QUANTITIES])
     axes.set_ylim(0.0, 1.12 * highest)
-    open_frame(axes)
-    axes.set_title(f"{one['vehicle']}, board {one['board']}", fontsize=9.5, color=INK)
+    open_frame(axes, f"{one['vehicle']}, board {one['board']}")
 
 
 def _cost_caption(report: Mapping[str, Any]) -> str:
@@ -453,6 +452,7 @@ def _cost_caption(report: Mapping[str, Any]) -> str:
 
 _FLOWN_RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("energy", "energy"))
 _STEP = 0.17
+_UPRIGHT: Mapping[str, Any] = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
 
 
 def _draw_flights(report: Mapping[str, Any]) -> Figure:
@@ -476,7 +476,7 @@ def _draw_flights(report: Mapping[str, Any]) -> Figure:
     handles += panels[0][0].plot([], [], "D", color="white", markeredgecolor=INK, markersize=5,
                                  label="model")  # fmt: skip
     handles += panels[0][0].plot([], [], "_", color=INK, markersize=9, label="top of a flight")
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    legend_above(figure, handles=handles)
     figure.supxlabel(
         f"bars: means of successful flights in {', '.join(flights['worlds'])}, "
         f"{flights['missions_each']} missions each; whiskers: 95 % intervals over missions; "
@@ -496,20 +496,13 @@ def _velocities(axes: Axes, one: Mapping[str, Any]) -> None:
         model, top = row["model_velocity_mps"], row["flight_top_velocity_mps"]
         axes.plot(place, top, "_", color=INK, markersize=12)
         highest = max(highest, model, 0.0 if math.isnan(top) else top)
-        axes.annotate(
-            _success_of(row), (place, 0.0), xytext=(0, 3), textcoords="offset points", ha="center",
-            va="bottom", fontsize=7, color=INK, rotation=90.0,
-        )  # fmt: skip
+        told = f"{row['success_percent']:.0f} % of {row['missions']} succeed"
+        note_at(axes, told, (place, 0.0), 3, **_UPRIGHT)
     axes.set_xticks(range(len(one["schemes"])), [row["scheme"] for row in one["schemes"]])
     axes.set_ylim(0.0, 1.12 * highest or 1.0)
     axes.set_ylabel("mean velocity, m/s", fontsize=8.5)
     axes.tick_params(labelsize=8)
-    open_frame(axes)
-    axes.set_title(f"{one['vehicle']}, board {one['board']}", fontsize=9.5, color=INK)
-
-
-def _success_of(row: Mapping[str, Any]) -> str:
-    return f"{row['success_percent']:.0f} % of {row['missions']} succeed"
+    open_frame(axes, f"{one['vehicle']}, board {one['board']}")
 
 
 def _ratios(axes: Axes, one: Mapping[str, Any], reference: str) -> None:
@@ -526,8 +519,7 @@ def _ratios(axes: Axes, one: Mapping[str, Any], reference: str) -> None:
     axes.set_ylabel(f"times that with {reference}", fontsize=8.5)
     axes.set_ylim(bottom=0.0)
     axes.tick_params(labelsize=8)
-    open_frame(axes)
-    axes.set_title(f"{one['vehicle']}: ratios, model and flight", fontsize=9.5, color=INK)
+    open_frame(axes, f"{one['vehicle']}: ratios, model and flight")
 
 
 def _bar(
@@ -536,21 +528,14 @@ def _bar(
     flight, low, high = (row[f"flight_{name}{end}{unit}"] for end in ("", "_low", "_high"))
     if not math.isnan(flight):
         axes.bar(place, flight, width=width, color=SCHEMES[row["scheme"]])
-        if not (math.isnan(low) or math.isnan(high)):
-            axes.errorbar(
-                place, flight, yerr=[[max(0.0, flight - low)], [max(0.0, high - flight)]],
-                fmt="none", ecolor=NOTE, elinewidth=1.0, capsize=2.0,
-            )  # fmt: skip
+        whisker(axes, place, flight, (low, high), ecolor=NOTE, elinewidth=1.0, capsize=2.0)
     axes.plot(
         place, row[f"model_{name}{unit}"], "D", color="white", markeredgecolor=INK, markersize=5
     )
 
 
 def _not_flown(axes: Axes, place: float) -> None:
-    axes.annotate(
-        "not flown", (place, 0.0), xytext=(0, 3), textcoords="offset points", ha="center",
-        va="bottom", fontsize=7, color=NOTE, rotation=90.0,
-    )  # fmt: skip
+    note_at(axes, "not flown", (place, 0.0), 3, **{**_UPRIGHT, "color": NOTE})
 
 
 PICTURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {

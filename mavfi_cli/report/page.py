@@ -21,7 +21,7 @@ from mavfi_cli.campaigns.specification_file import to_toml
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.columns import csv_text
-from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, new_figure, svg
+from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, legend_above, new_figure, svg
 from mavfi_cli.report.paper import DETECTOR_TITLES, PALETTE, SMALLEST, WIDTHS_IN, print_axes
 
 if TYPE_CHECKING:
@@ -168,6 +168,7 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)
+    rows = []
     for place, flow in enumerate(flows):
         total, left = sum(each.total for each in flow["fates"].values()), 0.0
         for fate, share in flow["fates"].items():
@@ -175,19 +176,15 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
             label = fate if not place else None
             axes.barh(place, part, left=left, height=0.66, color=_FATES[fate], label=label)
             left += part
+            rows.append({"kernel": flow["kernel"], "fate": fate, "missions": share.total,
+                         "lost": share.count})  # fmt: skip
     names = [each["kernel"].replace("_", " ") for each in flows]
     axes.set_yticks(range(len(flows)), names, fontsize=SMALLEST)
     axes.set_ylim(len(flows) - 0.5, -0.5)
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("share of struck kernels, %", fontsize=SMALLEST)
-    figure.legend(
-        loc="outside upper center", ncols=3, frameon=False, fontsize=SMALLEST, handlelength=1.0,
-        columnspacing=1.0, labelcolor=INK,
-    )  # fmt: skip
-    rows = [
-        {"kernel": each["kernel"], "fate": fate, "missions": share.total, "lost": share.count}
-        for each in flows for fate, share in each["fates"].items()
-    ]  # fmt: skip
+    look = {"handlelength": 1.0, "columnspacing": 1.0, "labelcolor": INK}
+    legend_above(figure, ncols=3, fontsize=SMALLEST, **look)
     title = f"What struck kernels did, {stack}"
     return _Chart(name=f"kernels-{stack}", title=title, figure=figure, csv=csv_text(rows))
 
@@ -223,28 +220,20 @@ def _p_value(chance: float | None) -> str:
     return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
 
 
-def _detector(name: str | None) -> str:
-    return DETECTOR_TITLES.get(name, name) if name else "none"
-
-
-def _hourly(rates: tuple[float, float, float]) -> str:
-    point, low, high = (f"{each:.2g}" for each in rates)
-    return f"{point} ({low} to {high})"
-
-
-def _shade(share: float | None) -> str:
-    """The strength of a cell's colour, from 0 to 100."""
-    return "0" if share is None or not math.isfinite(share) else f"{100 * math.sqrt(share):.0f}"
-
-
 def _link(text: str) -> str:
-    code = base64.b64encode(text.encode()).decode()
-    return f"data:text/csv;charset=utf-8;base64,{code}"
+    return f"data:text/csv;charset=utf-8;base64,{base64.b64encode(text.encode()).decode()}"
 
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value,
-    "detector": _detector, "hourly": _hourly, "shade": _shade, "csv": csv_text,
-    "link": _link, "toml": to_toml,
-}  # fmt: skip
+    "percent": _percent,
+    "ends": _ends,
+    "effect": _effect,
+    "p": _p_value,
+    "detector": lambda name: DETECTOR_TITLES.get(name, name) if name else "none",
+    "hourly": lambda rates: "{:.2g} ({:.2g} to {:.2g})".format(*rates),
+    "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
+    "csv": csv_text,
+    "link": _link,
+    "toml": to_toml,
+}
 """By the names that page.html uses."""

@@ -14,7 +14,7 @@ import numpy as np
 from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.columns import WIDTH, blocks, csv_text
-from mavfi_cli.report.drawing import GRID, INK, NOTE, new_figure, open_frame
+from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.shares import Share
 
@@ -289,11 +289,7 @@ _NAME = 36  # characters in a line of a row's name
 def print_axes(axes: Axes, title: str = "") -> None:
     """The frame and the text sizes of a panel in print."""
     axes.tick_params(labelsize=SMALLEST, color=GRID, length=2.5, pad=2)
-    axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
-    axes.set_axisbelow(True)
-    open_frame(axes)
-    if title:
-        axes.set_title(title, fontsize=SMALLEST + 0.5, loc="left", color=INK, pad=3)
+    open_frame(axes, title, "x", fontsize=SMALLEST + 0.5, loc="left", pad=3)
 
 
 # A table as dots ---------------------------------------------------------------------------------
@@ -455,7 +451,7 @@ def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("share of injected runs, %", fontsize=SMALLEST + 0.5)
-    figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=SMALLEST)
+    legend_above(figure, fontsize=SMALLEST)
     return figure
 
 
