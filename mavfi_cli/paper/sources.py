@@ -196,7 +196,7 @@ def _campaign(
     spec: Spec | None,
     table: pa.Table,
     origin: Mapping[str, Any],
-    **more: str,
+    **more: Any,
 ) -> CampaignSource:
     errors = table["state"].to_pylist().count(ResultState.ERROR.value)
     told = {each: origin[each] for each in ("planned", "versions", "host") if each in origin}
