@@ -75,25 +75,24 @@ class ObstacleGrid:
         blocked[tuple(chosen.T)] = values
         return replace(self, blocked=blocked)
 
+    @property
+    def arguments(self) -> tuple[Blocked, FloatArray, float, FloatArray]:
+        """First arguments of `segment_free` and `path_free`."""
+        return self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m
+
     def point_free(self, point_enu_m: FloatArray) -> bool:
         """Return True if the vehicle's centre may be at the point (3,)."""
         return self.segment_free(point_enu_m, point_enu_m)
 
     def segment_free(self, start_enu_m: FloatArray, end_enu_m: FloatArray) -> bool:
         """Return True if the vehicle's centre may fly straight from start to end, each (3,)."""
-        s, e = start_enu_m, end_enu_m
-        free: bool = segment_free(
-            self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
-            float(s[0]), float(s[1]), float(s[2]), float(e[0]), float(e[1]), float(e[2]),
-        )  # fmt: skip
+        ends = *start_enu_m.tolist(), *end_enu_m.tolist()
+        free: bool = segment_free(*self.arguments, *ends)
         return free
 
     def path_free(self, points_enu_m: FloatArray) -> bool:
         """Return True if every segment between consecutive points (n, 3) is free."""
-        free: bool = path_free(
-            self.blocked, self.origin_enu_m, self.resolution_m, self.bounds_enu_m,
-            np.ascontiguousarray(points_enu_m),
-        )  # fmt: skip
+        free: bool = path_free(*self.arguments, np.ascontiguousarray(points_enu_m))
         return free
 
 

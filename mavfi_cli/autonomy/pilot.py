@@ -1,11 +1,11 @@
 """The mission state machine. It decides when to plan, fly on, slow down, stop and give up.
 
 Its inputs are messages: collision reports, planned trajectories and the vehicle's state. Its output
-is a directive: the trajectory to track, the point on it, the rate of its clock, and a request for
-a new plan if one is needed.
+is what to track (the trajectory, the point on it, the rate of its clock), and a request for a new
+plan if one is needed.
 
 A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
-stays on the checked path; see `tracking.ActivePlan`. A vehicle that stops on a report drops the
+stays on the checked path; see `_ActivePlan`. A vehicle that stops on a report drops the
 trajectory and brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
 """
 
@@ -17,7 +17,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.autonomy.tracking import ActivePlan, TrackingInputs
+from mavfi_cli.autonomy.tracking import TrackingInputs, reference_waypoint, waypoint_index
 from mavfi_cli.core.frames import wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
@@ -57,6 +57,9 @@ class PlanFailure:
     reason: str
 
 
+SPEED_MIN_MPS = 0.5  # lower limit of the speed from which the clock's ramp is computed
+_SEVERITY = (PilotMode.FLYING, PilotMode.EVADING, PilotMode.SLOWING, PilotMode.STOPPING)
+_DONE = (PilotMode.ARRIVED, PilotMode.GAVE_UP)
 TURN_S = 6.0  # duration of one full turn; as in the released code with its two pauses of 1 s
 
 
@@ -111,26 +114,94 @@ class _Counters:
     look_rounds: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Directive:
-    """Decision of one tick: the inputs of control, and a request if a plan is needed."""
+class _ActivePlan:
+    """The active trajectory, its clock, and the present point on it.
 
-    mode: PilotMode
-    tracking: TrackingInputs
-    plan: PlanRequest | None
+    The clock may run slower than time, so that the vehicle slows down on the checked path. Its rate
+    is ramped within the braking limit: along a path of planned speed v, a rate r gives the velocity
+    r v, and a ramp dr/dt gives the acceleration v dr/dt.
+
+    Attributes:
+        trajectory: Active trajectory; None while hovering.
+        time_s: Present point on the trajectory, from its first waypoint.
+        rate: Trajectory seconds per second, 0..1.
+        rate_change_per_s: Time derivative of the rate.
+        pace: Factor on the clock's rate from the current command, 0..1.
+        checked: Trajectory that was last sent to the collision check.
+    """
+
+    def __init__(self, params: PilotParams) -> None:
+        self._params = params
+        self.checked: Trajectory | None = None
+        self.stand()
+
+    def stand(self) -> None:
+        """Drop the trajectory and hover."""
+        self.begin(None, time_s=0.0, rate=0.0)
+
+    def begin(self, trajectory: Trajectory | None, *, time_s: float, rate: float) -> None:
+        """Fly a trajectory from `time_s` on with its clock at `rate`."""
+        self.trajectory, self.time_s, self.rate = trajectory, time_s, rate
+        self.rate_change_per_s, self.pace = 0.0, 1.0
+
+    def advance(self, step_s: float, target_rate: float) -> None:
+        """Advance the clock by a step and ramp its rate towards the target."""
+        speed = max(self._planned_speed_mps(), SPEED_MIN_MPS)
+        ramp = self._params.brake_mps2 / speed * step_s
+        change = min(max(target_rate - self.rate, -ramp), ramp)
+        before = self.rate
+        self.rate += change
+        self.rate_change_per_s = change / step_s if step_s > 0.0 else 0.0
+        self.time_s += 0.5 * (before + self.rate) * step_s * self.pace
+
+    def exchange(self, flown: Trajectory, changed: Trajectory) -> None:
+        """Replace a trajectory by a changed version, without a new collision check."""
+        if self.trajectory is flown:
+            self.trajectory = changed
+        if self.checked is flown:
+            self.checked = changed
+
+    def skip_waypoint(self) -> None:
+        """Skip to the next waypoint, or to the end if there is none."""
+        if self.trajectory is not None:
+            durations_s = self.trajectory.durations_s[: self.waypoint + 1]
+            self.time_s = float(durations_s[durations_s > 0.0].sum())
+
+    @property
+    def over(self) -> bool:
+        """True if there is no trajectory, or its end has passed or is NaN."""
+        return self.trajectory is None or not self.time_s < self.trajectory.duration_s
+
+    @property
+    def waypoint(self) -> int:
+        """Index of the current waypoint; 0 without a trajectory."""
+        return 0 if self.trajectory is None else waypoint_index(self.trajectory, self.time_s)
+
+    def reference(self, ahead_s: float = 0.0) -> FloatArray:
+        """Return the reference (10,), in the order of WAYPOINT_FIELDS, `ahead_s` from now.
+
+        The clock is assumed to keep its rate. Velocity and acceleration are those at rate 1.
+        """
+        assert self.trajectory is not None
+        return reference_waypoint(self.trajectory, self.time_s + self.rate * ahead_s)
+
+    def _planned_speed_mps(self) -> float:
+        """Return the planned speed at the present point at rate 1, limited to v_max."""
+        if self.trajectory is None:
+            return 0.0
+        speed, limit = float(np.linalg.norm(self.reference()[4:7])), self._params.v_max_mps
+        return min(speed, limit) if math.isfinite(speed) else limit
+
+    def stopping_s(self) -> float:
+        """Return the time to brake from the present speed to rest, s."""
+        return self.rate * self._planned_speed_mps() / self._params.brake_mps2
 
 
 class Pilot:
     """The mission state machine. Pass it every message, then call `update` once per control tick.
 
-    Args:
-        params: Limits and time-outs.
-        goal_enu_m: Goal (3,), m.
-
     Attributes:
         active: Active trajectory and the present point on it.
-        mode: Present mode.
-        counters: Counters of the mission's record.
     """
 
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
@@ -138,7 +209,7 @@ class Pilot:
         self.goal_enu_m = goal_enu_m
         self.counters = _Counters()
         self.mode = PilotMode.WAITING
-        self.active = ActivePlan(params.v_max_mps, params.brake_mps2)
+        self.active = _ActivePlan(params)
         self._next: Trajectory | None = None
         self._hold: FloatArray | None = None
         self._hold_yaw = 0.0
@@ -172,7 +243,7 @@ class Pilot:
         elif self.params.acts_on_report_once:
             return False
         self._collision_seq = report.future_collision_seq
-        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP, PilotMode.WAITING):
+        if self.mode in (*_DONE, PilotMode.WAITING):
             return False
         self._next = None
         self.want_plan()
@@ -195,23 +266,19 @@ class Pilot:
         if p.stops_on_report:
             self._stop_s = self._stamp_s + (left_s - brake_s if left_s > brake_s else 0.0)
             return
+        mode = PilotMode.EVADING
         if not left_s > brake_s:  # also stops on NaN
             mode = PilotMode.STOPPING
         elif left_s <= brake_s + p.plan_lead_s + p.late_plan_s:
             mode = PilotMode.SLOWING
-        else:
-            mode = PilotMode.EVADING
-        severity = (PilotMode.FLYING, PilotMode.EVADING, PilotMode.SLOWING, PilotMode.STOPPING)
-        if severity.index(mode) > severity.index(self.mode):
+        if _SEVERITY.index(mode) > _SEVERITY.index(self.mode):
             if mode is PilotMode.STOPPING:
                 self._brake()
                 self._plan_anew()
-            elif mode is PilotMode.SLOWING:
-                self.counters.slowdowns += 1
+            self.counters.slowdowns += mode is PilotMode.SLOWING
             self.mode = mode
 
     def _brake(self) -> None:
-        """Stop on the trajectory."""
         if self.mode is not PilotMode.STOPPING:
             self.counters.stops += 1
         self.mode = PilotMode.STOPPING
@@ -230,7 +297,7 @@ class Pilot:
         collision, begins at another time than requested, or arrives too late for its own start.
         An answer to an abandoned request is ignored, too.
         """
-        if not self._awaiting_plan or result.stamp_s in self._abandoned:
+        if not self.expects(result):
             self._abandoned.discard(result.stamp_s)
             self.counters.plans_ignored += 1
             return
@@ -283,7 +350,7 @@ class Pilot:
 
     def want_plan(self) -> None:
         """Request a new plan unless one is pending."""
-        if not self._awaiting_plan and self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
+        if not self._awaiting_plan and self.mode not in _DONE:
             self._wanted = True
 
     def _plan_failed(self) -> None:
@@ -291,7 +358,7 @@ class Pilot:
         self._failures += 1
         self._wanted = True
         self._not_before_s = self._stamp_s + self.params.retry_s
-        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
+        if self.mode in _DONE:
             return
         if self.active.trajectory is not None:
             self._brake()
@@ -302,55 +369,57 @@ class Pilot:
             self.counters.look_rounds += 1
 
     @np.errstate(over="ignore", invalid="ignore")  # waypoints may be corrupted
-    def update(self, stamp_s: float, state: VehicleState) -> _Directive:
-        """Run one control tick: advance along the trajectory and return the directive."""
+    def update(
+        self, stamp_s: float, state: VehicleState
+    ) -> tuple[TrackingInputs, PlanRequest | None]:
+        """Run one control tick: advance along the trajectory and return what to track.
+
+        Returns:
+            The inputs of control, and a request if a plan is needed.
+        """
         step_s = stamp_s - self._stamp_s if self._stamp_s else 0.0
         self._stamp_s = stamp_s
         if self._hold is None:
-            self._begin(state)
-        if self.mode not in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
-            if self.mode is PilotMode.TURNING:
-                self._turn(stamp_s)
-            self._stop_if_due(stamp_s, state)
+            self._hold_here(state)
+            if self.params.turns_before_departure:
+                self.mode, self._look_started_s = PilotMode.TURNING, stamp_s
+        if self.mode not in _DONE:
+            if self.mode is PilotMode.TURNING and self._look_s >= TURN_S:
+                self.mode, self._look_started_s = PilotMode.WAITING, None
+            if stamp_s >= self._stop_s:
+                self._stop_s = math.inf
+                if self.active.trajectory is not None:
+                    self.abandon(state)
             self._advance(step_s, state)
             self._settle(state)
-            self._adopt_next(stamp_s)
+            self._adopt_next()
             self._guard(state)
             if self._has_arrived(state):
                 self.mode = PilotMode.ARRIVED
                 self._hold, self._hold_yaw = self.goal_enu_m, state.yaw_rad
                 self.active.stand()
-        plan = self._plan_request(stamp_s, state)
+        request = self._plan_request(state)
+        turned_rad = 0.0
+        if self.mode in (PilotMode.WAITING, PilotMode.TURNING):
+            turned_rad = min(2.0 * math.pi, self._look_s * 2.0 * math.pi / TURN_S)
         assert self._hold is not None
-        return _Directive(
-            mode=self.mode,
-            tracking=TrackingInputs(
-                stamp_s=stamp_s,
-                position_enu_m=state.position_enu_m,
-                velocity_enu_mps=state.velocity_enu_mps,
-                trajectory=self.active.trajectory,
-                time_s=self.active.time_s,
-                rate=self.active.rate,
-                rate_change_per_s=self.active.rate_change_per_s,
-                hold_enu_m=self._hold,
-                hold_yaw_rad=self._hold_yaw + self._look_round_angle(stamp_s),
-            ),
-            plan=plan,
+        tracked = TrackingInputs(
+            stamp_s=stamp_s,
+            position_enu_m=state.position_enu_m,
+            velocity_enu_mps=state.velocity_enu_mps,
+            trajectory=self.active.trajectory,
+            time_s=self.active.time_s,
+            rate=self.active.rate,
+            rate_change_per_s=self.active.rate_change_per_s,
+            hold_enu_m=self._hold,
+            hold_yaw_rad=self._hold_yaw + turned_rad,
         )
+        return tracked, request
 
-    def _begin(self, state: VehicleState) -> None:
-        """Run the first tick: hover here, and turn once round first if the parameters say so."""
-        self._hold_here(state)
-        if self.params.turns_before_departure:
-            self.mode = PilotMode.TURNING
-            self._look_started_s = self._stamp_s
-
-    def _turn(self, stamp_s: float) -> None:
-        """End the turn before departure once it is complete."""
-        assert self._look_started_s is not None
-        if stamp_s - self._look_started_s >= TURN_S:
-            self._look_started_s = None
-            self.mode = PilotMode.WAITING
+    @property
+    def _look_s(self) -> float:
+        """Time since the vehicle began to turn once round."""
+        return 0.0 if self._look_started_s is None else self._stamp_s - self._look_started_s
 
     def _has_arrived(self, state: VehicleState) -> bool:
         distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
@@ -362,14 +431,6 @@ class Pilot:
 
     def _at_rest(self, state: VehicleState) -> bool:
         return float(np.linalg.norm(state.velocity_enu_mps)) <= self.params.rest_mps
-
-    def _stop_if_due(self, stamp_s: float, state: VehicleState) -> None:
-        """Drop the trajectory if a stop requested by a report is due."""
-        if stamp_s < self._stop_s:
-            return
-        self._stop_s = math.inf
-        if self.active.trajectory is not None:
-            self.abandon(state)
 
     def _hover(self, state: VehicleState) -> None:
         """Drop the trajectory and hover here, or where the vehicle comes to rest."""
@@ -385,14 +446,14 @@ class Pilot:
             if self._at_rest(state):
                 self.mode = PilotMode.WAITING
 
-    def _adopt_next(self, stamp_s: float) -> None:
+    def _adopt_next(self) -> None:
         """Switch to the next trajectory once its start time is reached."""
-        if self._next is None or stamp_s < self._next.stamp_s:
+        if self._next is None or self._stamp_s < self._next.stamp_s:
             return
         self.counters.replans += self._adopted
         self._adopted = True
         moving = self.mode not in (PilotMode.WAITING, PilotMode.STOPPING)
-        late_s = stamp_s - self._next.stamp_s
+        late_s = self._stamp_s - self._next.stamp_s
         self.active.begin(
             self._next,
             time_s=max(0.0, late_s) if moving else 0.0,
@@ -446,7 +507,7 @@ class Pilot:
 
     def abandon(self, state: VehicleState) -> None:
         """Drop the trajectory, hover here, and request a plan from here."""
-        if self.mode in (PilotMode.ARRIVED, PilotMode.GAVE_UP):
+        if self.mode in _DONE:
             return
         self._hover(state)
         self._plan_anew()
@@ -464,61 +525,43 @@ class Pilot:
         self._hold = state.position_enu_m.copy()
         self._hold_yaw = state.yaw_rad
 
-    def _plan_request(self, stamp_s: float, state: VehicleState) -> PlanRequest | None:
+    def _plan_request(self, state: VehicleState) -> PlanRequest | None:
         """Return a request if one is due, none is pending, and the pause is over."""
-        idle = self.mode in (
-            PilotMode.ARRIVED,
-            PilotMode.GAVE_UP,
-            PilotMode.STOPPING,
-            PilotMode.TURNING,
-        )
+        idle = self.mode in (*_DONE, PilotMode.STOPPING, PilotMode.TURNING)
         if not self.params.plans_in_motion:
             idle = idle or self.active.trajectory is not None or not self._at_rest(state)
-        if idle or not self._wanted or self._awaiting_plan or stamp_s < self._not_before_s:
+        if idle or not self._wanted or self._awaiting_plan or self._stamp_s < self._not_before_s:
             return None
         self._wanted = False
         self._awaiting_plan = True
         self.counters.plans_requested += 1
-        start = self._start_of_plan(stamp_s, state)
-        self._asked_s, self._asked_rate = start[0], self.active.rate or 1.0
+        flying = self.active.trajectory is not None
+        self._asked_s = self._stamp_s + (self.params.plan_lead_s if flying else 0.0)
+        self._asked_rate = self.active.rate or 1.0
+        position, velocity, yaw_rad = self._start_of_plan(state)
         return PlanRequest(
-            stamp_s=start[0],
-            position_enu_m=start[1],
-            velocity_enu_mps=start[2],
-            yaw_rad=start[3],
+            stamp_s=self._asked_s,
+            position_enu_m=position.copy(),
+            velocity_enu_mps=velocity,
+            yaw_rad=yaw_rad,
             goal_enu_m=self.goal_enu_m,
             attempt=self.counters.plans_requested,
             trajectory_seq=self._trajectory_seq,
             future_collision_seq=self._collision_seq,
         )
 
-    def _start_of_plan(
-        self, stamp_s: float, state: VehicleState
-    ) -> tuple[float, FloatArray, FloatArray, float]:
-        """Return stamp, position, velocity and yaw at the start of the next trajectory."""
+    def _start_of_plan(self, state: VehicleState) -> tuple[FloatArray, FloatArray, float]:
+        """Return position, velocity and yaw at the start of the next trajectory."""
         if self.active.trajectory is None:
             assert self._hold is not None
             start = self._hold if self._near(self._hold, state) else state.position_enu_m
-            return stamp_s, start.copy(), np.zeros(3), state.yaw_rad
-        lead_s = self.params.plan_lead_s
-        waypoint = self.active.reference(lead_s)
+            return start, np.zeros(3), state.yaw_rad
+        waypoint = self.active.reference(self.params.plan_lead_s)
         if not self._near(waypoint[0:3], state):
-            return stamp_s + lead_s, state.position_enu_m.copy(), np.zeros(3), state.yaw_rad
-        return (
-            stamp_s + lead_s,
-            waypoint[0:3].copy(),
-            self.active.rate * waypoint[4:7],
-            float(waypoint[3]),
-        )
+            return state.position_enu_m, np.zeros(3), state.yaw_rad
+        return waypoint[0:3], self.active.rate * waypoint[4:7], float(waypoint[3])
 
     def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
         """Return True if a position (3,), possibly corrupted, is near enough to begin a plan."""
         distance_m = float(np.linalg.norm(place_enu_m - state.position_enu_m))
         return distance_m <= self.params.start_error_max_m
-
-    def _look_round_angle(self, stamp_s: float) -> float:
-        """Return the angle of the turn after failed plans, rad: one full turn in 6 s."""
-        if self._look_started_s is None or self.mode not in (PilotMode.WAITING, PilotMode.TURNING):
-            return 0.0
-        turn_s = stamp_s - self._look_started_s
-        return min(2.0 * math.pi, turn_s * 2.0 * math.pi / TURN_S)

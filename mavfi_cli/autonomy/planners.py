@@ -255,7 +255,7 @@ class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
 
     def __init__(self, information: Any, grid: ObstacleGrid) -> None:
         super().__init__(information)
-        self._arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
+        self._arguments = grid.arguments
 
     def checkMotion(self, a: Any, b: Any) -> bool:  # noqa: N802
         """Return True if the straight motion from state a to state b is free."""
@@ -271,7 +271,7 @@ def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
         bounds.setHigh(axis, float(grid.bounds_enu_m[3 + axis]))
     space.setBounds(bounds)
     information = ob.SpaceInformation(space)
-    arguments = (grid.blocked, grid.origin_enu_m, grid.resolution_m, grid.bounds_enu_m)
+    arguments = grid.arguments
 
     def valid(state: Any) -> bool:
         """Return True if a state (east, north, up, m) lies in free space."""

@@ -217,11 +217,10 @@ class Companion:
         self._ticks += 1
         self._state = self._recovery.state = state
         copy = self._strike_memory()
-        directive = self.pilot.update(self._now_s, state)
+        inputs, request = self.pilot.update(self._now_s, state)
         self._injector.watch(self._moment())
-        if directive.plan is not None:
-            self.executor.start(self._plan(directive.plan))
-        inputs = directive.tracking
+        if request is not None:
+            self.executor.start(self._plan(request))
         if inputs.trajectory is not None:
             if inputs.trajectory is not self.pilot.active.checked:
                 self.executor.start(self._check())

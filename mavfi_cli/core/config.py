@@ -7,12 +7,12 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
 import cattrs
-from cattrs import AttributeValidationNote, IterableValidationNote
+from cattrs import AttributeValidationNote, ForbiddenExtraKeysError, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, make_mapping_structure_fn
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
@@ -138,11 +138,10 @@ def structure(
         return _CONVERTER.structure(data, cls)
     except cattrs.BaseValidationError as group:
         key, error = _first_problem(group, "")
-    except _Extra as extra:
-        key, error = "", extra
-    if isinstance(error, _Extra):
-        key = f"{key}.{error.key}".lstrip(".")
-        raise ConfigError.unknown_key(key, error.known, path=path, line=_line_of(text, key))
+    if isinstance(error, ForbiddenExtraKeysError):
+        known = [each.name for each in dataclasses.fields(error.cl)]
+        key = f"{key}.{min(error.extra_fields)}".lstrip(".")
+        raise ConfigError.unknown_key(key, known, path=path, line=_line_of(text, key))
     problem = "is missing" if isinstance(error, KeyError) else str(error)
     raise ConfigError(problem, path=path, line=_line_of(text, key), key=key)
 
@@ -159,14 +158,6 @@ def read_text(path: Path) -> str:
         raise ConfigError(error.strerror or str(error), path=path) from None
     except UnicodeDecodeError:
         raise ConfigError("not a UTF-8 text file", path=path) from None
-
-
-class _Extra(Exception):
-    """A table has a key that its dataclass lacks."""
-
-    def __init__(self, key: str, known: Iterable[str]) -> None:
-        super().__init__(key)
-        self.key, self.known = key, known
 
 
 _IN_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -186,28 +177,19 @@ def _strict(kind: type, *accepted: type) -> Any:
     return hook
 
 
-def _shaped(
-    accepted: Any,
-    wanted: str,
-    structured: Any,
-    known: Sequence[str] = (),
-    length: int | None = None,
-) -> Any:
+def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = None) -> Any:
     def hook(value: Any, cls: Any) -> Any:
-        """Raise TypeError for another shape (text is an array of letters), _Extra for its keys."""
+        """Raise TypeError for another shape. Text is an array of letters."""
         if not isinstance(value, accepted):
             raise TypeError(f"expected {wanted}, got {value!r}")
         if length is not None and len(value) != length:
             raise TypeError(f"expected {length} values, got {len(value)}")
-        if known and (extra := [key for key in value if key not in known]):
-            raise _Extra(extra[0], known)
         return structured(value, cls)
 
     return hook
 
 
-def _origin(cls: Any) -> Any:
-    return get_origin(cls)
+_origin: Any = get_origin  # or mypy takes classes for ParamSpec
 
 
 def _converter() -> cattrs.Converter:
@@ -218,8 +200,8 @@ def _converter() -> cattrs.Converter:
 
     @converter.register_structure_hook_factory(dataclasses.is_dataclass)
     def table(cls: Any) -> Any:
-        known = [each.name for each in dataclasses.fields(cls)]
-        return _shaped(Mapping, "a table", make_dict_structure_fn(cls, converter), known)
+        made = make_dict_structure_fn(cls, converter, _cattrs_forbid_extra_keys=True)
+        return _shaped(Mapping, "a table", made)
 
     @converter.register_structure_hook_factory(lambda cls: _origin(cls) is dict)
     def named(cls: Any) -> Any:
@@ -246,7 +228,8 @@ def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
     """Return key and innermost first failure of a cattrs error group."""
     if not isinstance(error, ExceptionGroup):
         return key, error
-    inner = error.exceptions[0]
+    extra = [each for each in error.exceptions if isinstance(each, ForbiddenExtraKeysError)]
+    inner = (extra or error.exceptions)[0]
     for note in getattr(inner, "__notes__", []):
         if isinstance(note, AttributeValidationNote):
             key = f"{key}.{note.name}" if key else note.name

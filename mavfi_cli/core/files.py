@@ -46,19 +46,17 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         RecordError: The file could not be written (disk full, no permission). The old file stays.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with writing(path), contextlib.ExitStack() as undo:
-        undo.callback(_remove, temporary)
-        with temporary.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        undo.pop_all()
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
+    with writing(path):
+        try:
+            with temporary.open("wb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
 
 
 def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:

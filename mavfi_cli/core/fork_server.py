@@ -135,16 +135,15 @@ class ForkServer:
 
     def close(self) -> None:
         """End the server; guards and workers end with their channels."""
-        if self._control is not None:
-            self._control.close()
-            self._control = None
-        if self._process is not None:
-            try:
-                self._process.wait(_STOP_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-            self._process = None
+        if self._control is None or self._process is None:
+            return
+        self._control.close()
+        try:
+            self._process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._control = self._process = None
 
 
 # The server ---------------------------------------------------------------------------------------
@@ -157,7 +156,7 @@ def _serve() -> NoReturn:
     module = cast(_Module, importlib.import_module(sys.argv[2]))
     module.prepare()
     gc.collect()
-    if (count := _threads()) > 1:
+    if (count := len(os.listdir("/proc/self/task"))) > 1:
         sys.exit(f"error: {count} threads where one is needed: a fork would lack the others")
     gc.freeze()  # the collector would touch, and so copy, every page that forks share
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the guards
@@ -179,7 +178,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     order, channel = json.loads(packet), socket.socket(fileno=descriptor)
     _call_this_process(GUARD)
-    _become_reaper()
+    _request(_PR_SET_CHILD_SUBREAPER, 1)  # its descendants' orphans become its children
     begun_s, guard = time.monotonic(), os.getpid()
     reading, writing = os.pipe()
 
@@ -286,21 +285,11 @@ def _own_surroundings(folder: Path) -> None:
 # Processes ----------------------------------------------------------------------------------------
 
 
-def _become_reaper() -> None:
-    """Make orphaned descendants of this process its children from now on."""
-    _request(_PR_SET_CHILD_SUBREAPER, 1)
-
-
 def die_with(parent: int) -> None:
     """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
-
-
-def _threads() -> int:
-    """Count the threads of this process. A fork copies one thread, but the locks of all."""
-    return len(os.listdir("/proc/self/task"))
 
 
 def _call_this_process(name: str) -> None:
@@ -329,11 +318,8 @@ def _end_children() -> None:
 
 
 def _children() -> list[int]:
-    found: list[int] = []
-    for task in Path("/proc/self/task").iterdir():
-        with contextlib.suppress(OSError):
-            found += map(int, (task / "children").read_text().split())
-    return found
+    """Return the children of this process, which has one thread."""
+    return [*map(int, Path("/proc/thread-self/children").read_text().split())]
 
 
 if __name__ == "__main__":

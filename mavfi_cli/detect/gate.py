@@ -217,9 +217,8 @@ class Gate:
             self.detector.learn(self._deltas, Stage.PERCEPTION)
             self._pending = not self._per_stage
         else:
-            self._reject(Stage.PERCEPTION)
-        self._settle(report, alarm)
-        return alarm
+            self._refer(Stage.PERCEPTION, PREVIOUS)
+        return self._settled(report, alarm)
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
         """Judge a published plan: all steps from waypoint to waypoint, and the extended states.
@@ -232,15 +231,15 @@ class Gate:
         alarm = None if self._watch is None else self._watch.judge(trajectory)
         if alarm is None and self._per_stage:
             alarm = self._judge_steps(trajectory, 0)
-        self._settle(trajectory, alarm)
-        return alarm
+        return self._settled(trajectory, alarm)
 
-    def _settle(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> None:
-        """Tell the extended watch whether a judged message takes effect."""
+    def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
+        """Tell the extended watch whether a judged message takes effect; return the alarm."""
         if self._watch is not None and alarm is None:
             self._watch.accept(message)
         elif self._watch is not None:
             self._watch.lose(type(message))
+        return alarm
 
     def lose_plan(self) -> None:
         """Note that the planner has failed or its plan is not used."""
@@ -267,23 +266,16 @@ class Gate:
         rows = len(trajectory.waypoints)
         if rows < 2:
             return None
-        scores = self._look(trajectory, first)
-        threshold, steps, changes = self.detector.threshold, self._steps, self._changes
-        bad: tuple[int, float] | None = None
-        for number, score in enumerate(scores):
-            if score <= threshold:
-                continue
-            if bad is None:
-                bad = number, score
-            elif steps[number] == steps[bad[0]] + 1:  # the step away from the bad waypoint
-                return self._plan_alarm(changes[bad[0]], bad[1], int(steps[number]))
-            else:
-                break
-        if bad is None:
+        scores, threshold = self._look(trajectory, first), self.detector.threshold
+        bad = [number for number, score in enumerate(scores) if not score <= threshold]
+        if not bad:
             return None
-        step = int(steps[bad[0]])
-        only_first = step == max(first, 0) and step + 2 < rows
-        return self._plan_alarm(changes[bad[0]], bad[1], step if only_first else step + 1)
+        number, step = bad[0], int(self._steps[bad[0]])
+        leaves = len(bad) > 1 and self._steps[bad[1]] == step + 1  # away from the bad waypoint
+        only_first = not leaves and step == max(first, 0) and step + 2 < rows
+        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
+        deltas, waypoint = self._changes[number], step if only_first else step + 1
+        return self._alarm(stage, scores[number], deltas, waypoint)
 
     def _look(self, trajectory: Trajectory, first: int) -> list[float]:
         """Return the scores of the steps with a changed code; `_steps` and `_changes` hold them."""
@@ -301,10 +293,6 @@ class Gate:
         count = plan_deltas(waypoints, first, self._work, self._steps, self._changes)
         stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
         return [self.detector.score(self._changes[number], stage) for number in range(count)]
-
-    def _plan_alarm(self, deltas: Codes, score: float, waypoint: int) -> Alarm:
-        stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
-        return self._alarm(stage, score, deltas, waypoint)
 
     def judge_tick(
         self, trajectory: Trajectory | None, index: int, command: Command
@@ -332,7 +320,7 @@ class Gate:
         if verdict == PASSED:
             return None
         for stage in _TICK if of_control else self.fresh:
-            self._reject(stage)
+            self._refer(stage, PREVIOUS)
         stage = Stage.PLANNING if verdict == OF_PLANNING else Stage.CONTROL
         return self._alarm(stage, score, self._deltas)
 
@@ -361,7 +349,7 @@ class Gate:
 
     def accept_report(self) -> None:
         """Accept the last judged report in spite of its alarm. It becomes the reference."""
-        self._confirm(Stage.PERCEPTION)
+        self._refer(Stage.PERCEPTION, CODE)
         if self._watch is not None and self._report is not None:
             self._watch.accept(self._report)
 
@@ -374,17 +362,14 @@ class Gate:
         """Accept the last judged waypoint and command in spite of an alarm."""
         for stage in self.fresh:
             if stage is not Stage.PERCEPTION:
-                self._confirm(stage)
+                self._refer(stage, CODE)
         if Stage.PLANNING in self.fresh:
             self._trajectory, self._index = self._judged
 
-    def _reject(self, stage: Stage) -> None:
+    def _refer(self, stage: Stage, row: int) -> None:
+        """Make a row of the working array the reference of a stage."""
         first, end = SPANS[stage]
-        self._work[REFERENCE, first:end] = self._work[PREVIOUS, first:end]
-
-    def _confirm(self, stage: Stage) -> None:
-        first, end = SPANS[stage]
-        self._work[REFERENCE, first:end] = self._work[CODE, first:end]
+        self._work[REFERENCE, first:end] = self._work[row, first:end]
 
     def _alarm(
         self, stage: Stage, score: float, deltas: Codes, waypoint: int | None = None

@@ -31,7 +31,6 @@ from mavfi_cli.core.types import (
     STATES,
     CollisionReport,
     Command,
-    DType,
     FloatArray,
     StackMark,
     Stage,
@@ -172,11 +171,12 @@ class _FlownPlans:
         self._plans = {plan.stamp_s: plan for plan in plans}
         self._strikes = sorted(strikes, key=lambda strike: strike.stamp_s)
         self._looked: tuple[Trajectory | None, int] = (None, -1)
-        if plans and not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
+        if not plans:
+            return
+        if not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
             raise ModelError("the trace does not say which plan is flown")
-        if plans:
-            self._stamps_s = _reals(trace["trajectory_stamp_s"])
-            self._waypoints = _reals(trace["waypoint_index"])
+        self._stamps_s = _reals(trace["trajectory_stamp_s"])
+        self._waypoints = _reals(trace["waypoint_index"])
 
     def ahead(self, row: int, stamp_s: float) -> tuple[Trajectory, int] | None:
         """Return the plan to judge and its present waypoint; None if the gate does not judge."""
@@ -211,17 +211,14 @@ class _Messages:
         if missing:
             raise ModelError(f"the trace has no column {missing[0]!r}")
         self.stamps_s = _reals(trace["stamp_s"])
-        self._reports = np.column_stack([_reals(trace[name]) for name in _REPORT])
-        self._waypoints = np.column_stack([_reals(trace[name]) for name in _WAYPOINT])
-        self._commands = np.column_stack([_reals(trace[name]) for name in _COMMAND])
-        present = {
-            name: _present(trace[name]) for name in ("future_collision_seq", "waypoint_x",
-                                                     "command_yaw")
-        }  # fmt: skip
-        self._has_waypoint, self._has_command = present["waypoint_x"], present["command_yaw"]
-        self._new_report = present["future_collision_seq"] & _changes(
-            self._reports, trace, ("report_stamp_s",)
+        self._reports, self._waypoints, self._commands = (
+            np.column_stack([_reals(trace[name]) for name in group])
+            for group in (_REPORT, _WAYPOINT, _COMMAND)
         )
+        self._has_waypoint = _present(trace["waypoint_x"])
+        self._has_command = _present(trace["command_yaw"])
+        self._new_report = _present(trace["future_collision_seq"])
+        self._new_report &= _changes(self._reports, trace, ("report_stamp_s",))
         self._new_waypoint = self._has_waypoint & (
             _changes(self._waypoints, trace, ("waypoint_index", "trajectory_stamp_s"))
             | ~np.concatenate([[False], self._has_waypoint[:-1]])
@@ -288,12 +285,11 @@ def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> ND
 def columns_of(table: Any) -> dict[str, NDArray[Any]]:
     """Return the columns of an Arrow table as masked arrays, which tell NaN from null."""
     columns: dict[str, NDArray[Any]] = {}
-    kinds = {state.name: state.dtype for state in STATES}
     for name in table.column_names:
         column = table[name].combine_chunks()
         if str(column.type) == "string":
             continue
-        fill = False if kinds.get(name) is DType.BOOL else 0
+        fill = False if str(column.type) == "bool" else 0
         values = column.fill_null(fill).to_numpy(zero_copy_only=False)
         columns[name] = np.ma.array(values, mask=column.is_null().to_numpy(zero_copy_only=False))
     return columns

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -49,7 +50,8 @@ class Driver:
     def tick(self, count=1, at=None):
         for _ in range(count):
             self.now_s = round(self.now_s + TICK_S, 6)
-            self.last = self.pilot.update(self.now_s, self.vehicle() if at is None else at)
+            tracked, request = self.pilot.update(self.now_s, self.vehicle() if at is None else at)
+            self.last = SimpleNamespace(mode=self.pilot.mode, tracking=tracked, plan=request)
             if self.last.plan is not None:
                 self.requests.append(self.last.plan)
         return self.last
