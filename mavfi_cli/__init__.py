@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mavfi_cli.campaigns.run import run_campaign
     from mavfi_cli.core.errors import MavfiError
     from mavfi_cli.core.installed import __version__
-    from mavfi_cli.fi.value import inject
+    from mavfi_cli.fi.fault import inject
     from mavfi_cli.library import campaign, fly
     from mavfi_cli.mission.run import paired_golden
     from mavfi_cli.mission.run_folder import load_run
@@ -46,7 +46,7 @@ _MODULES = {  # name -> module that defines it
     "__version__": "mavfi_cli.core.installed",
     "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
-    "inject": "mavfi_cli.fi.value",
+    "inject": "mavfi_cli.fi.fault",
     "load_run": "mavfi_cli.mission.run_folder",
     "paired_golden": "mavfi_cli.mission.run",
     "run_campaign": "mavfi_cli.campaigns.run",

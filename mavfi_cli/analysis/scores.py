@@ -64,7 +64,7 @@ def _kept_of(path: Path) -> _Kept:
 def _value(state: str, pattern: str) -> float | int | bool:
     """Decode a value from its bits, because a record has finite numbers only."""
     kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
-    return bits.value_of(int(pattern, 16), kind)
+    return kind.value(int(pattern, 16))
 
 
 class Scores:

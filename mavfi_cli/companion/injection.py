@@ -13,7 +13,7 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.bits import told_apart
-from mavfi_cli.fi.source.injector import (
+from mavfi_cli.fi.injector import (
     Injector,
     Listener,
     MemoryInjector,

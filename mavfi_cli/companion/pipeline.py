@@ -37,7 +37,7 @@ from mavfi_cli.core.types import (
     VehicleState,
 )
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.fi.source.injector import Moment
+from mavfi_cli.fi.injector import Moment
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 

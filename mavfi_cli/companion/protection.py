@@ -42,7 +42,7 @@ from mavfi_cli.core.types import CollisionReport, Command, Message, Stage, Traje
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.detect.preprocess import take_tick
-from mavfi_cli.fi.source.injector import Follower
+from mavfi_cli.fi.injector import Follower
 from mavfi_cli.spec.detector import DetectorConfig
 
 MAX_LISTED_ALARMS = 100

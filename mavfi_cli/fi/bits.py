@@ -27,6 +27,13 @@ class Field(Enum):
     ANY = "any"
 
 
+# How struct packs a value, and the unsigned integer with the same bits.
+_FORMATS = {
+    "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int16": ("<h", "<H"), "int32": ("<i", "<I"),
+    "int64": ("<q", "<Q"), "bool": ("<?", "<B"),
+}  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BitType:
     """A type as bits: its name, its width, and the bits of each of its fields."""
@@ -34,6 +41,12 @@ class BitType:
     name: str
     width: int
     fields: dict[Field, range]
+
+    @classmethod
+    def raw(cls, size_bytes: int) -> BitType:
+        """A register or memory operand of `size_bytes` bytes, without fields."""
+        width = 8 * size_bytes
+        return cls(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
 
     def field_bits(self, field: Field) -> range:
         """The bits of `field`.
@@ -44,11 +57,59 @@ class BitType:
         try:
             return self.fields[field]
         except KeyError:
-            raise self.lacks(field.value, [known.value for known in self.fields]) from None
+            raise self._lacks(field.value, [known.value for known in self.fields]) from None
 
-    def lacks(self, field: str, known: Iterable[str]) -> FaultError:
-        """The error about a field that the type does not have."""
+    def _lacks(self, field: str, known: Iterable[str]) -> FaultError:
         return FaultError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
+
+    def mask(self, bits: Iterable[int]) -> int:
+        """The xor mask of distinct bits.
+
+        Raises:
+            FaultError: a bit that the type does not have.
+        """
+        mask = 0
+        for bit in bits:
+            if not 0 <= bit < self.width:
+                raise FaultError(
+                    f"bit {bit} is outside {self.name}, which has bits 0 to {self.width - 1}"
+                )
+            mask |= 1 << bit
+        return mask
+
+    def draw(
+        self, rng: np.random.Generator, *, field: Field = Field.ANY, count: int = 1
+    ) -> tuple[int, ...]:
+        """`count` distinct bits of a field, uniformly, ascending.
+
+        Raises:
+            FaultError: the type has no such field, or the field has fewer than `count` bits.
+        """
+        candidates = self.field_bits(field)
+        if not 1 <= count <= len(candidates):
+            wanted = f"{field.value} of at least {count} bits"
+            known = [f"{name.value} ({len(bits)})" for name, bits in self.fields.items()]
+            raise self._lacks(wanted, known)
+        chosen = rng.choice(len(candidates), size=count, replace=False)
+        return tuple(sorted(candidates[int(index)] for index in chosen))
+
+    def pattern(self, value: Scalar) -> int:
+        """The bits of a value; a float32 is rounded to the nearest representable first."""
+        of_value, of_pattern = _FORMATS[self.name]
+        return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
+
+    def value(self, pattern: int) -> Scalar:
+        """The value of a pattern.
+
+        A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
+        """
+        of_value, of_pattern = _FORMATS[self.name]
+        value: Scalar = struct.unpack(of_value, struct.pack(of_pattern, pattern))[0]
+        return value
+
+    def flip(self, value: Scalar, bits: Iterable[int]) -> Scalar:
+        """The value with `bits` of its pattern inverted."""
+        return self.value(self.pattern(value) ^ self.mask(bits))
 
 
 def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
@@ -74,90 +135,14 @@ INT16, INT32, INT64 = (
 BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
 
 
-def raw(size_bytes: int) -> BitType:
-    """A register or memory operand of `size_bytes` bytes, without fields."""
-    width = 8 * size_bytes
-    return BitType(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
-
-
-def mask_of(bits: Iterable[int], kind: BitType) -> int:
-    """The xor mask of distinct bits.
-
-    Raises:
-        FaultError: a bit that `kind` does not have.
-    """
-    mask = 0
-    for bit in bits:
-        if not 0 <= bit < kind.width:
-            raise FaultError(
-                f"bit {bit} is outside {kind.name}, which has bits 0 to {kind.width - 1}"
-            )
-        mask |= 1 << bit
-    return mask
-
-
 def bits_of(mask: int) -> tuple[int, ...]:
     """The set bits of a mask, ascending."""
     return tuple(bit for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 
-def draw_bits(
-    rng: np.random.Generator, kind: BitType, *, field: Field = Field.ANY, count: int = 1
-) -> tuple[int, ...]:
-    """`count` distinct bits of a field, uniformly, ascending.
-
-    Raises:
-        FaultError: the type has no such field, or the field has fewer than `count` bits.
-    """
-    candidates = kind.field_bits(field)
-    if not 1 <= count <= len(candidates):
-        wanted = f"{field.value} of at least {count} bits"
-        known = [f"{name.value} ({len(bits)})" for name, bits in kind.fields.items()]
-        raise kind.lacks(wanted, known)
-    chosen = rng.choice(len(candidates), size=count, replace=False)
-    return tuple(sorted(candidates[int(index)] for index in chosen))
-
-
-def flip_pattern(pattern: int, bits: Iterable[int], kind: BitType) -> int:
-    """The pattern with `bits` inverted; flipping twice gives the pattern back."""
-    return pattern ^ mask_of(bits, kind)
-
-
-# How struct packs a value, and the unsigned integer with the same bits.
-_FORMATS = {
-    "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int16": ("<h", "<H"), "int32": ("<i", "<I"),
-    "int64": ("<q", "<Q"),
-}  # fmt: skip
-
-
-def pattern_of(value: Scalar, kind: BitType) -> int:
-    """The bits of a value; a float32 is rounded to the nearest representable first."""
-    if kind.name == BOOL.name:
-        return int(value)
-    of_value, of_pattern = _FORMATS[kind.name]
-    return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
-
-
-def value_of(pattern: int, kind: BitType) -> Scalar:
-    """The value of a pattern.
-
-    A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
-    """
-    if kind.name == BOOL.name:
-        return bool(pattern)
-    of_value, of_pattern = _FORMATS[kind.name]
-    value: Scalar = struct.unpack(of_value, struct.pack(of_pattern, pattern))[0]
-    return value
-
-
-def flip(value: Scalar, bits: Iterable[int], kind: BitType) -> Scalar:
-    """The value with `bits` of its pattern inverted."""
-    return value_of(flip_pattern(pattern_of(value, kind), bits, kind), kind)
-
-
 def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
     """Raw little-endian bytes with `bits` inverted (bit 8 is bit 0 of the second byte)."""
-    pattern = flip_pattern(int.from_bytes(data, "little"), bits, raw(len(data)))
+    pattern = int.from_bytes(data, "little") ^ BitType.raw(len(data)).mask(bits)
     return pattern.to_bytes(len(data), "little")
 
 

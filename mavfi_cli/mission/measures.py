@@ -298,7 +298,7 @@ def _value(change: Record, when: str) -> Any:
     value, pattern = change[when], change[f"{when}_hex"]
     if value is not None:
         return value
-    return bits.value_of(int(pattern, 16), bits.NUMPY_TYPES[_FLOATS[len(pattern)]])
+    return bits.NUMPY_TYPES[_FLOATS[len(pattern)]].value(int(pattern, 16))
 
 
 # Cost of detection and recovery -------------------------------------------------------------------

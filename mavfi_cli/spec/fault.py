@@ -10,7 +10,7 @@ from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import BY_NAME
 from mavfi_cli.fi.bits import Field
-from mavfi_cli.fi.source.fault import (
+from mavfi_cli.fi.fault import (
     GROUPS,
     Corruption,
     Effect,

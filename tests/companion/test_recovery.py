@@ -7,7 +7,7 @@ from mavfi_cli.autonomy.pilot import Pilot, PilotMode, PilotParams
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Recovery, Response
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory, VehicleState
 from mavfi_cli.detect.gate import Alarm
-from mavfi_cli.fi.source.injector import Follower
+from mavfi_cli.fi.injector import Follower
 
 STATE = VehicleState(
     stamp_s=1.0, position_enu_m=np.array([1.4, 0.0, 0.0]), velocity_enu_mps=np.zeros(3),

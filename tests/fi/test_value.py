@@ -5,7 +5,7 @@ import pytest
 
 from mavfi_cli.core.errors import FaultError, FaultSpecError, UnknownName
 from mavfi_cli.fi.bits import NUMPY_TYPES, Field
-from mavfi_cli.fi.value import inject
+from mavfi_cli.fi.fault import inject
 
 
 @pytest.mark.parametrize("value", [5.0, 7, True, np.float32(2.5), np.int16(3), np.bool_(0)])

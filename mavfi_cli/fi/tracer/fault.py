@@ -214,7 +214,7 @@ def _field_mask(instruction: Instruction, model: FaultModel, role: Role, site: S
     if site is not Site.VECTOR or element is None:
         return 0
     kind = bits.NUMPY_TYPES[element]
-    lane = bits.mask_of(kind.field_bits(model.field), kind)
+    lane = kind.mask(kind.field_bits(model.field))
     if instruction.scalar:
         return lane
     return sum(lane << shift for shift in range(0, VECTOR_BITS, kind.width))

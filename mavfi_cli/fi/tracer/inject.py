@@ -151,9 +151,9 @@ def _invert(
         return _number(data), _number(tracee.memory.read(place, size))
     registers = tracee.registers
     before = registers.read(corruption.register)
-    kind = bits.raw(width_of(corruption.register) // 8)
+    kind = bits.BitType.raw(width_of(corruption.register) // 8)
     struck = corruption.struck(before)
-    registers.write(corruption.register, bits.flip_pattern(before, struck, kind))
+    registers.write(corruption.register, before ^ kind.mask(struck))
     return before, registers.read(corruption.register)
 
 
@@ -189,7 +189,7 @@ def _follow(
         return Followed(
             activation=BitActivation.READ, after_instructions=0, instruction=instruction.text
         )
-    remaining = bits.mask_of(corruption.bits, bits.raw(VECTOR_BITS))
+    remaining = bits.BitType.raw(VECTOR_BITS).mask(corruption.bits)
     for distance in range(1, window + 1):
         current = instruction_at(tracee, tracee.registers.ip)
         if current is None:

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import CollisionReport, Command, Message, Scalar, State, Trajectory
-from mavfi_cli.fi import bits as bit_operations
-from mavfi_cli.fi.source.fault import (
+from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, bits_of
+from mavfi_cli.fi.fault import (
     Corruption,
     Effect,
     Persistence,
@@ -143,25 +143,23 @@ class _Pattern:
         self._bits: tuple[int, ...] | None = None
         self._target = 0
 
-    def corrupt(self, pattern: int, kind: bit_operations.BitType) -> int:
+    def corrupt(self, pattern: int, kind: BitType) -> int:
         """Return the pattern after a strike."""
         if self._bits is None:
             self._bits = self._choose(pattern, kind)
-        mask = bit_operations.mask_of(self._bits, kind)
+        mask = kind.mask(self._bits)
         corruption = self._corruption
         if corruption.persistence is Persistence.INTERMITTENT and corruption.effect is Effect.FLIP:
             return pattern ^ mask
         return pattern & ~mask | self._target & mask
 
-    def _choose(self, pattern: int, kind: bit_operations.BitType) -> tuple[int, ...]:
+    def _choose(self, pattern: int, kind: BitType) -> tuple[int, ...]:
         corruption = self._corruption
         if corruption.effect is Effect.FLIP:
             chosen = self._prescribed
             if chosen is None:
-                chosen = bit_operations.draw_bits(
-                    self._rng, kind, field=corruption.field, count=corruption.bits
-                )
-            self._target = bit_operations.flip_pattern(pattern, chosen, kind)
+                chosen = kind.draw(self._rng, field=corruption.field, count=corruption.bits)
+            self._target = pattern ^ kind.mask(chosen)
             return chosen
         if corruption.effect is Effect.RANDOM:
             drawn = self._rng.integers(0, 2, size=kind.width, dtype=np.uint8)
@@ -339,23 +337,23 @@ class SourceInjector(Injector):
 
     def _change(self, place: int, state: State, message: Message) -> Change:
         assert self._index is not None
-        kind = bit_operations.NUMPY_TYPES[state.dtype.value]
+        kind = NUMPY_TYPES[state.dtype.value]
         before = state.read(message, self._index)
         return _change_of(state.name, self._index, before, kind, self._patterns[place])
 
 
 def _change_of(
-    name: str, index: int, before: Scalar, kind: bit_operations.BitType, corruption: _Pattern
+    name: str, index: int, before: Scalar, kind: BitType, corruption: _Pattern
 ) -> Change:
     """Return the change that a strike makes to one value."""
-    pattern = bit_operations.pattern_of(before, kind)
+    pattern = kind.pattern(before)
     corrupted = corruption.corrupt(pattern, kind)
     return Change(
         state=name,
         index=index,
-        bits=bit_operations.bits_of(pattern ^ corrupted),
+        bits=bits_of(pattern ^ corrupted),
         before=before,
-        after=bit_operations.value_of(corrupted, kind),
+        after=kind.value(corrupted),
         before_hex=f"{pattern:#0{kind.width // 4 + 2}x}",
         after_hex=f"{corrupted:#0{kind.width // 4 + 2}x}",
     )
@@ -409,7 +407,7 @@ class MemoryInjector(Injector):
             raise FaultSpecError(f"{array} has no elements")
         self.array = array
         self.element = int(rng.integers(memory[array].size))
-        self._kind = bit_operations.NUMPY_TYPES[memory[array].dtype.name]
+        self._kind = NUMPY_TYPES[memory[array].dtype.name]
         require_bits(array, self._kind, corruption, bits)
         self._memory = memory
         chosen = None if bits is None else tuple(sorted(bits))

@@ -17,8 +17,8 @@ from mavfi_cli.core.types import (
     Stage,
     Trajectory,
 )
-from mavfi_cli.fi.bits import NUMPY_TYPES, Field, pattern_of
-from mavfi_cli.fi.source.fault import (
+from mavfi_cli.fi.bits import NUMPY_TYPES, Field
+from mavfi_cli.fi.fault import (
     GROUPS,
     Corruption,
     Effect,
@@ -27,7 +27,7 @@ from mavfi_cli.fi.source.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.fi.source.injector import Activation, MemoryInjector, Moment, SourceInjector, Strike
+from mavfi_cli.fi.injector import Activation, MemoryInjector, Moment, SourceInjector, Strike
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,
@@ -85,14 +85,14 @@ def test_exactly_the_drawn_bits_of_one_value_change(state, seed, bits):
     assert values(message) == before  # the sender's copy stays as it was
     changed = {
         key for key in before
-        if pattern_of(before[key], kind_of(key)) != pattern_of(after[key], kind_of(key))
+        if kind_of(key).pattern(before[key]) != kind_of(key).pattern(after[key])
     }  # fmt: skip
     (change,) = told[0].changes
     assert changed <= {(state.name, change.index)} | shadows(state.name, message, change.index)
     assert len(change.bits) == bits
     xor = int(change.before_hex, 16) ^ int(change.after_hex, 16)
     assert xor.bit_count() == bits
-    assert pattern_of(before[state.name, change.index], kind) == int(change.before_hex, 16)
+    assert kind.pattern(before[state.name, change.index]) == int(change.before_hex, 16)
 
 
 def kind_of(key):

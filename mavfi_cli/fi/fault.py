@@ -1,6 +1,7 @@
 """Source-level faults: injection site, trigger and corruption as three small frozen types.
 
 `draw_fault` resolves a requested fault to one exact fault: names are looked up, the rest is drawn.
+`inject` flips bits of one value or of one element of an array, without a mission.
 
 Vocabulary: transient, intermittent and stuck-at faults as in Avizienis et al., "Basic concepts and
 taxonomy of dependable and secure computing", IEEE TDSC 1(1), 2004.
@@ -12,13 +13,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import BY_NAME, Stage, State
-from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field, mask_of
+from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field, Scalar
 
 
 class When(Enum):
@@ -148,7 +151,7 @@ def require_bits(
         FaultSpecError: the field has too few bits.
     """
     if bits is not None:
-        mask_of(bits, kind)
+        kind.mask(bits)
     elif corruption.effect is Effect.FLIP and corruption.bits > len(
         kind.field_bits(corruption.field)
     ):
@@ -178,3 +181,52 @@ def _states(
 
 def _group(name: str) -> tuple[State, ...]:
     return tuple(state for state in BY_NAME.values() if state.group == name)
+
+
+# -- without a mission
+
+Value = TypeVar("Value", bound=Scalar | np.generic | NDArray[Any])
+
+
+def inject(
+    value: Value,
+    *,
+    bits: int = 1,
+    field: str | Field = Field.ANY,
+    seed: int = 1,
+    exact_bits: Sequence[int] | None = None,
+) -> Value:
+    """Return the value with flipped bits, or a copy of the array with one corrupted element.
+
+    The same arguments give the same flip. An injection into the result with the same seed and the
+    same bits restores the value.
+
+    Args:
+        value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any
+            shape with dtype float64, float32, int64, int32, int16 or bool. It is not changed.
+        field: Field of the bits: sign, exponent, mantissa or any.
+        seed: Seed from which the element and the bits are drawn, 0 or more.
+        exact_bits: Bits to flip instead of drawn ones; bit 0 is the least significant.
+
+    Raises:
+        FaultSpecError: The type of the value is not supported, or the array is empty.
+        UnknownName: No field has this name.
+        FaultError: The type lacks the field or a bit of `exact_bits`, or the field has too few
+            bits.
+    """
+    corrupted: NDArray[Any] = np.array(value)
+    kind = NUMPY_TYPES.get(corrupted.dtype.name)
+    if kind is None:
+        known = ", ".join(NUMPY_TYPES)
+        raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; types are {known}")
+    if corrupted.size == 0:
+        raise FaultSpecError("cannot flip bits of an array without elements")
+    rng = Stream.FAULT.generator(seed, "value")
+    element = int(rng.integers(corrupted.size))
+    chosen = exact_bits
+    if chosen is None:
+        chosen = kind.draw(rng, field=named_member(Field, "field", field), count=bits)
+    corrupted.flat[element] = kind.flip(corrupted.flat[element].item(), chosen)
+    if isinstance(value, np.ndarray):
+        return cast(Value, corrupted)
+    return cast(Value, corrupted[()] if isinstance(value, np.generic) else corrupted.item())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.core.types import Trajectory
-from mavfi_cli.fi.source.injector import Activation, Change, Follower, Reader, Strike
+from mavfi_cli.fi.injector import Activation, Change, Follower, Reader, Strike
 
 STRUCK = Trajectory(
     stamp_s=0.0,
