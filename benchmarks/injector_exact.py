@@ -33,12 +33,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from mavfi_cli.attack.attacker import Attacker, golden_run
-from mavfi_cli.attack.campaign import Plan, Record, completed, one_processor, run_campaign
+from mavfi_cli.attack.campaign import Plan, Record, one_processor, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.attack.program import ProgramTarget
-from mavfi_cli.attack.target import TargetProfile
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.decode import decode
@@ -212,7 +212,7 @@ def same_by_breakpoints(target: KernelTarget, records: Sequence[Record]) -> tupl
             fault = record.fault_of(entry)
             stages = tuple(replace(stage, detour=None) for stage in fault.trigger)
             again = attackers[entry["input"]].run(replace(fault, trigger=stages))
-            same += seen(completed(entry, again)) == seen(entry)
+            same += seen(again.completed(entry)) == seen(entry)
     return same, len(detoured)
 
 

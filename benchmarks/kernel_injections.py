@@ -23,10 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mavfi_cli.attack.campaign import Plan, one_processor, run_campaign
+from mavfi_cli.attack.campaign import Plan, one_processor, replay_runs, run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
-from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.mission.kernel_inputs import inputs_of_flight
 from mavfi_cli.spec.mission import MissionConfig
 

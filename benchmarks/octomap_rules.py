@@ -24,8 +24,7 @@ from mavfi_cli.spec.mission import MissionConfig
 
 KERNEL = """
 import numpy as np
-from mavfi_cli.attack.kernels.catalogue import Kernel
-from mavfi_cli.attack.kernels.outputs import maps
+from mavfi_cli.attack.kernels.catalogue import KERNELS, Kernel
 from mavfi_cli.attack.kernels.scope import kernel_scope
 from mavfi_cli.autonomy.occupancy import OccupancyMap, OccupancyParams
 
@@ -58,8 +57,8 @@ def prepare(inputs):
 
 
 KERNEL = Kernel(
-    name="octomap", title="OctoMap", prepare=prepare, compare=maps, repeatable=False,
-    too_long=True, code=lambda: kernel_scope("octomap"),
+    name="octomap", title="OctoMap", prepare=prepare, compare=KERNELS["octomap"].compare,
+    repeatable=False, too_long=True, code=lambda: kernel_scope("octomap"),
 )
 """
 USUAL = {"scans": 1, "empty": False, "resolution_m": 0.2, "lazy": True}

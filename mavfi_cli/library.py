@@ -42,10 +42,10 @@ def fly(
     """
     mission = _mission(config, settings)
     if mission.instruction is not None:  # the attacked node loads as long as this process
-        from mavfi_cli.attack.served import start_early
+        from mavfi_cli.attack.served import ServedProcess
         from mavfi_cli.mission.instruction import PROGRAM
 
-        start_early(PROGRAM)
+        ServedProcess.start_early(PROGRAM)
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.mission.run_folder import load_run

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -45,6 +45,30 @@ class RunResult:
     followed: Followed
     reason: str  # why the fault was not injected
     run_s: float  # wall time of the whole run
+
+    def completed(self, planned: Mapping[str, Any]) -> dict[str, Any]:
+        """Make the record of the run that was planned so."""
+        fault = self.fault
+        if fault is not None and not planned["trigger"]:  # a time trigger: it cannot be repeated
+            planned = {
+                **planned,
+                "object": fault.target.object,
+                "offset": fault.target.offset,
+                "instruction": fault.instruction,
+                "instruction_bytes": fault.instruction_bytes.hex(),
+                "corruption": fault.corruption and fault.corruption.to_json(),
+            }
+        return record.completed(
+            planned,
+            self.injection,
+            self.followed,
+            outcome=self.outcome.value,
+            signal=self.signal,
+            **self.verdict.details,
+            output_sha256=self.verdict.output_sha256,
+            not_injected_reason=self.reason,
+            run_s=self.run_s,
+        )
 
 
 def golden_run(place: JudgedPlace) -> Golden:

@@ -26,16 +26,11 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
-from mavfi_cli.attack.journal import Journal
-from mavfi_cli.attack.target import (
-    AttackTarget,
-    Golden,
-    JudgedPlace,
-    TargetProfile,
-    Watch,
-    places_of,
-)
-from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.attack.journal import Journal, read_plan, read_runs
+from mavfi_cli.attack.profile import TargetProfile, started
+from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, Watch, places_of
+from mavfi_cli.core.errors import BuildMismatch, FaultError, RecordError, TargetError
+from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
@@ -169,7 +164,7 @@ def _attack(
         done = journal.runs_of(planned)
         journal.flush_plan("-".join(("faults", *target.stream)) + ".jsonl", planned)
     for index, result in workers.run(bench, _tasks(planned, done)):
-        done[index] = completed(planned[index], result)
+        done[index] = result.completed(planned[index])
         if journal is not None:
             journal.append(done[index])
         progress(target.name, len(done))
@@ -250,31 +245,6 @@ def _tasks(planned: Sequence[Record], done: Mapping[int, Record]) -> list[Any]:
         for index, entry in enumerate(planned)
         if index not in done
     ]
-
-
-def completed(planned: Mapping[str, Any], result: RunResult) -> Record:
-    """Make the record of a run that is over."""
-    fault = result.fault
-    if fault is not None and not planned["trigger"]:  # a time trigger: it cannot be repeated
-        planned = {
-            **planned,
-            "object": fault.target.object,
-            "offset": fault.target.offset,
-            "instruction": fault.instruction,
-            "instruction_bytes": fault.instruction_bytes.hex(),
-            "corruption": fault.corruption and fault.corruption.to_json(),
-        }
-    return record.completed(
-        planned,
-        result.injection,
-        result.followed,
-        outcome=result.outcome.value,
-        signal=result.signal,
-        **result.verdict.details,
-        output_sha256=result.verdict.output_sha256,
-        not_injected_reason=result.reason,
-        run_s=result.run_s,
-    )
 
 
 # -- worker processes
@@ -433,3 +403,88 @@ class _AttackWorkers:
                 yield from results
         except BrokenProcessPool:
             raise FaultError("a worker process was killed; the campaign is incomplete") from None
+
+
+# -- recorded runs are repeated bit by bit
+
+# A replay must repeat these entries; durations are not among them.
+_COMPARED = (
+    "outcome", "signal", "exit_code", "error", "magnitude", "within_tolerance", "output_sha256",
+    "not_injected_reason", "activation",
+)  # fmt: skip
+_INJECTION = ("applied", "reason", "address", "before", "after")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Replay:
+    target: str  # name of the kernel or program
+    run: int
+    differs: tuple[str, ...]  # keys of the record that differ; empty if it is identical
+    record: dict[str, Any]
+
+
+def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> Iterator[_Replay]:
+    """Repeat the runs of a campaign's folder.
+
+    Args:
+        kernels: names of the kernels; all of ours if none is named.
+        runs: number of runs of each kernel, or of the program, from the first; 0 for all.
+
+    Raises:
+        RecordError: the folder has no runs that can be repeated.
+        BuildMismatch: a record is of another build; says what differs.
+    """
+    plan, found = read_plan(folder), False
+    for target in _targets(plan, folder, kernels):
+        of_it = [e for e in read_runs(folder) if (e.get("kernel"),) == (target.stream or (None,))]
+        records = [entry for entry in of_it if entry["trigger"]]
+        if not records:
+            continue
+        found = True
+        with one_processor(), contextlib.closing(target.open()) as place:
+            places = places_of(place)
+            attackers = [Attacker(place=each, golden=golden_run(each)) for each in places]
+            with started(places[0]) as tracee:
+                image = places[0].image(tracee)
+            for entry in records[: runs or None]:
+                record.require_same_build(entry, image)
+                yield _replay(attackers[entry.get("input", 0)], entry)
+    if not found:
+        raise RecordError(f"{folder}: no runs that can be repeated")
+
+
+def _targets(
+    plan: dict[str, Any], folder: Path, kernels: tuple[str, ...]
+) -> Iterator[AttackTarget]:
+    from mavfi_cli.attack.kernels import catalogue
+    from mavfi_cli.attack.kernels.inputs import INPUTS
+    from mavfi_cli.attack.kernels.target import KernelTarget
+    from mavfi_cli.attack.program import ProgramTarget
+
+    if "program" in plan:
+        if kernels:
+            raise RecordError(f"{folder}: holds runs of a program, not of {' and '.join(kernels)}")
+        try:
+            target = ProgramTarget.of_plan(plan)
+        except KeyError as missing:
+            problem = f"the plan of an older version, without {missing}, cannot be repeated"
+            raise RecordError(f"{folder}: {problem}") from None
+        yield target
+        return
+    if "inputs_sha256" not in plan:
+        raise RecordError(f"{folder}: holds no runs of kernels or of a program")
+    if plan.get("sources") != own_digest():  # other code has another memory layout
+        raise BuildMismatch(["our own code"])
+    for kernel in catalogue.select(kernels):
+        tolerance = float(plan["tolerance"])
+        yield KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)
+
+
+def _replay(attacker: Attacker, entry: dict[str, Any]) -> _Replay:
+    again = attacker.run(record.fault_of(entry)).completed(entry)
+    differs = [name for name in _COMPARED if again.get(name) != entry.get(name)]
+    was, now = entry["injection"], again["injection"]
+    differs += [name for name in _INJECTION if now.get(name) != was.get(name)]
+    return _Replay(
+        target=attacker.place.name, run=entry["run"], differs=tuple(differs), record=again
+    )

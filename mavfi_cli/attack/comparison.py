@@ -125,21 +125,17 @@ class OutputComparison:
             line for line in lines if not any(re.search(each, line) for each in self.ignored)
         )
 
+    def difference(self, golden: bytes, output: bytes) -> Difference | None:
+        """The difference between the numbers of two outputs; None if anything else differs."""
+        size = _magnitude(golden, output)
+        return None if size is None else Difference(relative=size, absolute=size)
+
     def same(self, golden: bytes, output: bytes) -> bool:
         """True if two outputs are equal, or differ only in numbers within the tolerance."""
         if golden == output:
             return True
         size = _magnitude(golden, output) if self.tolerance > 0.0 else None
         return size is not None and size <= self.tolerance
-
-
-def joined(parts: dict[str, bytes | None]) -> bytes:
-    """Join all outputs: a single one as it is, several each after its name."""
-    pieces = [b"\0missing" if data is None else data for data in parts.values()]
-    if len(pieces) == 1:
-        return pieces[0]
-    names = (f"== {name}\n".encode() for name in parts)
-    return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
 
 
 def _inside(text: str) -> str:
@@ -178,12 +174,6 @@ def _beginning(path: Path) -> bytes:
     """The contents of a file, cut behind what is compared."""
     with path.open("rb") as file:
         return file.read(LARGEST_BYTES + 1)
-
-
-def compared(golden: bytes, output: bytes) -> Difference | None:
-    """The difference between the numbers of two texts; None if anything else differs."""
-    size = _magnitude(golden, output)
-    return None if size is None else Difference(relative=size, absolute=size)
 
 
 def _magnitude(golden: bytes, output: bytes) -> float | None:

@@ -17,20 +17,24 @@ windows.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.attack.target import AttackPlace, TargetProfile, Watch, code_of
+from mavfi_cli.attack.target import AttackPlace, Watch
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Detour
+from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
-from mavfi_cli.fi.tracer.sampling import Segment, Stratum, record_window
+from mavfi_cli.fi.tracer.sampling import Segment, Stratum, draw_fault, record_window
 from mavfi_cli.fi.tracer.tracee import Tracee
+from mavfi_cli.stats.shares import Interval, estimated_total
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
@@ -39,6 +43,127 @@ _CHECKED = 4  # instructions whose counts are checked, besides the most executed
 _DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
 Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
+Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetProfile:
+    """The instructions that can be hit in one run, with what is needed to draw from them."""
+
+    strata: tuple[Stratum, ...] = ()
+    counted: CountedRun | None = None  # a whole run that was counted instead of stepped
+    image: Image
+    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
+    cost_s: float
+
+    @property
+    def complete(self) -> bool:
+        """True if every window of the run was stepped."""
+        return all(stratum.complete for stratum in self.strata)
+
+    @property
+    def windows(self) -> str:
+        """Stepped windows and all windows, in words."""
+        stepped = sum(len(stratum.segments) for stratum in self.strata)
+        return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
+
+    @property
+    def executed(self) -> int:
+        """Number of executed instructions in scope, over the stepped windows."""
+        stepped = sum(stratum.executed for stratum in self.strata)
+        return stepped if self.counted is None else self.counted.executed
+
+    @property
+    def instructions(self) -> Interval:
+        """Number of executed instructions in scope; estimated if the profile is not complete."""
+        if self.counted is not None:
+            return estimated_total([([self.counted.executed], 1)])
+        return estimated_total(
+            [
+                ([len(segment.trace) for segment in stratum.segments], stratum.windows_in_run)
+                for stratum in self.strata
+            ]
+        )
+
+    @property
+    def not_reached(self) -> float:
+        """Share of the executed instructions that is not drawn, because no stop reaches it."""
+        return 0.0 if self.counted is None else self.counted.not_reached
+
+    def code_at(self, address: int) -> bytes:
+        """16 bytes of code."""
+        return _code_of(self.code, address)
+
+    def window_of(self, record: Mapping[str, Any]) -> Window | None:
+        """The sampled window of a fault; None if no sample of windows was taken."""
+        first = record["trigger"][0]
+        return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
+
+    @functools.cached_property
+    def _sampled_windows(self) -> dict[tuple[str, int, int], Window]:
+        return {
+            (start.location.object, start.location.offset, start.count): (number, start.count)
+            for number in self.sampled
+            for segment in self.strata[number].segments
+            for start in segment.start[:1]
+        }
+
+    @property
+    def sampled(self) -> dict[int, int]:
+        """Stepped windows of each stratum of which not all were stepped, by its number."""
+        return {
+            number: len(stratum.segments)
+            for number, stratum in enumerate(self.strata)
+            if not stratum.complete
+        }
+
+    def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
+        """Draw one fault, uniformly over the executed instructions."""
+        drawn = self.counted or self._drawn_stratum(rng)
+        return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.image.locate)
+
+    def _drawn_stratum(self, rng: np.random.Generator) -> Stratum:
+        shares = np.array([stratum.instructions for stratum in self.strata])
+        which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
+        return self.strata[which]
+
+    def after(self, begin: CountedStop) -> TargetProfile:
+        """Make the same profile for a run that has to reach `begin` first."""
+
+        def later(stratum: Stratum) -> Stratum:
+            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
+            return replace(stratum, segments=tuple(segments))
+
+        return replace(self, strata=tuple(map(later, self.strata)))
+
+    def in_words(self) -> str:
+        """How the population of faults was found, in words."""
+        if self.complete:
+            return f"all {self.executed} executed instructions in scope"
+        windows: dict[str, list[int]] = {}
+        for stratum in self.strata:
+            if stratum.marker is not None:
+                name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
+                counts = windows.setdefault(name, [0, 0])
+                counts[0] += len(stratum.segments)
+                counts[1] += stratum.windows_in_run
+        parts = [f"{some} of {all_} windows from {name}" for name, (some, all_) in windows.items()]
+        if len(windows) < len({stratum.marker for stratum in self.strata}):
+            parts.insert(0, "the beginning")
+        found = self.instructions
+        return (
+            f"about {found.value:.3g} executed instructions in scope (95 % interval "
+            f"{found.low:.3g} to {found.high:.3g}), by sample: {', '.join(parts)}; "
+            f"{self.executed} stepped"
+        )
+
+
+def _code_of(code: Iterable[tuple[int, bytes]], address: int) -> bytes:
+    """16 bytes at an address, from pieces of code with their start addresses."""
+    for start, data in code:
+        if start <= address < start + len(data):
+            return data[address - start : address - start + 16]
+    return b""
 
 
 def profile_run(
@@ -163,7 +288,7 @@ def profile_counted(
     }
     if not executions:
         raise TargetError(place.name, _NOTHING)
-    run = CountedRun.of(executions, lambda address: code_of(code, address))
+    run = CountedRun.of(executions, lambda address: _code_of(code, address))
     cost_s = time.perf_counter() - begun
     _require_counts(place, run, image, rng)
     return TargetProfile(counted=run, image=image, code=code, cost_s=cost_s)

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
-from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison, compared, joined
+from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison
 from mavfi_cli.attack.profile import (
+    TargetProfile,
     function_of,
     profile_calls,
     profile_counted,
@@ -35,7 +36,6 @@ from mavfi_cli.attack.target import (
     Golden,
     RunLimits,
     RunVerdict,
-    TargetProfile,
     Watch,
     digest,
     judged,
@@ -308,7 +308,7 @@ class _Workplace:
         if ended.signal is not None:
             unlike = f"it is killed by {signal_name(ended.signal)}"
         else:
-            again = replace(golden, output=joined(self._parts()), exit_code=ended.exit_code or 0)
+            again = replace(golden, output=_joined(self._parts()), exit_code=ended.exit_code or 0)
             unlike = self.unlike(golden, again)
         if unlike:
             problem = f"does not do the same when it is {how}, so it has no profile: {unlike}"
@@ -352,7 +352,7 @@ class _Workplace:
         parts = self._parts()
         self._require_sound(ended, parts)
         golden = Golden(
-            output=joined(parts), exit_code=ended.exit_code or 0, cpu_s=cpu_s, wall_s=wall_s
+            output=_joined(parts), exit_code=ended.exit_code or 0, cpu_s=cpu_s, wall_s=wall_s
         )
         self._golden = self._golden or golden
         return replace(golden, notices=tuple(self._notices()))
@@ -419,9 +419,11 @@ class _Workplace:
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None if it exceeded its limit."""
-        parts, tolerance = self._parts(), self.target.comparison.tolerance
-        output = joined(parts)
-        outcome, difference = judged(golden, ended, output, compared, tolerance=tolerance)
+        parts, comparison = self._parts(), self.target.comparison
+        output = _joined(parts)
+        outcome, difference = judged(
+            golden, ended, output, comparison.difference, tolerance=comparison.tolerance
+        )
         return RunVerdict(
             outcome=outcome,
             output_sha256=digest(output if any(parts.values()) else b""),
@@ -434,6 +436,15 @@ class _Workplace:
     def close(self) -> None:
         """Delete the scratch folder."""
         self._remove()
+
+
+def _joined(parts: dict[str, bytes | None]) -> bytes:
+    """Join all outputs: a single one as it is, several each after its name."""
+    pieces = [b"\0missing" if data is None else data for data in parts.values()]
+    if len(pieces) == 1:
+        return pieces[0]
+    names = (f"== {name}\n".encode() for name in parts)
+    return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
 
 
 def _children_cpu_s() -> float:

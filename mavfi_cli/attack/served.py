@@ -32,6 +32,7 @@ _FIXED = {
     "OMP_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
 }
+_early: dict[str, ServedProcess] = {}
 
 
 class ServedProcess:
@@ -53,6 +54,17 @@ class ServedProcess:
         self._module, self._output = module, output
         self._errors = os.memfd_create("mavfi-errors")
         self._start()
+
+    @classmethod
+    def start_early(cls, module: str) -> None:
+        """Start a program that the next `of` gets, because it loads long."""
+        if module not in _early:
+            _early[module] = cls(module)
+
+    @classmethod
+    def of(cls, module: str) -> ServedProcess:
+        """The program that was started early, or a new one."""
+        return _early.pop(module, None) or cls(module)
 
     def _start(self) -> None:
         self.connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -111,20 +123,6 @@ class ServedProcess:
         if self._errors >= 0:
             os.close(self._errors)
             self._errors = -1
-
-
-_early: dict[str, ServedProcess] = {}
-
-
-def start_early(module: str) -> None:
-    """Start a program that the next `served_process` of the module gets, because it loads long."""
-    if module not in _early:
-        _early[module] = ServedProcess(module)
-
-
-def served_process(module: str) -> ServedProcess:
-    """The program that was started early, or a new one."""
-    return _early.pop(module, None) or ServedProcess(module)
 
 
 def channel() -> socket.socket:

@@ -6,25 +6,22 @@ where it runs repeatedly from the same memory. Any class with these methods can 
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import signal
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from mavfi_cli.attack.comparison import Difference
-from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop
-from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
-from mavfi_cli.fi.tracer.image import Image, Scope, short_name
-from mavfi_cli.fi.tracer.sampling import Stratum, draw_fault
+from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
-from mavfi_cli.stats.shares import Interval, estimated_total
 
-Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
+if TYPE_CHECKING:
+    from mavfi_cli.attack.profile import TargetProfile
+
 # Called with the instructions stepped since the last call, or with what goes on, in words.
 Watch = Callable[[int | str], None]
 
@@ -85,126 +82,6 @@ class RunVerdict:
     outcome: RunOutcome
     output_sha256: str
     details: Mapping[str, Any] = field(default_factory=dict)
-
-
-def code_of(code: Iterable[tuple[int, bytes]], address: int) -> bytes:
-    """16 bytes at an address, from pieces of code with their start addresses."""
-    for start, data in code:
-        if start <= address < start + len(data):
-            return data[address - start : address - start + 16]
-    return b""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TargetProfile:
-    """The instructions that can be hit in one run, with what is needed to draw from them."""
-
-    strata: tuple[Stratum, ...] = ()
-    counted: CountedRun | None = None  # a whole run that was counted instead of stepped
-    image: Image
-    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
-    cost_s: float
-
-    @property
-    def complete(self) -> bool:
-        """True if every window of the run was stepped."""
-        return all(stratum.complete for stratum in self.strata)
-
-    @property
-    def windows(self) -> str:
-        """Stepped windows and all windows, in words."""
-        stepped = sum(len(stratum.segments) for stratum in self.strata)
-        return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
-
-    @property
-    def executed(self) -> int:
-        """Number of executed instructions in scope, over the stepped windows."""
-        stepped = sum(stratum.executed for stratum in self.strata)
-        return stepped if self.counted is None else self.counted.executed
-
-    @property
-    def instructions(self) -> Interval:
-        """Number of executed instructions in scope; estimated if the profile is not complete."""
-        if self.counted is not None:
-            return estimated_total([([self.counted.executed], 1)])
-        return estimated_total(
-            [
-                ([len(segment.trace) for segment in stratum.segments], stratum.windows_in_run)
-                for stratum in self.strata
-            ]
-        )
-
-    @property
-    def not_reached(self) -> float:
-        """Share of the executed instructions that is not drawn, because no stop reaches it."""
-        return 0.0 if self.counted is None else self.counted.not_reached
-
-    def code_at(self, address: int) -> bytes:
-        """16 bytes of code."""
-        return code_of(self.code, address)
-
-    def window_of(self, record: Mapping[str, Any]) -> Window | None:
-        """The sampled window of a fault; None if no sample of windows was taken."""
-        first = record["trigger"][0]
-        return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
-
-    @functools.cached_property
-    def _sampled_windows(self) -> dict[tuple[str, int, int], Window]:
-        return {
-            (start.location.object, start.location.offset, start.count): (number, start.count)
-            for number in self.sampled
-            for segment in self.strata[number].segments
-            for start in segment.start[:1]
-        }
-
-    @property
-    def sampled(self) -> dict[int, int]:
-        """Stepped windows of each stratum of which not all were stepped, by its number."""
-        return {
-            number: len(stratum.segments)
-            for number, stratum in enumerate(self.strata)
-            if not stratum.complete
-        }
-
-    def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
-        """Draw one fault, uniformly over the executed instructions."""
-        drawn = self.counted or self._drawn_stratum(rng)
-        return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.image.locate)
-
-    def _drawn_stratum(self, rng: np.random.Generator) -> Stratum:
-        shares = np.array([stratum.instructions for stratum in self.strata])
-        which = int(rng.choice(len(shares), p=shares / shares.sum())) if len(shares) > 1 else 0
-        return self.strata[which]
-
-    def after(self, begin: CountedStop) -> TargetProfile:
-        """Make the same profile for a run that has to reach `begin` first."""
-
-        def later(stratum: Stratum) -> Stratum:
-            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
-            return replace(stratum, segments=tuple(segments))
-
-        return replace(self, strata=tuple(map(later, self.strata)))
-
-    def in_words(self) -> str:
-        """How the population of faults was found, in words."""
-        if self.complete:
-            return f"all {self.executed} executed instructions in scope"
-        windows: dict[str, list[int]] = {}
-        for stratum in self.strata:
-            if stratum.marker is not None:
-                name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
-                counts = windows.setdefault(name, [0, 0])
-                counts[0] += len(stratum.segments)
-                counts[1] += stratum.windows_in_run
-        parts = [f"{some} of {all_} windows from {name}" for name, (some, all_) in windows.items()]
-        if len(windows) < len({stratum.marker for stratum in self.strata}):
-            parts.insert(0, "the beginning")
-        found = self.instructions
-        return (
-            f"about {found.value:.3g} executed instructions in scope (95 % interval "
-            f"{found.low:.3g} to {found.high:.3g}), by sample: {', '.join(parts)}; "
-            f"{self.executed} stepped"
-        )
 
 
 class AttackPlace(Protocol):

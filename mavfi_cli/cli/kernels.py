@@ -156,9 +156,14 @@ def _attacked(
 def _attack_kernels(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.kernels.catalogue import select
     from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets
-    from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table
+    from mavfi_cli.report.attacks import (
+        KERNEL_COLUMNS,
+        draw_kernel_plot,
+        save_runs,
+        summarise,
+        table,
+    )
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.kernel_plot import draw_kernel_plot
 
     plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
     config = kernel_flight(options["world"], options["world_seed"])
@@ -246,7 +251,7 @@ def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, An
 
 def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:
     """Repeat recorded runs and print those that differ; True if none does."""
-    from mavfi_cli.attack.replay import replay_runs
+    from mavfi_cli.attack.campaign import replay_runs
 
     equal = total = 0
     for result in replay_runs(folder, kernels, runs):

@@ -19,9 +19,8 @@ from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
-from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise
+from mavfi_cli.report.attacks import KERNEL_COLUMNS, draw_kernel_plot, save_runs, summarise
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.kernel_plot import draw_kernel_plot
 
 _TELLING = 0.05  # share of the missions that must be over for a forecast
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run

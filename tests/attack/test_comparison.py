@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
-from mavfi_cli.attack.comparison import OutputComparison, compared
+from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.program import (
     ProgramTarget,
     absolute_arguments,
@@ -232,7 +232,7 @@ def test_standard_input_reaches_the_program(native_program, tmp_path):
     ],
 )
 def test_magnitude(golden, output, size):
-    found = compared(golden, output)
+    found = OutputComparison().difference(golden, output)
     assert (found and found.relative) == size
 
 

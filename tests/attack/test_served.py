@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.attack import served
-from mavfi_cli.attack.served import served_process, start_early
 
 MODULE = "mavfi_cli.attack.kernels.template"
 
@@ -28,10 +27,10 @@ def started(monkeypatch):
 
 
 def test_a_program_that_was_started_early_is_taken_once(started):
-    start_early(MODULE)
-    start_early(MODULE)  # it runs already
+    served.ServedProcess.start_early(MODULE)
+    served.ServedProcess.start_early(MODULE)  # it runs already
     assert len(started) == 1
-    assert [served_process(MODULE), served_process(MODULE)] == started
+    assert [served.ServedProcess.of(MODULE) for _ in range(2)] == started
     assert len({each.pid for each in started}) == 2
 
 
@@ -43,9 +42,9 @@ def environment(pid):
 
 def test_the_shell_leaves_no_traces_in_a_program(started, monkeypatch):
     for name, value in (("PATH", "/elsewhere"), ("LANG", "C"), ("VIRTUAL_ENV", "/v"), ("X", "y")):
-        served_process(MODULE)
+        served.ServedProcess.of(MODULE)
         monkeypatch.setenv(name, value)
-    served_process(MODULE)
+    served.ServedProcess.of(MODULE)
     found = {environment(each.pid) for each in started}
     assert len(started) == 5
     assert len(found) == 1

@@ -19,21 +19,12 @@ import numpy as np
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.outputs import unpack
+from mavfi_cli.attack.kernels.catalogue import unpack
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
-from mavfi_cli.attack.profile import profile_run
+from mavfi_cli.attack.profile import TargetProfile, profile_run
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.target import (
-    Golden,
-    RunLimits,
-    RunOutcome,
-    RunVerdict,
-    TargetProfile,
-    Watch,
-    digest,
-    judged,
-)
+from mavfi_cli.attack.target import Golden, RunLimits, RunOutcome, RunVerdict, Watch, digest, judged
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive

@@ -27,9 +27,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.catalogue import Call
+from mavfi_cli.attack.kernels.catalogue import Call, pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
-from mavfi_cli.attack.kernels.outputs import pack
 from mavfi_cli.attack.served import channel, newest_cache_ns
 from mavfi_cli.core.processes import fork, receive, send
 

@@ -24,9 +24,8 @@ import numpy as np
 
 from mavfi_cli.attack.attacker import EntryCounter, LiveAttack, TracerThread, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
-from mavfi_cli.attack.profile import profile_call, profile_calls, profile_run
-from mavfi_cli.attack.served import ServedProcess, served_process
-from mavfi_cli.attack.target import TargetProfile
+from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
@@ -204,7 +203,7 @@ class Rehearsal:
     def __init__(self, setup: Setup, orders: Sequence[_Order], entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
         self._last = orders[-1]
-        self._spawned = served_process(PROGRAM)
+        self._spawned = ServedProcess.of(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
             self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
@@ -311,7 +310,7 @@ def _count_entries(setup: Setup, orders: Sequence[_Order]) -> list[int]:
     Raises:
         TracingForbidden: the operating system neither counts nor lets us trace.
     """
-    spawned, counts = served_process(PROGRAM), []
+    spawned, counts = ServedProcess.of(PROGRAM), []
     with contextlib.ExitStack() as leaving:
         leaving.callback(spawned.kill)
         scope = spawned.begin(setup, f"node {setup.node}")
@@ -485,4 +484,4 @@ def injection_of(
             "autopilot do not: leave out --link"
         )
     planned = _planned_of(repeat) if repeat else _plan_fault(config, config.instruction, out)
-    return _InstructionInjection(planned, served_process(PROGRAM), for_debugger)
+    return _InstructionInjection(planned, ServedProcess.of(PROGRAM), for_debugger)

@@ -5,9 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from mavfi_cli.attack.kernels.outputs import checks, maps, numbers, pack, paths, unpack
+from mavfi_cli.attack.kernels.catalogue import KERNELS, pack, unpack
 from mavfi_cli.autonomy.occupancy import MapSnapshot, OccupancyMap, OccupancyParams
 from mavfi_cli.core.types import PointCloud
+
+numbers, maps, checks, paths = (
+    KERNELS[name].compare for name in ("control", "octomap", "collision_check", "rrt")
+)
 
 
 def path(points, found=True):

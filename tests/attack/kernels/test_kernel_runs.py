@@ -6,18 +6,17 @@ from functools import partial
 
 import pytest
 
+from mavfi_cli.attack.campaign import replay_runs
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels import target as kernel_target
+from mavfi_cli.attack.kernels.catalogue import pack
 from mavfi_cli.attack.kernels.inputs import load_inputs
-from mavfi_cli.attack.kernels.outputs import pack
 from mavfi_cli.attack.profile import profile_run
-from mavfi_cli.attack.replay import replay_runs
 from mavfi_cli.attack.target import digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
-from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table
+from mavfi_cli.report.attacks import KERNEL_COLUMNS, draw_kernel_plot, save_runs, summarise, table
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.kernel_plot import draw_kernel_plot
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 
