@@ -7,7 +7,7 @@ Projections: A Working Manual, 1987, equations 25-15 and 20-14), as in PX4.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 EARTH_RADIUS_M = 6_371_000.0
 
@@ -19,24 +19,23 @@ class Origin:
     latitude_deg: float = 47.397742
     longitude_deg: float = 8.545594
     altitude_amsl_m: float = 489.4
-    _sin: float = field(init=False, repr=False)
-    _cos: float = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_sin", math.sin(math.radians(self.latitude_deg)))
-        object.__setattr__(self, "_cos", math.cos(math.radians(self.latitude_deg)))
+    @property
+    def _sine_cosine(self) -> tuple[float, float]:
+        return math.sin(math.radians(self.latitude_deg)), math.cos(math.radians(self.latitude_deg))
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[float, float]:
         """Return latitude and longitude, degrees, of a point of the local frame."""
         distance = math.hypot(north_m, east_m)
         if distance < 1e-9:
             return self.latitude_deg, self.longitude_deg
+        origin_sine, origin_cosine = self._sine_cosine
         arc = distance / EARTH_RADIUS_M
         sin_arc, cos_arc = math.sin(arc), math.cos(arc)
-        sine = cos_arc * self._sin + north_m * sin_arc * self._cos / distance
+        sine = cos_arc * origin_sine + north_m * sin_arc * origin_cosine / distance
         latitude = math.asin(max(-1.0, min(1.0, sine)))
         longitude = math.radians(self.longitude_deg) + math.atan2(
-            east_m * sin_arc, distance * self._cos * cos_arc - north_m * self._sin * sin_arc
+            east_m * sin_arc, distance * origin_cosine * cos_arc - north_m * origin_sine * sin_arc
         )
         return math.degrees(latitude), math.degrees(longitude)
 
@@ -45,8 +44,9 @@ class Origin:
         latitude = math.radians(latitude_deg)
         delta = math.radians(longitude_deg - self.longitude_deg)
         sin_latitude, cos_latitude = math.sin(latitude), math.cos(latitude)
-        cosine = self._sin * sin_latitude + self._cos * cos_latitude * math.cos(delta)
+        origin_sine, origin_cosine = self._sine_cosine
+        cosine = origin_sine * sin_latitude + origin_cosine * cos_latitude * math.cos(delta)
         arc = math.acos(max(-1.0, min(1.0, cosine)))
         scale = EARTH_RADIUS_M * (arc / math.sin(arc) if arc > 1e-9 else 1.0)
-        north = self._cos * sin_latitude - self._sin * cos_latitude * math.cos(delta)
+        north = origin_cosine * sin_latitude - origin_sine * cos_latitude * math.cos(delta)
         return scale * north, scale * cos_latitude * math.sin(delta)

@@ -52,8 +52,6 @@ class Peers(Generic[P]):
 
     Args:
         signing: Vouches for unknown senders; None: everybody with a valid frame is welcome.
-        allow_unsigned: Allow unsigned links beyond this machine.
-        clock: Monotonic clock, s.
 
     Attributes:
         over: True once an inherited connection has closed.

@@ -110,10 +110,8 @@ class Referee:
     """Collision, clearance, flown distance and truth log of one flight.
 
     Args:
-        world: World of the flight.
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
-        vehicle: Name of the vehicle, for the report.
-        physics: Mass and thrust of the vehicle, for the report.
+        vehicle, physics: Name, mass and thrust of the vehicle, for the report.
         pose: Whose pose it judges, for the report; None for the true one.
         logs: Keep a row of truth for each observation, for `save`.
     """
@@ -164,16 +162,14 @@ class Referee:
         """Check the motion since the last observation, and log a row of truth.
 
         Args:
-            stamp_s: Simulated time, s.
-            position_enu_m: Position of the vehicle (3,).
+            stamp_s: Simulated time.
+            position_enu_m, velocity_enu_mps: (3,)
             quaternion_flu_enu: Unit quaternion (4,) w x y z, body forward-left-up to ENU.
-            velocity_enu_mps: Velocity of the vehicle (3,).
             armed: True if the motors may turn.
             on_ground: True if the physics reports ground contact.
             may_land: The flight controller is landing or taking off, so a gentle ground contact is
                 not a crash. A disarmed vehicle may always land.
-            power_regression_w: Power comparable with the paper's, for the log.
-            power_propeller_w: Power of the propellers, for the log.
+            power_regression_w, power_propeller_w: Powers for the log.
 
         Returns:
             First collision of the flight in the call that detects it, otherwise None.

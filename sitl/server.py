@@ -133,7 +133,7 @@ class Client(Peer):
 
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""
-        self._send([], self._simulation.autopilot.take_outbox(self._link))
+        self._send([], self._link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
         """Send messages of both components; the camera's answers are the first."""
@@ -166,11 +166,7 @@ _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdu
 class _Pace:
     """Computes the wait before the next tick.
 
-    A slow machine does not accumulate delay: time lost beyond half a second of delay is
-    dropped.
-
-    Args:
-        speed: Simulated seconds for each second of the wall clock.
+    A slow machine does not accumulate delay: time lost beyond half a second of delay is dropped.
     """
 
     def __init__(self, speed: float) -> None:
@@ -178,11 +174,9 @@ class _Pace:
         self._due_s = time.monotonic()
 
     def next_tick(self, tick_s: float) -> None:
-        """Count one more simulated tick."""
         self._due_s = max(self._due_s + tick_s / self.speed, time.monotonic() - _PATIENCE_S)
 
     def remaining_s(self) -> float:
-        """Time until the tick is due; zero or less if it is."""
         return self._due_s - time.monotonic()
 
 
@@ -234,7 +228,6 @@ def _await_answer(
 
 
 def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
-    """Return True if the setpoint for a stamp is among the companion's messages."""
     return any(
         message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms
         for message in messages
@@ -243,10 +236,6 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
 
 class _EmbeddedVehicle:
     """The vehicle in the process of its companion, which waits while the vehicle flies.
-
-    Args:
-        simulation: The vehicle.
-        truth_folder: Folder in which the truth is saved at the end.
 
     Attributes:
         link: The companion's end of the link. When the companion has answered a tick and waits for
@@ -287,11 +276,7 @@ class _EmbeddedVehicle:
         return answered
 
     def end(self) -> None:
-        """Fly the companion's last answer and save the truth. May be called repeatedly.
-
-        Raises:
-            RecordError: The truth cannot be saved.
-        """
+        """Fly the companion's last answer and save the truth. May be called repeatedly."""
         if self._ended:
             return
         self._ended = True
@@ -306,12 +291,7 @@ class _EmbeddedVehicle:
 
 
 class _Realtime:
-    """The clients of a simulation that is paced by the wall clock, any number of them.
-
-    Raises:
-        LinkError: An endpoint cannot be opened.
-        ConfigError: The file of the signing key cannot be read.
-    """
+    """The clients of a simulation that is paced by the wall clock, any number of them."""
 
     def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
         self._options = options
@@ -356,14 +336,12 @@ class _Realtime:
         click.echo("restarted")
 
     def _tell_collision(self) -> None:
-        """Print the first collision of a flight."""
         collision = self._simulation.referee.collision
         if collision is not None and not self._told_collision:
             self._told_collision = True
             click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
 
     def close(self) -> None:
-        """Close every client and endpoint."""
         self._clients.close()
 
     def _serve(self, duration_us: int, stopped: Callable[[], bool]) -> None:
@@ -383,7 +361,6 @@ class _Realtime:
                 break
 
     def _forward(self) -> None:
-        """Forward the status texts of each client to all others."""
         for speaker in self._clients:
             while speaker.overheard:
                 frame = speaker.overheard.popleft()
@@ -504,7 +481,6 @@ def _needs_of_firmware(options: ServerOptions) -> list[str]:
 
 
 def _commanders(options: ServerOptions) -> str:
-    """Return the clients whose commands are obeyed."""
     if options.trusted:
         return f"system {', '.join(map(str, sorted(options.trusted)))} only"
     return "anyone" + ("" if options.key_file is None else " who signs")

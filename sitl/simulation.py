@@ -33,12 +33,10 @@ _STEP_S = STEP_US * 1e-6
 class Simulation:
     """One vehicle in one world; deterministic in its arguments and the messages handled.
 
+    The flight begins at the world's start, facing the goal.
+
     Args:
-        world: World of the flight, which begins at the world's start, facing the goal.
-        profile: Profile of the vehicle.
         camera: Its depth camera; None for one with default settings.
-        system_id: MAVLink system id.
-        step_s: Physics step.
         autopilot: Real firmware in the place of the autopilot; None for our own.
         trusted: MAVLink systems that may command; empty for all.
         logs: Keep the truth of every tick for `save_truth`.
@@ -157,7 +155,7 @@ class Simulation:
         return self.camera.poll(self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
-        """Let the referee judge this tick; after a collision the vehicle falls and stays there."""
+        """After a collision the vehicle falls and stays there."""
         commander = self.autopilot.commander
         collision = self.referee.observe(
             self.stamp_us * 1e-6,

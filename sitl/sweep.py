@@ -235,10 +235,8 @@ def sweep(
     """Compute first contact and nearest approach of the body from pose 0 to pose 1.
 
     Args:
-        p0: Position (3,) at the start, m.
-        q0: Attitude (4,), body to world, at the start.
-        p1: Position (3,) at the end, m.
-        q1: Attitude (4,), body to world, at the end.
+        p0, p1: Positions (3,) at the start and the end, m.
+        q0, q1: Attitudes (4,) there, body to world.
         half: Half sides of the body (3,), m.
         boxes: Boxes (n, 6), m.
         least_m: Nearest approach so far, m. The search ignores larger distances.

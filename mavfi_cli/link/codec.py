@@ -136,7 +136,6 @@ class Signing:
 
 
 def _timestamp(frame: bytes) -> int:
-    """Return the timestamp of a signed frame."""
     return int.from_bytes(frame[-12:-6], "little")
 
 
@@ -259,12 +258,6 @@ def _kind(message_id: int) -> _Kind | None:
 
 class Codec:
     """Codec of one end of a link. It numbers the frames that it encodes.
-
-    Args:
-        system: Own system id, written into every frame.
-        component: Own component id.
-        signing: Signs outgoing frames and rejects incoming ones with a bad signature; None for
-            neither.
 
     Attributes:
         bad_bytes: Number of received bytes that belong to no frame.
@@ -403,9 +396,7 @@ _TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "s": "char"}
 def _message_class(number: int, name: str, crc_extra: int, **layout: str) -> Any:
     """Return a message class that the codec treats as one of the dialect's.
 
-    Args:
-        number, name, crc_extra: As in the definition.
-        layout: Fields with their codes of `struct`.
+    The layout has the fields with their codes of `struct`.
     """
     names = list(layout)
     types = [_TYPES[code[-1]] for code in layout.values()]

@@ -61,15 +61,8 @@ class Commands:
     """Commands of a session to the components of one system.
 
     Any number of submitted commands is under way. Beside them a phase of the session has one
-    request at a time, which is repeated until telemetry shows its effect.
-
-    Args:
-        system: Own system id.
-        component: Own component id. Acknowledgements for other components are ignored.
-        telemetry: Telemetry that shows the effect of commands.
-
-    Attributes:
-        now_s: Present stamp. Set it before any request.
+    request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the present
+    stamp, before any request. Acknowledgements for other systems and components are ignored.
     """
 
     def __init__(self, system: int, component: int, telemetry: Telemetry) -> None:
@@ -88,14 +81,9 @@ class Commands:
         unused: float = 0.0,
         refusals: int = 0,
     ) -> Ticket:
-        """Queue a COMMAND_LONG.
+        """Queue a COMMAND_LONG with its first parameters; the others are set to `unused`.
 
-        Args:
-            command: MAV_CMD number.
-            parameters: First of its seven parameters; the others are set to `unused`.
-            component: Component id of the receiver.
-            unused: Value of an unused parameter.
-            refusals: Number of temporary refusals after which the command is repeated, 1 s later.
+        After up to `refusals` temporary refusals the command is repeated, 1 s later.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(

@@ -82,7 +82,6 @@ class Endpoint:
         return opened
 
     def _refusal(self, error: OSError, address: str) -> str:
-        """Return why a socket cannot be bound or connected."""
         text = error.strerror or str(error)
         if self.scheme not in LISTENING:
             refused = "connection refused, nothing listens there"
@@ -172,9 +171,6 @@ def two_autopilots(address: str, rival_address: str) -> str:
 
 class SenderSlot(Generic[Sender]):
     """The place of one sender. Another one may take it after 5 s of silence.
-
-    Args:
-        clock: Monotonic clock, s.
 
     Attributes:
         holder: The sender that counts; None before the first.

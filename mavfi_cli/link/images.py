@@ -12,8 +12,9 @@ import math
 import re
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,8 @@ DEPTH_UNIT_M = 0.1
 NOTHING = 255  # pixel value where nothing was in range
 
 _OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
-_RECENT_PACKETS = 16  # packets that a frame announced after them may still claim
-_STRAY = 8  # messages that a packet comes off its due time before it is taken for a stray
+_FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
+_STRAY = 8  # messages between two copies of a packet, or by which those of a frame are spread
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
@@ -68,58 +69,25 @@ class ImageFrame:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Shape:
+class _Shape(NamedTuple):
     columns: int
     rows: int
     packets: int
     payload: int
 
-    @property
-    def size(self) -> int:
-        """Size of the image in bytes, one per pixel."""
-        return self.columns * self.rows
+
+@dataclass(slots=True)
+class _Announced:
+    """A frame that is not complete yet."""
+
+    index: int
+    stamp_s: float
+    checksum: int | None
+    due: int  # count of messages at which its first packet is due
+    trials_left: int = _TRIALS
 
 
-class _Assembly:
-    """A frame that was announced but is not complete yet."""
-
-    __slots__ = (
-        "announced", "checksum", "improved", "index", "near", "stamp_s", "trials_left",
-    )  # fmt: skip
-
-    def __init__(self, index: int, stamp_s: float, checksum: int | None, announced: int) -> None:
-        self.index = index
-        self.stamp_s = stamp_s
-        self.checksum = checksum
-        self.announced = announced  # count of messages at its announcement
-        self.near: dict[int, tuple[int, bytes]] = {}  # place -> how far off its due time, data
-        self.improved = False  # a packet came that no trial has seen
-        self.trials_left = _TRIALS
-
-    def offer(self, place: int, data: bytes, count: int, reach: int) -> None:
-        """Take the packet if it came nearer to when this frame's was due than any before."""
-        off = abs(count - (self.announced + 2 + place))
-        held = self.near.get(place)
-        if off > reach or (held is not None and held[0] <= off):
-            return
-        self.near[place] = (off, data)
-        self.improved = True
-
-    @property
-    def has_strays(self) -> bool:
-        """True if a packet came so far off its due time that it may be another frame's."""
-        return any(off > _STRAY for off, _ in self.near.values())
-
-    def image(self, packets: Iterable[bytes], shape: _Shape) -> bytes | None:
-        """The pixels of these packets, if the checksum agrees."""
-        self.improved = False
-        if self.trials_left <= 0:
-            return None
-        self.trials_left -= 1
-        image = b"".join([data[: shape.payload] for data in packets])[: shape.size]
-        agreed = self.checksum is None or zlib.crc32(image) == self.checksum
-        return image if agreed else None
+_Packet = tuple[int, bytes]  # count of messages at its arrival, data
 
 
 class ImageReceiver:
@@ -128,10 +96,10 @@ class ImageReceiver:
     A lost packet loses only its own frame. A frame whose checksum never matches is dropped.
     Memory is bounded by a few frames of MAX_PIXELS for any input.
 
-    The receiver checks two candidates against the checksum. The first takes for each place the
-    packet nearest to its due time after the announcement, which is right if neighbouring frames
-    interleave slightly. The second takes the newest packet of each place, which is right if one
-    frame is reordered in any way.
+    Once there are packets for all places, two candidates are checked against the checksum of each
+    announced frame. The first takes for each place the packet nearest to its due time after the
+    announcement, which is right if neighbouring frames interleave slightly. The second takes the
+    newest packet of each place, which is right if one frame is reordered in any way.
 
     Attributes:
         hfov_rad: Horizontal field of view of the camera; None until the camera reports it.
@@ -142,13 +110,10 @@ class ImageReceiver:
         self.hfov_rad: float | None = None
         self.received = 0
         self._shape: _Shape | None = None
-        self._places = _RECENT_PACKETS  # packets in a frame of this shape
-        self._reach = _RECENT_PACKETS  # a packet's largest distance from its due time, in messages
-        self._open: list[_Assembly] = []  # oldest first
+        self._places = _FIRST_PLACES  # packets in a frame of this shape
+        self._packets: dict[int, deque[_Packet]] = {}  # by place; the newest that no frame took
+        self._open: list[_Announced] = []  # oldest first
         self._count = 0  # messages of the protocol so far
-        self._recent: deque[tuple[int, int, bytes]] = deque(maxlen=_RECENT_PACKETS)
-        self._latest: dict[int, bytes] = {}  # place -> newest packet
-        self._fresh: set[int] = set()  # places with a packet since the last complete frame
         self._closed: deque[int] = deque(maxlen=_REMEMBERED)
         self._first: int | None = None  # first and newest index since the camera's start
         self._newest = 0
@@ -183,15 +148,11 @@ class ImageReceiver:
             return []
         match = _CHECKSUM.fullmatch(message.file_url)
         checksum = int(match[1], 16) if match else None
-        frame = _Assembly(message.image_index, stamp_s, checksum, self._count)
-        for count, place, data in self._recent:
-            if place < self._places:
-                frame.offer(place, data, count, self._reach)
-        self._open.append(frame)
+        self._open.append(_Announced(message.image_index, stamp_s, checksum, self._count + 2))
         self._open.sort(key=lambda each: each.index)
         while self._open and self._open[0].index <= self._newest - _OPEN_FRAMES:
             self._close(self._open[0])
-        return self._finish(self._open)
+        return self._finish()
 
     def _follow(self, index: int, stamp_s: float) -> bool:
         """Track the index. Return False for a frame that is known or too old.
@@ -222,45 +183,34 @@ class ImageReceiver:
         if shape is None:
             return []
         if shape != self._shape:
-            self._shape = shape
-            self._places, self._reach = shape.packets, shape.packets + 2
-            self._latest = {p: data for p, data in self._latest.items() if p < shape.packets}
-            self._fresh &= self._latest.keys()
-            for frame in self._open:
-                frame.near = {p: held for p, held in frame.near.items() if p < shape.packets}
-        return self._finish(self._open)
+            self._shape, self._places = shape, shape.packets
+            self._packets = {p: held for p, held in self._packets.items() if p < shape.packets}
+        return self._finish()
 
     def _packet(self, message: Message) -> list[ImageFrame]:
         place, data = message.seqnr, bytes(message.data)
         self._count += 1
         if place >= self._places:
             return []
-        self._recent.append((self._count, place, data))
-        self._latest[place] = data
-        self._fresh.add(place)
-        last = self._count - 1 - self._places  # announced then, a frame has had its time
-        ready = []
-        for frame in self._open:
-            frame.offer(place, data, self._count, self._reach)
-            whole = frame.improved and len(frame.near) == self._places
-            if whole and (frame.announced <= last or not frame.has_strays):
-                ready.append(frame)
-        if len(self._fresh) >= self._places:
-            ready = self._open
-        return self._finish(ready) if ready else []
+        held = self._packets.get(place)
+        if held is None:
+            held = self._packets[place] = deque(maxlen=_OPEN_FRAMES)
+        elif self._count - held[-1][0] <= _STRAY and held[-1][1] == data:
+            held.pop()  # the same packet twice
+        held.append((self._count, data))
+        return self._finish() if len(self._packets) >= self._places else []
 
-    def _finish(self, frames: list[_Assembly]) -> list[ImageFrame]:
-        """Close and return the complete ones of some open frames."""
-        shape = self._shape
-        if shape is None:
-            return []
+    def _finish(self) -> list[ImageFrame]:
+        """Close and return the complete ones of the open frames."""
         done = []
-        for frame in list(frames):
-            image = self._solve(frame, shape)
+        for frame in list(self._open):
+            shape = self._shape
+            if shape is None or len(self._packets) < shape.packets:
+                break
+            image = self._solve(frame, shape) if frame.trials_left > 0 else None
             if image is None:
                 continue
             self._close(frame)
-            self._fresh.clear()
             self.received += 1
             pixels = np.frombuffer(image, dtype=np.uint8).reshape(shape.rows, shape.columns)
             done.append(
@@ -270,29 +220,40 @@ class ImageReceiver:
             )
         return done
 
-    def _solve(self, frame: _Assembly, shape: _Shape) -> bytes | None:
+    def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
         """Return the pixels of the nearest or else the newest packets that match the checksum."""
-        places = range(shape.packets)
-        candidates = []
-        if len(frame.near) == shape.packets:
-            candidates.append([frame.near[place][1] for place in places])
-        if len(self._fresh) == shape.packets:
-            candidates.append([self._latest[place] for place in places])
-        for packets in candidates:
-            image = frame.image(packets, shape)
-            if image is not None:
-                self._forget(packets)
+        newest = [self._packets[place][-1] for place in range(shape.packets)]
+        nearest = [
+            min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])[1]
+            for place in range(shape.packets)
+        ]
+        for packets in (nearest,) if nearest == newest else (nearest, newest):
+            frame.trials_left -= 1
+            data = b"".join([data[: shape.payload] for _, data in packets])
+            image = data[: shape.columns * shape.rows]
+            if frame.checksum is None:
+                arrivals = [count for count, _ in packets]
+                agreed = max(arrivals) - min(arrivals) < shape.packets + _STRAY
+            else:
+                agreed = zlib.crc32(image) == frame.checksum
+            if agreed:
+                self._forget(frame, packets)
                 return image
         return None
 
-    def _forget(self, packets: Iterable[bytes]) -> None:
-        """Offer the packets of a complete frame to no other one."""
-        used = set(map(id, packets))
-        recent = [each for each in self._recent if id(each[2]) not in used]
-        self._recent.clear()
-        self._recent.extend(recent)
+    def _forget(self, frame: _Announced, packets: list[_Packet]) -> None:
+        """Keep the packets of a complete frame that are another one's by their due time.
 
-    def _close(self, frame: _Assembly) -> None:
+        Equal parts of pictures, such as the sky, may be swapped.
+        """
+        for place, packet in enumerate(packets):
+            held, since = self._packets[place], packet[0] - place
+            if abs(since - frame.due) <= min(abs(since - each.due) for each in self._open):
+                held.remove(packet)
+            if not held:
+                del self._packets[place]
+
+    def _close(self, frame: _Announced) -> None:
         self._open.remove(frame)
         self._closed.append(frame.index)
 
@@ -315,4 +276,4 @@ def _shape_of(message: Message) -> _Shape | None:
         return None
     if message.packets != -(-message.size // payload):
         return None
-    return _Shape(columns=columns, rows=rows, packets=message.packets, payload=payload)
+    return _Shape(columns, rows, message.packets, payload)

@@ -94,16 +94,13 @@ class OffboardSession:
     """Connects, arms, takes off, streams setpoints and lands.
 
     Args:
-        settings: Settings and time-outs.
         url: URL of the link, for error messages.
-        telemetry: Telemetry so far, if this session is not the first on its link.
+        telemetry: Newest telemetry of the autopilot, if this session is not the first on its link.
 
     Attributes:
-        phase: Present phase of the flight.
         failure: Cause of the phase FAILED; None before that.
         failsafe_text: Reason why the autopilot no longer follows (it changed its mode or disarmed);
             None while it follows. Never reset.
-        telemetry: Newest telemetry of the autopilot.
     """
 
     def __init__(
@@ -253,7 +250,6 @@ class OffboardSession:
             self._answer(dialect.MAVLink_timesync_message(own_ns, message.ts1))
 
     def _ping(self, message: Message) -> None:
-        """Reply to a request; the reply to one of our own needs none."""
         if message.target_system == message.target_component == 0:
             asker = (message.get_srcSystem(), message.get_srcComponent())
             self._answer(dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker))

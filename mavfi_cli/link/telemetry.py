@@ -146,13 +146,7 @@ class _Open(NamedTuple):
 
 
 class _TextCollector:
-    """Collects texts.
-
-    Attributes:
-        texts: The newest thousand.
-        total: Number of all.
-        open: Texts whose chunks have not all come, by system, component and id.
-    """
+    """Collects texts: the newest thousand, the number of all, and those with missing chunks."""
 
     def __init__(self) -> None:
         self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
@@ -364,7 +358,6 @@ class Telemetry:
 
 
 def _name(enum: str, number: int) -> str:
-    """Return the name of a MAVLink enumeration's value, or the enumeration and the number."""
     entry = dialect.enums[enum].get(number)
     return f"{enum} {number}" if entry is None else str(entry.name)
 

@@ -70,7 +70,6 @@ class _TlogWriter:
             raise self._error(error) from None
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
-        """Record frames, sent or received, at a stamp."""
         time_us = self._epoch_us + round(stamp_s * 1e6)
         records = time_us.to_bytes(8, "big").join([b"", *frames])
         self._pending.append(records)
@@ -115,7 +114,6 @@ class RecordedLink:
 
     Args:
         transport: Open transport. Its opener closes it.
-        system, component: MAVLink ids of this end.
         signing: Signs sent frames and refuses received ones without a good signature.
         clock: Unix time, s, to record in place of the stamps.
     """

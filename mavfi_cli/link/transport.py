@@ -471,7 +471,6 @@ class _UdpListener(_SocketOwner):
         return fresh
 
     def pump(self) -> None:
-        """Distribute the waiting datagrams to their peers."""
         judged = 0
         for _ in range(_PUMPED):
             data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)

@@ -29,15 +29,11 @@ class Autopilot:
 
     At each stamp, call `observe` with the vehicle's state, `collect` for the messages of each link,
     `handle` for each received message, then `fly`. `setpoint` (11,) and `motors_on` hold until the
-    next stamp.
+    next stamp. `restart_asked` is True once a client has asked for a reboot; the owner restarts.
 
     Args:
         truth: Vehicle state before the first `observe`.
-        system_id: MAVLink system id.
         trusted: MAVLink systems that may command; empty for all.
-
-    Attributes:
-        restart_asked: True once a client has asked for a reboot. The owner restarts.
     """
 
     def __init__(self, truth: Truth, *, system_id: int = 1, trusted: Sequence[int] = ()) -> None:
@@ -84,23 +80,13 @@ class Autopilot:
         """Return all due messages of a link at the newest stamp: answers, then streams."""
         for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
             link.send(self.parameters.message(link.parameters_left.popleft()))
-        due = link.due(self.snapshot.stamp_us, self.snapshot)
-        if not link.outbox:
-            return due
-        messages, link.outbox = link.outbox, []
-        messages += due
-        return messages
+        return link.take() + link.due(self.snapshot)
 
     def collect_between(self, link: Link, stamp_us: int) -> list[Any]:
         """Return the messages of a link's fast streams at a stamp between two ticks."""
         tick_us, self.snapshot.stamp_us = self.snapshot.stamp_us, stamp_us
-        messages = link.due_between(stamp_us, self.snapshot)
+        messages = link.due(self.snapshot, between_ticks=True)
         self.snapshot.stamp_us = tick_us
-        return messages
-
-    def take_outbox(self, link: Link) -> list[Any]:
-        """Return answers and texts only, for a link that is served between ticks."""
-        messages, link.outbox = link.outbox, []
         return messages
 
     # Requests of clients.
@@ -281,12 +267,9 @@ _Sender = tuple[Link, int, int]  # link, system, component
 class _Authority:
     """Decides whose commands and whose setpoints count.
 
-    Commands of every trusted system count. Setpoints of one sender count at a time: of the first
-    that sends them, until it has been silent for as long as OFFBOARD tolerates.
-
-    Args:
-        trusted: MAVLink systems that may command; empty for all.
-        say: Queues a status text for every client.
+    Commands of every trusted system count, of all if none is named. Setpoints of one sender count
+    at a time: of the first that sends them, until it has been silent for as long as OFFBOARD
+    tolerates.
     """
 
     def __init__(self, trusted: Sequence[int], say: Callable[[Severity, str], None]) -> None:
@@ -309,13 +292,9 @@ class _Authority:
         return False
 
     def follows(self, message: Any, link: Link, stamp_us: int, silence_us: float) -> bool:
-        """Return True if a setpoint counts, and remember its sender.
+        """Return True if a valid setpoint counts, and remember its sender.
 
-        Args:
-            message: Valid setpoint.
-            link: Link on which it arrived.
-            stamp_us: Boot clock, us.
-            silence_us: Time after which another sender may take over.
+        After `silence_us` another sender may take over.
         """
         sender = (link, message.get_srcSystem(), message.get_srcComponent())
         if self._holder not in (None, sender):
@@ -332,7 +311,6 @@ class _Authority:
         return "" if self._holder is None else _name(self._holder)
 
     def _tell(self, sender: _Sender, text: str) -> None:
-        """Say a text once for each sender."""
         if sender not in self._told:
             if len(self._told) >= _TOLD:
                 self._told.clear()

@@ -79,11 +79,6 @@ class Severity(IntEnum):
     INFO = 6
 
 
-def _is_still(truth: Truth) -> bool:
-    velocity = truth.velocity_ned_mps
-    return bool(abs(velocity[0]) + abs(velocity[1]) + abs(velocity[2]) < _STILL_MPS)
-
-
 class Result(IntEnum):
     """MAV_RESULT."""
 
@@ -162,16 +157,15 @@ class Commander:
     @property
     def system_status(self) -> int:
         """HEARTBEAT.system_status."""
-        status: int = dialect.MAV_STATE_UNINIT
-        if self.terminated:
-            status = dialect.MAV_STATE_FLIGHT_TERMINATION
-        elif self.failsafe is not None:
-            status = dialect.MAV_STATE_CRITICAL
-        elif self.armed:
-            status = dialect.MAV_STATE_ACTIVE
-        elif self.can_arm:
-            status = dialect.MAV_STATE_STANDBY
-        return status
+        for holds, status in (
+            (self.terminated, dialect.MAV_STATE_FLIGHT_TERMINATION),
+            (self.failsafe is not None, dialect.MAV_STATE_CRITICAL),
+            (self.armed, dialect.MAV_STATE_ACTIVE),
+            (self.can_arm, dialect.MAV_STATE_STANDBY),
+        ):
+            if holds:
+                return int(status)
+        return int(dialect.MAV_STATE_UNINIT)
 
     @property
     def landed_state(self) -> int:
@@ -257,13 +251,7 @@ class Commander:
     # Updates over time.
 
     def update(self, stamp_us: int, truth: Truth, *, wants_up: bool) -> None:
-        """Advance to a stamp with the newest state of the vehicle.
-
-        Args:
-            stamp_us: Boot clock, us.
-            truth: Vehicle state.
-            wants_up: True if the active setpoint climbs.
-        """
+        """Advance to a stamp. `wants_up` is True if the active setpoint climbs."""
         self.stamp_us = stamp_us
         self._detect_landing(truth, wants_up=wants_up)
         if self.armed:
@@ -279,7 +267,9 @@ class Commander:
     def _detect_landing(self, truth: Truth, *, wants_up: bool) -> None:
         """Update `landed`, with PX4's LNDMC_TRIG_TIME as hysteresis."""
         before = self.landed
-        if self.landed or not truth.on_ground or wants_up or not _is_still(truth):
+        north, east, down = map(abs, truth.velocity_ned_mps)
+        moves = not north + east + down < _STILL_MPS
+        if self.landed or not truth.on_ground or wants_up or moves:
             self.landed = self.landed and truth.on_ground
             self._settled_us = None
         else:

@@ -243,8 +243,6 @@ def begin(
     """Return the guidance of a mode at its entry.
 
     Args:
-        mode: Entered mode.
-        now: State of the autopilot.
         takeoff_down_m: Height of a TAKEOFF; NaN is MIS_TAKEOFF_ALT above home.
         hold: Position (3,), NED, and yaw of a LOITER; None stops here.
         finished: Called with the position to hold (3,) at the end of a TAKEOFF.

@@ -34,12 +34,10 @@ class _Parameter(NamedTuple):
 
     @property
     def is_integer(self) -> bool:
-        """True for an INT32, False for a REAL32."""
         return isinstance(self.default, int)
 
     @property
     def wire_type(self) -> int:
-        """MAV_PARAM_TYPE."""
         return TYPE_INT32 if self.is_integer else TYPE_REAL32
 
     def packed(self, value: float) -> bytes:

@@ -57,7 +57,6 @@ def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _acknowledge(message: Any, number: int, result: Result) -> Any:
-    """Return the COMMAND_ACK of a command number to the sender of a message."""
     return dialect.MAVLink_command_ack_message(number, int(result), 0, 0, *_sender(message))
 
 
@@ -75,7 +74,6 @@ def refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _whole(value: float) -> int | None:
-    """Return an integer parameter; None if it is not an integer."""
     return int(value) if math.isfinite(value) and value == int(value) else None
 
 
@@ -280,12 +278,8 @@ def setpoint_of(
 ) -> Setpoint | str:
     """Return the setpoint of a SET_POSITION_TARGET message, or in words what is not supported.
 
-    Args:
-        message: _LOCAL_NED with frame LOCAL_NED, or BODY_NED, which is rotated by the heading; or
-            _GLOBAL_INT with altitude above sea or home.
-        heading_rad: Present heading of the vehicle from north.
-        origin: Geographic origin of the local frame.
-        home_down_m: Height of home as local down.
+    A BODY_NED setpoint is rotated by the heading (rad, from north). The altitude of a global one is
+    above sea or home.
     """
     frame, mask = message.coordinate_frame, message.type_mask
     is_local = message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
@@ -388,7 +382,7 @@ def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Store a value, answer on this link, and broadcast a change to all."""
+    """Answer on this link, and broadcast a change to all."""
     if message.param_id == HASH_NAME:
         link.parameters_left.clear()  # the client's cache is valid and needs no list
         return

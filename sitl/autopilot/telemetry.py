@@ -433,9 +433,6 @@ class _Stream:
 class Link:
     """The autopilot's end of one connection, without a socket, and its telemetry streams.
 
-    Args:
-        preset: Default rates of the client.
-
     Attributes:
         in_lockstep: Simulated time stands still while the client thinks.
         outbox: Pending messages, oldest first.
@@ -459,6 +456,11 @@ class Link:
         if len(self.outbox) >= _OUTBOX:
             del self.outbox[0]
         self.outbox.append(message)
+
+    def take(self) -> list[Any]:
+        """Return the pending messages, which are then sent."""
+        messages, self.outbox = self.outbox, []
+        return messages
 
     def interval_us(self, message_id: int) -> int | None:
         """Return the interval of a message; 0 if it is not streamed, None if unknown."""
@@ -490,17 +492,13 @@ class Link:
         """True if a stream has an interval below a tick."""
         return bool(self._fast)
 
-    def due(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
-        """Return the messages due at a tick. A late stream skips missed messages."""
-        return self._due(self._active, stamp_us, snapshot)
+    def due(self, snapshot: Snapshot, *, between_ticks: bool = False) -> list[Any]:
+        """Return the messages due now, between two ticks those of the fast streams only.
 
-    def due_between(self, stamp_us: int, snapshot: Snapshot) -> list[Any]:
-        """Return the messages of fast streams due at a stamp between two ticks."""
-        return self._due(self._fast, stamp_us, snapshot)
-
-    def _due(self, streams: Sequence[_Stream], stamp_us: int, snapshot: Snapshot) -> list[Any]:
-        messages = []
-        for stream in streams:
+        A late stream skips missed messages.
+        """
+        stamp_us, messages = snapshot.stamp_us, []
+        for stream in self._fast if between_ticks else self._active:
             if stream.due_us > stamp_us:
                 continue
             stream.due_us += stream.interval_us

@@ -60,7 +60,6 @@ class _Schedule:
         return True
 
     def restart(self) -> None:
-        """Make it due at the next poll."""
         self._first_s, self._count = None, 0
 
 
@@ -69,9 +68,6 @@ class Camera:
 
     Args:
         world_boxes: (n, 6) xmin ymin zmin xmax ymax zmax, ENU m.
-        columns: Image width, pixels.
-        rows: Image height, pixels.
-        hfov_rad: Horizontal field of view, rad.
         mount_offset_flu_m: Offset of the optical centre from the vehicle's position.
         rate_hz: Default frame rate, at most 50 Hz.
         heartbeat_hz: Heartbeats per second; 0 for none.
@@ -193,7 +189,7 @@ class Camera:
         return [captured, handshake, *data]
 
     def _command(self, message: Message) -> list[Message]:
-        """Return the answer to a command: requested messages, then the acknowledgement."""
+        """Requested messages come before the acknowledgement."""
         number = int(message.command)
         answers: list[Message] = []
         if number == dialect.MAV_CMD_REQUEST_MESSAGE or number in _LEGACY_REQUESTS:
@@ -242,7 +238,7 @@ class Camera:
         return int32(latitude * 1e7), int32(longitude * 1e7), altitude
 
     def _act(self, number: int, message: Message) -> int:
-        """Carry out a command. Return its MAV_RESULT."""
+        """Return the MAV_RESULT of a command."""
         result: int = dialect.MAV_RESULT_ACCEPTED
         if number == dialect.MAV_CMD_IMAGE_START_CAPTURE:
             result = self._start_capture(message)

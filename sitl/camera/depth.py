@@ -55,12 +55,8 @@ def render_depth(
         position_enu_m: Optical centre (3,). The depth is zero everywhere if it is inside a box, or
             below the ground and looking down. A pose that is not finite sees nothing.
         quaternion_flu_enu: Unit quaternion (4,) w x y z, camera forward-left-up to ENU.
-        columns: Image width, at least 1.
-        rows: Image height, at least 1.
-        hfov_rad: Horizontal field of view, between 0 and pi, rad.
-
-    Raises:
-        ValueError: The image size or field of view is invalid.
+        columns, rows: Size of the image, at least 1.
+        hfov_rad: Horizontal field of view, between 0 and pi.
     """
     if columns < 1 or rows < 1 or not 0.0 < hfov_rad < math.pi:
         raise ValueError(f"no camera has {columns} x {rows} pixels and {hfov_rad} rad")

@@ -32,8 +32,6 @@ class _Linked(Peer):
     """An autopilot, companion or ground station on one of the links.
 
     Args:
-        transport: Its connection.
-        router: Hears its messages.
         slots: Place of the autopilot of each system at the peer's endpoint.
         awaits_frames: False for a companion that has started the camera, until it speaks.
     """
@@ -51,7 +49,6 @@ class _Linked(Peer):
         self._codec = Codec(0, 0, signing=router.signing)
 
     def take(self, data: bytes) -> list[Any]:
-        """Handle received bytes. Return the messages in them."""
         messages = self._codec.decode(data, datagram=self.transport.datagram)
         self.awaits_frames = self.awaits_frames or bool(messages)
         for message in messages:
@@ -59,12 +56,10 @@ class _Linked(Peer):
         return messages
 
     def forward(self, *, frame: bytes, of: Peer) -> None:
-        """See `Peer`."""
         if self.awaits_frames:
             super().forward(frame=frame, of=of)
 
     def close(self) -> None:
-        """Close the connection and leave every place."""
         super().close()
         for slot in self.slots.values():
             slot.leave(self)
@@ -74,22 +69,13 @@ class Router:
     """Joins the peers of several endpoints, and is the camera component among them.
 
     Two autopilots of the same system id at one endpoint would be one vehicle that jumps. The frames
-    of the second are dropped, and a STATUSTEXT tells both senders.
-
-    Args:
-        urls: Endpoints to open. The autopilot may be on any of them.
-        signing: Signs what the camera sends and refuses frames without a good signature. Frames
-            of others keep their own signatures.
-        allow_unsigned: Allow unsigned links beyond this machine.
-        clock: Monotonic clock in seconds.
+    of the second are dropped, and a STATUSTEXT tells both senders. Frames of others keep their own
+    signatures. An endpoint that cannot be opened raises LinkError.
 
     Attributes:
         codec: Encoder of the camera's messages.
         peers: Everybody on the links.
         take: Handles a message. Returns True if it goes to the other peers, too.
-
-    Raises:
-        LinkError: An endpoint cannot be opened.
     """
 
     def __init__(
@@ -249,12 +235,7 @@ class Witness:
     """Collision, clearance and energy of a foreign vehicle, as far as its pose tells them.
 
     The record begins when the vehicle arms. The energy is that of the regression; the power of the
-    propellers is not known.
-
-    Args:
-        world: World of the flight.
-        profile: Stands for the vehicle: its body box and its energy regression.
-        logs: Keep a row for each pose, for `save`.
+    propellers is not known. The profile's body box and regression stand for the vehicle's.
     """
 
     def __init__(self, world: World, profile: VehicleProfile, *, logs: bool) -> None:
@@ -286,14 +267,7 @@ class Witness:
     def observe(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector, velocity: Vector
     ) -> Collision | None:
-        """Judge a pose in the world. Return the first collision of a flight, once.
-
-        Args:
-            stamp_s: Boot clock of the vehicle.
-            position_enu_m: (3,)
-            quaternion_flu_enu: (4,)
-            velocity: (3,) ENU, m/s.
-        """
+        """Judge a pose at a stamp of the boot clock. Return a flight's first collision, once."""
         if self._stamp_s is not None and stamp_s <= self._stamp_s:
             if stamp_s > self._stamp_s - 1.0:
                 return None
@@ -330,9 +304,6 @@ class Station:
     """Camera, referee and links of one autopilot.
 
     Args:
-        camera: Camera component, whose system id is set to the autopilot's.
-        tracker: Tracker of the vehicle's pose.
-        router: Links. The autopilot may be on any of them.
         witness: Judges the poses; None without a referee.
         origin_given: The tracker's origin holds. Otherwise another camera of ours on the link,
             whose vehicle is simulated, knows a better one.

@@ -39,11 +39,7 @@ _SPIN_MIN, _SPIN_ARM = 0.05, 0.03  # throttles of the rotors in flight and on th
 
 
 class ArduPilotLink:
-    """One ArduPilot on the JSON backend.
-
-    Args:
-        sensors: Sensors of the vehicle.
-        port: UDP port that ArduPilot sends to; 0 for any.
+    """One ArduPilot on the JSON backend, which sends to a UDP port; 0 for any.
 
     Raises:
         LinkError: The port cannot be opened.

@@ -51,8 +51,6 @@ class FirmwareAutopilot:
     that its positions are world coordinates.
 
     Args:
-        transport: Link to the firmware.
-        system_id: System id of the firmware.
         echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
             has been read before simulated time goes on.
 
@@ -99,10 +97,7 @@ class FirmwareAutopilot:
 
     def collect(self, link: Link) -> list[Any]:
         """Return the messages for a client since the last call."""
-        messages, link.outbox = link.outbox, []
-        return messages
-
-    take_outbox = collect
+        return link.take()
 
     def forget(self) -> None:
         """Drop what no client has collected."""
@@ -234,8 +229,6 @@ class FirmwareProcess:
     """A running firmware. Its folder and everything that it started end with it.
 
     Args:
-        binary: The program.
-        arguments: Command line after the program.
         folder: Working folder, removed at the end.
         environment: Additions to the environment.
 

@@ -65,16 +65,7 @@ mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
 
 
 class Px4Link:
-    """One PX4 on the simulator link.
-
-    Args:
-        transport: End of the TCP connection that PX4 calls.
-        sensors: Sensors of the vehicle.
-        port: TCP port of the connection.
-
-    Attributes:
-        port: TCP port of the connection, which numbers the instances of PX4.
-    """
+    """One PX4 on the simulator link. The port of its connection numbers the instances of PX4."""
 
     step_s = STEP_S
     settle_s = SETTLE_S
@@ -140,12 +131,7 @@ class Px4Link:
     ) -> FirmwareProcess:
         """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
 
-        Args:
-            binary: The program.
-            parameters: Those of the vehicle, set before it starts.
-            system_id: Its MAVLink system id.
-            mavlink_port: UDP port to which it sends MAVLink.
-            heading_deg: Unused. The magnetometer tells PX4 its heading.
+        Its MAVLink goes to a UDP port. The magnetometer tells PX4 its heading.
 
         Raises:
             VehicleProcessError: It cannot be started.

@@ -43,9 +43,6 @@ class Sensors:
     """Gyroscope, accelerometer, magnetometer, barometer and GPS of one vehicle.
 
     The same seed and the same calls give the same measurements.
-
-    Args:
-        seed: Seed of the noise.
     """
 
     def __init__(self, seed: int) -> None:

@@ -41,13 +41,10 @@ class FirmwareSimulation(Simulation):
     from where the vehicle truly was at the stamp of the newest state.
 
     Args:
-        world: World of the flight.
-        profile: Profile of the vehicle.
         kind: Which firmware, one of LINKS.
         binary: Its SITL program, which `close` ends; None if somebody else starts it.
         seed: Seed of the sensors' noise.
         url: Link on which a firmware that somebody else starts sends its MAVLink.
-        system_id: MAVLink system id of the firmware.
         options: Further arguments of `Simulation`.
 
     Raises:

@@ -425,12 +425,6 @@ def mix(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
 
 
 @compiled
-def _idle(gains: Vector) -> Vector:
-    """Return the motor commands (4,) of an armed vehicle on the ground."""
-    return np.full(4, throttle(IDLE_SHARE, gains))
-
-
-@compiled
 def _resting_state(measurement: Vector, matrix: Vector) -> Vector:
     """Return the controller state (n,) on the ground: zero integrals, references at rest."""
     state = np.zeros(STATE_SIZE)
@@ -458,7 +452,7 @@ def control_step(
     on_ground = measurement[M_ON_GROUND] > 0.5
     climbing = target[2] < -LIFT_OFF_MPS
     if on_ground and not climbing:
-        return _resting_state(measurement, matrix), _idle(gains)
+        return _resting_state(measurement, matrix), np.full(4, throttle(IDLE_SHARE, gains))
     new = state.copy() if state[S_FLYING] > 0.5 else _resting_state(measurement, matrix)
     new[S_FLYING] = 1.0
     acceleration = acceleration_target(target, clean, measurement, new, gains)

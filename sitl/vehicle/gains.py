@@ -145,12 +145,9 @@ class RateLoops:
     def parameters(
         self, pattern: str, axes: Sequence[str], shares: Sequence[float]
     ) -> dict[str, float]:
-        """Return the gains by their names, such as "MC_{axis}RATE_{term}".
+        """Return the gains by names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
 
-        Args:
-            pattern: Name of a gain, with places for axis and term.
-            axes: Names of roll, pitch and yaw.
-            shares: Share of `tilt_nm` or `yaw_nm` that full command gives round each axis (3,).
+        A share is that of `tilt_nm` or `yaw_nm` which full command gives round its axis.
         """
         full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
         return {

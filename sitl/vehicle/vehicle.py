@@ -232,7 +232,6 @@ def _refresh(
     armed: bool,
     truth: Vector,
 ) -> None:
-    """Update `truth` in place after a step of `dt_s`."""
     _observe_motion(raw, dt_s, truth)
     for rotor in range(4):
         truth[T_COMMANDS + rotor] = commands[rotor]

@@ -73,7 +73,9 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> Wo
         start_clearance_m=float(start_gaps.min(initial=math.inf)),
         goal_clearance_m=float(goal_gaps.min(initial=math.inf)),
         straight_m=float(np.hypot(*plan)),
-        path_m=None if found is None else _length_m(path),
+        path_m=None
+        if found is None
+        else float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         path_enu_m=path,
     )
 
@@ -121,7 +123,10 @@ def _shortest(
     while queue:
         _, here = heapq.heappop(queue)
         if here == goal:
-            return _trace(parent, goal)
+            cells = [goal]
+            while cells[-1] in parent:
+                cells.append(parent[cells[-1]])
+            return cells[::-1]
         if here in closed:
             continue
         closed.add(here)
@@ -135,15 +140,6 @@ def _shortest(
                 parent[there] = here
                 heapq.heappush(queue, (cost + math.dist(there, goal), there))
     return None
-
-
-def _trace(
-    parent: dict[tuple[int, int], tuple[int, int]], goal: tuple[int, int]
-) -> list[tuple[int, int]]:
-    cells = [goal]
-    while cells[-1] in parent:
-        cells.append(parent[cells[-1]])
-    return cells[::-1]
 
 
 def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -162,14 +158,9 @@ def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int
 
 
 def _sees(free: Mask, a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Return True if every cell on the straight line between two cells is free."""
     count = 4 * max(abs(b[0] - a[0]), abs(b[1] - a[1])) + 1
     line = np.rint(np.linspace(a, b, count)).astype(int)
     return bool(free[line[:, 0], line[:, 1]].all())
-
-
-def _length_m(path: Vector) -> float:
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 _GROUND = "#fbfbf9"
@@ -180,14 +171,10 @@ _WIDTH_IN = 5.2
 
 
 def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
-    """Return the SVG of a world from above, east to the right and north up, axes in m.
+    """Return the SVG of a world from above, with a path (n, 3) if given; axes in m.
 
     Boxes that end 1 m or more below the goal's height are green, because the flight passes over
     them. The same world gives the same bytes.
-
-    Args:
-        world: World to draw.
-        path_enu_m: Path (n, 3) from start to goal to draw, or None.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -120,11 +120,7 @@ class World:
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
-        """Write what a companion knows before the first message: start, goal, bounds and camera.
-
-        Args:
-            camera_mount_flu_m: Offset of the camera from the vehicle's position (3,).
-            folder: Where `briefing.json` is written.
+        """Write what a companion knows before the first message, into `briefing.json` of a folder.
 
         Raises:
             RecordError: The file cannot be written.
@@ -178,13 +174,9 @@ def load_world(
     start_enu_m: Sequence[float] | Vector | None = None,
     goal_enu_m: Sequence[float] | Vector | None = None,
 ) -> World:
-    """Load a world by name, `gen:density,size` or TOML file for one seed.
+    """Load a world by name, `gen:density,size` or path of a TOML file, for one seed.
 
-    Args:
-        name_or_path: One of `named_worlds()`, a generator spec, or a path ending in `.toml`.
-        seed: Non-negative seed. The same seed always gives the same world.
-        start_enu_m: Start of the flight (3,), m; default: the world's own.
-        goal_enu_m: Goal of the flight (3,), m; default: the world's own.
+    The same seed always gives the same world. Start and goal (3,), ENU m, replace the world's own.
 
     Raises:
         UnknownName: No world has this name. Suggests the nearest.
@@ -278,9 +270,6 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
     """Generate a world between a start (3,) and a goal (3,), ENU m.
 
     The area contains start and goal with a margin of at least 20 m, in whole cells.
-
-    Raises:
-        WorldError: Start and goal are more than 1000 m apart along an axis, or unusable.
     """
     places = np.array([start, goal])
     if (np.ptp(places, axis=0) > _MAX_SPAN_M).any():
@@ -354,11 +343,7 @@ def _shipped(name: str) -> _Scene:
 def _world_of_scene(
     scene: _Scene, name: str, seed: int, start: Vector | None, goal: Vector | None
 ) -> World:
-    """Return the world of a scene. A given start or goal replaces the scene's own.
-
-    Raises:
-        WorldError: Start or goal is unusable, or the seed finds no clear position for it.
-    """
+    """A given start or goal replaces the scene's own."""
     boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():
@@ -385,7 +370,6 @@ def _choose(
     start: Vector | None,
     goal: Vector | None,
 ) -> tuple[Vector, Vector]:
-    """Draw missing start and goal until they are clear and at the scene's distance."""
     stream = Stream.WORLD.generator(seed, "places", scene.name)
     least, most = scene.goal_distance_m
     low, high = bounds[:2] + CLEAR_RADIUS_M, bounds[3:5] - CLEAR_RADIUS_M

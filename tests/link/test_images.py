@@ -239,10 +239,8 @@ def test_hostile_streams_stay_within_bounds(noise: random.Random) -> None:
             data = [noise.randrange(256)] * PAYLOAD
             place = noise.choice([noise.randrange(65_536), noise.randrange(20)])
             _feed(receiver, [dialect.MAVLink_encapsulated_data_message(place, data)])
-        held = sum(len(frame.near) for frame in receiver._open) + len(receiver._latest)
-        limit = (images_module._OPEN_FRAMES + 1) * (MAX_PIXELS // PAYLOAD + 1)
-        assert held <= limit
-        assert len(receiver._recent) <= images_module._RECENT_PACKETS
+        limit = images_module._OPEN_FRAMES * (MAX_PIXELS // PAYLOAD + 1)
+        assert sum(map(len, receiver._packets.values())) <= limit
         assert len(receiver._open) <= images_module._OPEN_FRAMES
 
 

@@ -17,7 +17,7 @@ def test_requested_message_comes_before_its_ack(bench, number):
     bench.run(4.0)
     bench.received.clear()
     bench.command(REQUEST, number)
-    order = [m.get_msgId() for m in bench.autopilot.take_outbox(bench.link)]
+    order = [m.get_msgId() for m in bench.link.take()]
     assert order == [number, d.MAVLINK_MSG_ID_COMMAND_ACK]
 
 
@@ -101,7 +101,7 @@ def test_rates_belong_to_one_client(bench):
 def test_answers_go_to_who_asked_and_texts_to_all(bench):
     other = bench.autopilot.open_link(Preset.LOCKSTEP)
     bench.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1)
-    kinds = [m.get_type() for m in bench.autopilot.take_outbox(other)]
+    kinds = [m.get_type() for m in other.take()]
     assert set(kinds) == {"STATUSTEXT"}
     assert bench.acks() == [(400, 1)]
 
