@@ -29,7 +29,8 @@ NOTHING = 255  # pixel value where nothing was in range
 
 _OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
 _FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
-_STRAY = 8  # messages between two copies of a packet, or by which those of a frame are spread
+_COPY = 4  # largest number of messages from a packet to its copy
+_STRAY = 8  # messages of others among those of a frame without a checksum
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
@@ -195,7 +196,7 @@ class ImageReceiver:
         held = self._packets.get(place)
         if held is None:
             held = self._packets[place] = deque(maxlen=_OPEN_FRAMES)
-        elif self._count - held[-1][0] <= _STRAY and held[-1][1] == data:
+        elif self._count - held[-1][0] <= _COPY and held[-1][1] == data:
             held.pop()  # the same packet twice
         held.append((self._count, data))
         return self._finish() if len(self._packets) >= self._places else []
