@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import changed, chosen, flags, known, numbers, paired
+from mavfi_cli.analysis.flights import changed, chosen, errors, flags, flown, known, numbers, paired
 from mavfi_cli.analysis.overhead import TIMES, ComputeOverhead
 from mavfi_cli.campaigns.detector_plans import TRAINING_WORLDS, TrainingPlan
 from mavfi_cli.campaigns.missions import PlannedMission
@@ -40,8 +40,6 @@ from mavfi_cli.vpm.model import (
     ModelInputs,
     ModelVehicle,
     Scheme,
-    named,
-    outcome,
     safe_velocity_mps,
 )
 from mavfi_cli.vpm.report import Choices
@@ -54,11 +52,74 @@ class FlightPlan:
     Attributes:
         mission: configuration without world and seed.
         files: TOML files of the mission, by path.
+        braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
+        rotors_w: electrical hover power with all boards.
+        boards_w: power of all boards.
+        cut: values of the model that exceed the limits of a mission, in words.
     """
 
     mission: MissionConfig
     files: Mapping[Path, str]
-    limits: SchemeLimits
+    braking_velocity_mps: float
+    rotors_w: float
+    boards_w: float
+    cut: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        setting: ModelInputs,
+        scheme: Scheme,
+        platform: PlatformProfile,
+        chain_s: float,
+        folder: Path,
+        models: Path | None = None,
+        stack: str = DEFAULT,
+    ) -> FlightPlan:
+        """The mission that flies a scheme at the model's safe velocity.
+
+        Args:
+            platform: platform whose latencies are scaled to the model's response time.
+            chain_s: response time of that platform in the model.
+            folder: absolute path of the folder for the files.
+            models: folder of model files NAME.json; None takes the shipped ones.
+
+        Raises:
+            CannotLift: the rotors cannot lift this many boards.
+            ConfigError: the model's numbers are not valid for a mission.
+            ModelError: the folder lacks the detector's model.
+        """
+        flown, boards_w = setting.performance(scheme), scheme.copies * setting.board.power_w
+        velocity, cut_v = _within("v_max_mps", flown["velocity_mps"], "velocity", "m/s")
+        accel, cut_a = _within("a_max_mps2", flown["acceleration_mps2"], "acceleration", "m/s²")
+        range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
+        rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
+        stem = folder_name(f"{setting.vehicle.name}-{scheme.name}")
+        vehicle = _file(folder, stem, _vehicle(setting, scheme, accel))
+        factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
+        board = _file(folder, folder_name(f"{stem}-{platform.name}"), _platform(platform, factor))
+        watched = scheme.name in DETECTORS
+        mission = MissionConfig(
+            vehicle=str(vehicle[0]),
+            platform=str(board[0]),
+            stack=stack,
+            v_max_mps=velocity,
+            a_max_mps2=accel,
+            map_range_m=range_m,
+            camera_rate_hz=rate_hz,
+            detector=DetectorConfig.with_model(scheme.name, models) if watched else None,
+        )
+        response_s = setting.response_s(scheme.overhead)
+        return cls(
+            mission=mission,
+            files=dict((vehicle, board)),
+            braking_velocity_mps=safe_velocity_mps(
+                BRAKE_SHARE * accel, response_s, setting.range_m
+            ),
+            rotors_w=flown["power_w"] - boards_w,
+            boards_w=boards_w,
+            cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
+        )
 
     def write(self) -> None:
         """Write the files.
@@ -71,61 +132,20 @@ class FlightPlan:
                 path.parent.mkdir(parents=True, exist_ok=True)
             write_text(path, text)
 
+    def measured(self, name: str, flights: pa.Table) -> FloatArray:
+        """A quantity of MODEL for each flight, (n,); NaN if a flight has none.
 
-def flight_plan(
-    setting: ModelInputs,
-    scheme: Scheme,
-    platform: PlatformProfile,
-    chain_s: float,
-    folder: Path,
-    models: Path | None = None,
-    stack: str = DEFAULT,
-) -> FlightPlan:
-    """The mission that flies a scheme at the model's safe velocity.
-
-    Args:
-        platform: platform whose latencies are scaled to the model's response time.
-        chain_s: response time of that platform in the model.
-        folder: absolute path of the folder for the files.
-        models: folder of model files NAME.json; None takes the shipped ones.
-
-    Raises:
-        CannotLift: the rotors cannot lift this many boards.
-        ConfigError: the model's numbers are not valid for a mission.
-        ModelError: the folder lacks the detector's model.
-    """
-    flown = outcome(setting, scheme)
-    boards_w = scheme.copies * setting.board.power_w
-    velocity_mps, cut_v = _within("v_max_mps", flown.velocity_mps, "velocity", "m/s")
-    accel_mps2, cut_a = _within("a_max_mps2", flown.acceleration_mps2, "acceleration", "m/s²")
-    range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
-    rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
-    stem = folder_name(f"{setting.vehicle.name}-{scheme.name}")
-    vehicle = _file(folder, stem, _vehicle(setting, scheme, accel_mps2))
-    factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
-    computer = _file(folder, folder_name(f"{stem}-{platform.name}"), _platform(platform, factor))
-    watched = scheme.name in DETECTORS
-    mission = MissionConfig(
-        vehicle=str(vehicle[0]),
-        platform=str(computer[0]),
-        stack=stack,
-        v_max_mps=velocity_mps,
-        a_max_mps2=accel_mps2,
-        map_range_m=range_m,
-        camera_rate_hz=rate_hz,
-        detector=DetectorConfig.with_model(scheme.name, models) if watched else None,
-    )
-    limits = SchemeLimits(
-        v_max_mps=velocity_mps,
-        a_max_mps2=accel_mps2,
-        braking_velocity_mps=safe_velocity_mps(
-            BRAKE_SHARE * accel_mps2, setting.response_s(scheme.overhead), setting.range_m
-        ),
-        rotors_w=flown.power_w - boards_w,
-        boards_w=boards_w,
-        cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
-    )
-    return FlightPlan(mission=mission, files=dict((vehicle, computer)), limits=limits)
+        Electrical energy of rotors and boards is shaft energy times the model's hover power over
+        the simulated vehicle's, which is the same for any number of boards, plus the boards' power
+        times the flight time.
+        """
+        if name == "velocity":
+            return numbers(flights, "mean_speed_mps")
+        time_s = numbers(flights, "flight_time_s")
+        if name == "flight_time":
+            return time_s
+        shaft_j, hover_w = (numbers(flights, n) for n in ("energy_propeller_j", "hover_shaft_w"))
+        return np.asarray(shaft_j * self.rotors_w / hover_w + self.boards_w * time_s)
 
 
 def _vehicle(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
@@ -189,66 +209,23 @@ NOT_SCALED = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SchemeLimits:
-    """The values of the model that the flights of a scheme have.
-
-    Attributes:
-        v_max_mps: speed limit of the missions.
-        a_max_mps2: acceleration limit of the missions.
-        braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
-        rotors_w: electrical hover power with all boards.
-        boards_w: power of all boards.
-        cut: values of the model that exceed the limits of a mission, in words.
-    """
-
-    v_max_mps: float
-    a_max_mps2: float
-    braking_velocity_mps: float
-    rotors_w: float
-    boards_w: float
-    cut: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Beside:
-    """The flights of a scheme.
-
-    Attributes:
-        limits: the model's values in them, or the reason why they cannot be flown.
-        flights: ended flights, as in `analysis.flights`.
-        errors: why missions could not be flown.
-    """
-
-    limits: SchemeLimits | str
-    flights: pa.Table | None = None
-    errors: Sequence[str] = ()
-
-    def measured(self, name: str, flights: pa.Table) -> FloatArray:
-        """A quantity of MODEL for each flight, (n,); NaN if a flight has none.
-
-        Electrical energy of rotors and boards is shaft energy times the model's hover power over
-        the simulated vehicle's, which is the same for any number of boards, plus the boards' power
-        times the flight time.
-        """
-        if name == "velocity":
-            return numbers(flights, "mean_speed_mps")
-        time_s = numbers(flights, "flight_time_s")
-        if name == "flight_time":
-            return time_s
-        limits = self.limits
-        assert isinstance(limits, SchemeLimits)
-        shaft_j, hover_w = (numbers(flights, n) for n in ("energy_propeller_j", "hover_shaft_w"))
-        return np.asarray(shaft_j * limits.rotors_w / hover_w + limits.boards_w * time_s)
+def arm(table: pa.Table, key: Key) -> pa.Table:
+    """The flights of a vehicle with a scheme."""
+    return chosen(table, label_group=key[0], label_arm=key[1])
 
 
 def side_by_side(
-    told: Mapping[str, Any], flown: Mapping[Key, Beside], overheads: Mapping[str, ComputeOverhead]
+    told: Mapping[str, Any],
+    plans: Mapping[Key, FlightPlan | str],
+    flights: pa.Table,
+    overheads: Mapping[str, ComputeOverhead],
 ) -> dict[str, Any]:
     """Unscaled properties, overheads, and one flat row per vehicle and scheme.
 
     Args:
         told: the model's report, with the overheads of the plans.
+        plans: of each vehicle and scheme, or the reason why they cannot be flown.
+        flights: of the missions of `RedundancyPlan.list_of`, as in `analysis.flights`.
         overheads: overheads measured in these flights, by detector.
     """
     return {
@@ -261,7 +238,8 @@ def side_by_side(
                 "vehicle": one["vehicle"],
                 "board": one["board"],
                 "schemes": [
-                    {**_scheme(row, flown[one["vehicle"], row["scheme"]]), **_over(one, row, flown)}
+                    _scheme(row, plans[one["vehicle"], row["scheme"]], flights, one["vehicle"])
+                    | _over(one, row, plans, flights)
                     for row in one["schemes"]
                 ],
             }
@@ -278,33 +256,38 @@ def _overhead(measured: ComputeOverhead) -> dict[str, Any]:
         "measured_percent": 100.0 * measured.share,
         "checks_percent": 100.0 * measured.checks_share,
         "checks_of_host_kernels_percent": 100.0 * measured.checks_host_share,
-        "paper_percent": 100.0 * named(SCHEMES, measured.detector).overhead,
+        "paper_percent": 100.0 * SCHEMES[measured.detector].overhead,
     }
 
 
-def _scheme(row: Mapping[str, Any], beside: Beside) -> dict[str, Any]:
-    limits = beside.limits
+def _scheme(
+    row: Mapping[str, Any], plan: FlightPlan | str, flights: pa.Table, vehicle: str
+) -> dict[str, Any]:
     told: dict[str, Any] = {
         "scheme": row["scheme"], "title": row["title"], "boards": row["boards"],
         "overhead_percent": row["overhead_percent"], "mass_kg": row["mass_kg"], "problem": None,
         "errors": [], "cut": [],
     }  # fmt: skip
-    if isinstance(limits, str):
-        return {**told, "problem": limits}
+    if isinstance(plan, str):
+        return {**told, "problem": plan}
+    mine = arm(flights, (vehicle, row["scheme"]))
     return {
         **told,
-        "v_max_mps": limits.v_max_mps,
-        "a_max_mps2": limits.a_max_mps2,
-        "braking_velocity_mps": limits.braking_velocity_mps,
-        "cut": list(limits.cut),
-        "errors": list(beside.errors),
-        **_success(beside.flights),
-        **_numbers(row, beside),
+        "v_max_mps": plan.mission.v_max_mps,
+        "a_max_mps2": plan.mission.a_max_mps2,
+        "braking_velocity_mps": plan.braking_velocity_mps,
+        "cut": list(plan.cut),
+        "errors": errors(mine, "{reason}"),
+        **_success(flown(mine)),
+        **_numbers(row, plan, flown(mine)),
     }
 
 
 def _over(
-    one: Mapping[str, Any], row: Mapping[str, Any], flown: Mapping[Key, Beside]
+    one: Mapping[str, Any],
+    row: Mapping[str, Any],
+    plans: Mapping[Key, FlightPlan | str],
+    flights: pa.Table,
 ) -> dict[str, float]:
     """Ratios to one board without protection and, as in the paper, to detection and recovery."""
     rows = {each["scheme"]: each for each in one["schemes"]}
@@ -313,15 +296,17 @@ def _over(
         (BASE, "", tuple(MODEL)),
         (REFERENCE, f"_over_{REFERENCE}", ("flight_time",)),
     ):
-        sides = [flown[one["vehicle"], name] for name in (over, row["scheme"])]
-        if any(isinstance(side.limits, str) for side in sides):
+        keys = [(one["vehicle"], name) for name in (over, row["scheme"])]
+        base, own = (plans[key] for key in keys)
+        if isinstance(base, str) or isinstance(own, str):
             continue
-        pairs = paired(sides[0].flights, sides[1].flights, PLACE)
+        sides = [flown(arm(flights, key)) for key in keys]
+        pairs = paired(sides[0], sides[1], PLACE)
         both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))
         first, second = (pair.filter(both).sort_by([*_BY_PLACE]) for pair in pairs)
         for name in names:
             model = row[MODEL[name]] / rows[over][MODEL[name]]
-            before, after = sides[0].measured(name, first), sides[1].measured(name, second)
+            before, after = base.measured(name, first), own.measured(name, second)
             found = changed(range(len(before)), before.tolist(), after.tolist())
             told |= _beside(f"{name}{suffix}", "_ratio", model, found)
             told[f"pairs{suffix}"] = found.count
@@ -339,14 +324,13 @@ def _success(flights: pa.Table) -> dict[str, Any]:
     }
 
 
-def _numbers(row: Mapping[str, Any], beside: Beside) -> dict[str, Any]:
+def _numbers(row: Mapping[str, Any], plan: FlightPlan, flights: pa.Table) -> dict[str, Any]:
     """Absolute numbers of the successful flights, and the model's for the same missions."""
-    won = chosen(beside.flights, succeeded=True)
+    won = chosen(flights, succeeded=True)
     straight_m = numbers(won, "straight_m")
-    model_s = _mean(
-        straight_m / row["velocity_mps"]
-    ).value  # the straight distance at the model's velocity
-    energy_j, top = beside.measured("energy", won), _mean(numbers(won, "max_speed_mps"))
+    # The straight distance at the model's velocity.
+    model_s = _mean(straight_m / row["velocity_mps"]).value
+    energy_j, top = plan.measured("energy", won), _mean(numbers(won, "max_speed_mps"))
     path = _mean(numbers(won, "distance_m") / straight_m)
     return {
         **_beside("velocity", "_mps", row["velocity_mps"], _mean(numbers(won, "mean_speed_mps"))),

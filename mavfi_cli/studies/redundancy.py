@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.beside_model import (
     BASE,
-    Beside,
     FlightPlan,
     Key,
     RedundancyPlan,
-    flight_plan,
+    arm,
     side_by_side,
 )
-from mavfi_cli.analysis.flights import chosen, errors, flown
+from mavfi_cli.analysis.flights import flown
 from mavfi_cli.analysis.overhead import compute_overheads
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
@@ -32,7 +31,7 @@ from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import fly
 from mavfi_cli.studies.train import train
 from mavfi_cli.vpm.model import DETECTORS, ModelVehicle, Scheme, schemes_with
-from mavfi_cli.vpm.report import CHAINS, report, setting_of
+from mavfi_cli.vpm.report import CHAINS, report
 
 FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default
@@ -41,20 +40,20 @@ PLATFORM = "x86"  # platform whose latencies are scaled by default
 def _plans_of(
     plan: RedundancyPlan,
     vehicle: ModelVehicle,
-    schemes: Sequence[Scheme],
+    schemes: Iterable[Scheme],
     options: Options,
     spectator: Spectator,
 ) -> Iterator[tuple[Key, FlightPlan | str]]:
     """Each scheme's plan or the reason for its absence; the first one has one bare board."""
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
-    setting, models = setting_of(vehicle, plan.choices), plan.models
+    setting, models = plan.choices.inputs(vehicle), plan.models
     folder = plan.folder.absolute() / FLOWN
     refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
     for scheme in schemes:
         bare, key = scheme.name == BASE, (vehicle.name, scheme.name)
         try:
-            each = flight_plan(setting, scheme, platform, chain_s, folder, models, plan.stack)
+            each = FlightPlan.of(setting, scheme, platform, chain_s, folder, models, plan.stack)
             if each.mission.detector is not None:
                 each.mission.detector.built(each.mission.stack)
             each.write()
@@ -114,24 +113,15 @@ def fly_and_report(
     plans = {
         key: each
         for vehicle in plan.vehicles
-        for key, each in _plans_of(plan, vehicle, schemes, options, spectator)
+        for key, each in _plans_of(plan, vehicle, schemes.values(), options, spectator)
     }
     missions = plan.list_of({k: each for k, each in plans.items() if isinstance(each, FlightPlan)})
     table = fly(missions, plan.folder / FLIGHTS, Keep.NONE, options, spectator)
-    arms = {key: chosen(table, label_group=key[0], label_arm=key[1]) for key in plans}
-    watched = [flown(arms[key])["number"].to_pylist() for key in plans if key[1] in DETECTORS]
+    watched = [flown(arm(table, key))["number"].to_pylist() for key in plans if key[1] in DETECTORS]
     with Ledger(plan.folder / FLIGHTS) as ledger:
         measured = compute_overheads(
             each.result for numbers in watched for each in ledger.results(numbers)
         )
-    beside = {
-        key: Beside(
-            limits=each.limits if isinstance(each, FlightPlan) else each,
-            flights=flown(arms[key]),
-            errors=errors(arms[key], "{reason}"),
-        )
-        for key, each in plans.items()
-    }
     found = {name: (100.0 * each.share, each.told("--fly")) for name, each in measured.items()}
     told = report(plan.vehicles, plan.choices, schemes_with({**found, **overheads}))
     told["flights"] = {
@@ -140,6 +130,6 @@ def fly_and_report(
         "first_seed": plan.first_seed,
         "stack": plan.stack,
         "detectors": plan.models_told,
-        **side_by_side(report(plan.vehicles, plan.choices, schemes), beside, measured),
+        **side_by_side(report(plan.vehicles, plan.choices, schemes), plans, table, measured),
     }
     return told

@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +162,7 @@ class Scheme:
 
 
 TABLE_V = "paper, Table V: Dense, the worst of four environments"
-SCHEMES = (
+_SCHEMES = (
     Scheme(name="none", title="no protection", source="one board"),
     Scheme(name="dmr", title="DMR", copies=2, source="two boards; no time for the comparison"),
     Scheme(name="tmr", title="TMR", copies=3, source="three boards; no time for the vote"),
@@ -171,11 +170,12 @@ SCHEMES = (
     Scheme(name="aad", title="detection (autoencoder)", overhead=0.000062, source=TABLE_V),
 )
 
-DETECTORS = tuple(scheme.name for scheme in SCHEMES if scheme.overhead > 0.0)
+SCHEMES = {scheme.name: scheme for scheme in _SCHEMES}
+DETECTORS = tuple(scheme.name for scheme in _SCHEMES if scheme.overhead > 0.0)
 
 
-def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ...]:
-    """Return the schemes with measured overheads in place of the paper's.
+def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme]:
+    """The schemes by name, with measured overheads in place of the paper's.
 
     Args:
         overheads: detector name -> its overhead in per cent of the compute time, and the source
@@ -185,25 +185,16 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> tuple[Scheme, ..
         UnknownName: no scheme of this name detects and recovers.
         ConfigError: an overhead is negative, not finite, or probably in the wrong unit.
     """
-    for name, (percent, _) in overheads.items():
+    schemes = dict(SCHEMES)
+    for name, (percent, source) in overheads.items():
         if name not in DETECTORS:
             raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent <= LARGEST:
             raise ConfigError(
                 f"must be within 0 and {LARGEST:g} %, is {percent:g} %", key=f"overhead of {name}"
             )
-    given = {name: (percent / 100.0, source) for name, (percent, source) in overheads.items()}
-    return tuple(
-        replace(scheme, overhead=given[scheme.name][0], source=given[scheme.name][1])
-        if scheme.name in given
-        else scheme
-        for scheme in SCHEMES
-    )
-
-
-def named(schemes: tuple[Scheme, ...], name: str) -> Scheme:
-    """The scheme of this name, which must exist."""
-    return next(scheme for scheme in schemes if scheme.name == name)
+        schemes[name] = replace(schemes[name], overhead=percent / 100.0, source=source)
+    return schemes
 
 
 GRAVITY_MPS2 = 9.80665
@@ -264,12 +255,6 @@ def hover_power_w(known_w: float, known_kg: float, mass_kg: float) -> float:
 _J_PER_WH = 3600.0
 
 
-class _Bound(Enum):
-    BODY = "body dynamics"
-    SENSOR = "sensor"
-    COMPUTE = "compute"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelInputs:
     """The model's inputs for one vehicle with its computer."""
@@ -314,62 +299,43 @@ class ModelInputs:
             f"compute are {own_kg + compute_kg:.3f} kg"
         )
 
+    def performance(self, scheme: Scheme) -> dict[str, Any]:
+        """Performance with a scheme, for hovering power and a straight path.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SchemePerformance:
-    """Performance with a scheme, for hovering power and a straight path."""
+        Returns:
+            Numbers by name and unit. `throughput_hz`: actions a second, the inverse of the response
+            time. `compute_hz`: rate of the computer alone. `power_w`: rotors and boards.
+            `missions`: missions for each battery charge, not rounded. `bound`: what limits the
+            velocity.
 
-    scheme: Scheme
-    mass_kg: float
-    compute_kg: float
-    thrust_to_weight: float
-    acceleration_mps2: float
-    throughput_hz: float  # actions a second, the inverse of the response time
-    compute_hz: float  # rate of the computer alone
-    knee_hz: float
-    roof_mps: float
-    sensor_ceiling_mps: float
-    compute_ceiling_mps: float
-    bound: _Bound
-    velocity_mps: float
-    flight_time_s: float
-    power_w: float  # rotors and boards
-    energy_j: float
-    missions: float  # missions for each battery charge, not rounded
-
-
-def outcome(setting: ModelInputs, scheme: Scheme) -> SchemePerformance:
-    """Compute the performance of a vehicle with a scheme.
-
-    Raises:
-        CannotLift: the rotors do not lift this many boards.
-    """
-    vehicle, copies = setting.vehicle, scheme.copies
-    accel, velocity = setting.acceleration_mps2(copies), setting.velocity_mps(scheme)
-    if velocity is None:
-        raise setting.too_heavy(copies)
-    mass_kg, compute_s = setting.mass_kg(copies), setting.compute_s * (1.0 + scheme.overhead)
-    knee, response_s = knee_hz(accel, setting.range_m), setting.response_s(scheme.overhead)
-    rotors_w = hover_power_w(vehicle.hover_power_w, vehicle.mass_kg, mass_kg)
-    power_w = rotors_w + copies * setting.board.power_w
-    time_s = setting.distance_m / velocity
-    slower = _Bound.SENSOR if 1.0 / vehicle.sensor_hz > compute_s else _Bound.COMPUTE
-    return SchemePerformance(
-        scheme=scheme,
-        mass_kg=mass_kg,
-        compute_kg=setting.carried_kg(copies),
-        thrust_to_weight=setting.pull_n / (mass_kg * GRAVITY_MPS2),
-        acceleration_mps2=accel,
-        throughput_hz=1.0 / response_s,
-        compute_hz=1.0 / compute_s,
-        knee_hz=knee,
-        roof_mps=roof_mps(accel, setting.range_m),
-        sensor_ceiling_mps=safe_velocity_mps(accel, 1.0 / vehicle.sensor_hz, setting.range_m),
-        compute_ceiling_mps=safe_velocity_mps(accel, compute_s, setting.range_m),
-        bound=_Bound.BODY if 1.0 / response_s >= knee else slower,
-        velocity_mps=velocity,
-        flight_time_s=time_s,
-        power_w=power_w,
-        energy_j=power_w * time_s,
-        missions=vehicle.battery_wh * _J_PER_WH / (power_w * time_s),
-    )
+        Raises:
+            CannotLift: the rotors do not lift this many boards.
+        """
+        vehicle, copies = self.vehicle, scheme.copies
+        accel, velocity = self.acceleration_mps2(copies), self.velocity_mps(scheme)
+        if velocity is None:
+            raise self.too_heavy(copies)
+        mass_kg, compute_s = self.mass_kg(copies), self.compute_s * (1.0 + scheme.overhead)
+        knee, response_s = knee_hz(accel, self.range_m), self.response_s(scheme.overhead)
+        rotors_w = hover_power_w(vehicle.hover_power_w, vehicle.mass_kg, mass_kg)
+        power_w = rotors_w + copies * self.board.power_w
+        time_s = self.distance_m / velocity
+        slower = "sensor" if 1.0 / vehicle.sensor_hz > compute_s else "compute"
+        return {
+            "mass_kg": mass_kg,
+            "compute_kg": self.carried_kg(copies),
+            "thrust_to_weight": self.pull_n / (mass_kg * GRAVITY_MPS2),
+            "acceleration_mps2": accel,
+            "throughput_hz": 1.0 / response_s,
+            "compute_hz": 1.0 / compute_s,
+            "knee_hz": knee,
+            "roof_mps": roof_mps(accel, self.range_m),
+            "sensor_ceiling_mps": safe_velocity_mps(accel, 1.0 / vehicle.sensor_hz, self.range_m),
+            "compute_ceiling_mps": safe_velocity_mps(accel, compute_s, self.range_m),
+            "velocity_mps": velocity,
+            "flight_time_s": time_s,
+            "power_w": power_w,
+            "energy_j": power_w * time_s,
+            "missions": vehicle.battery_wh * _J_PER_WH / (power_w * time_s),
+            "bound": "body dynamics" if 1.0 / response_s >= knee else slower,
+        }

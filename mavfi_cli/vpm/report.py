@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import CannotLift, ConfigError
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.vpm.model import (
     DETECTORS,
@@ -24,9 +24,6 @@ from mavfi_cli.vpm.model import (
     ModelInputs,
     ModelVehicle,
     Scheme,
-    SchemePerformance,
-    named,
-    outcome,
     safe_velocity_mps,
 )
 
@@ -58,9 +55,17 @@ class Choices:
     range_m: float | None = None
     distance_m: float = 50.0
 
+    def inputs(self, vehicle: ModelVehicle) -> ModelInputs:
+        """The model's inputs for a vehicle with its free number calibrated.
+
+        Raises:
+            ConfigError: neither the vehicle nor the choices give a needed value.
+        """
+        return _setting(vehicle, self, _calibrate(vehicle) if vehicle.calibration else None)[0]
+
 
 def report(
-    vehicles: Sequence[ModelVehicle], choices: Choices, schemes: tuple[Scheme, ...]
+    vehicles: Sequence[ModelVehicle], choices: Choices, schemes: Mapping[str, Scheme]
 ) -> dict[str, Any]:
     """Compute the model's answer for each vehicle; keys of numbers but ratios name the unit.
 
@@ -78,9 +83,9 @@ def report(
     }
 
 
-def _unlike_sources(schemes: tuple[Scheme, ...]) -> list[str]:
+def _unlike_sources(schemes: Mapping[str, Scheme]) -> list[str]:
     """A note if one detector's overhead is from the paper and another's is not."""
-    detectors = [scheme for scheme in schemes if scheme.name in DETECTORS]
+    detectors = [schemes[name] for name in DETECTORS]
     papers = [scheme.name for scheme in detectors if scheme.source == TABLE_V]
     others = [scheme.name for scheme in detectors if scheme.source != TABLE_V]
     if not papers or not others:
@@ -91,31 +96,21 @@ def _unlike_sources(schemes: tuple[Scheme, ...]) -> list[str]:
     ]
 
 
-def _one(vehicle: ModelVehicle, choices: Choices, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
-    found = calibrated(vehicle) if vehicle.calibration else None
+def _one(vehicle: ModelVehicle, choices: Choices, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
+    found = _calibrate(vehicle) if vehicle.calibration else None
     setting, parameters = _setting(vehicle, choices, found)
-    reference = outcome(setting, named(schemes, REFERENCE))
+    reference = setting.performance(schemes[REFERENCE])
     return {
         "vehicle": vehicle.name,
         "description": vehicle.description,
         "board": setting.board.name,
         "notes": _notes(vehicle, choices, setting, found),
         "parameters": parameters,
-        "schemes": [_row(setting, scheme, reference) for scheme in schemes],
+        "schemes": [_row(setting, scheme, reference) for scheme in schemes.values()],
         "sensitivity": _sensitivity(setting, schemes),
         "calibrations": _calibrations(vehicle, found),
         "curves": _curves(setting, schemes),
     }
-
-
-def setting_of(vehicle: ModelVehicle, choices: Choices) -> ModelInputs:
-    """Make the model's inputs for a vehicle with its free number calibrated.
-
-    Raises:
-        ConfigError: neither the vehicle nor the choices give a needed value.
-    """
-    found = calibrated(vehicle) if vehicle.calibration else None
-    return _setting(vehicle, choices, found)[0]
 
 
 def _setting(
@@ -193,7 +188,7 @@ def _other_calibration(vehicle: ModelVehicle, board: Board, found: _Calibrated) 
     if board.total_kg <= 0.0:
         return f"{told}; board {board.name} has no mass, so nothing can be calibrated with it"
     try:
-        other = calibrated(vehicle, board)
+        other = _calibrate(vehicle, board)
     except ConfigError as error:
         return f"{told}; it cannot be with board {board.name}: {error}"
     return f"{told}; with board {board.name} it would be {other.value:.4g} {unit}"
@@ -230,26 +225,21 @@ def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> lis
     return rows
 
 
-def _row(setting: ModelInputs, scheme: Scheme, reference: SchemePerformance) -> dict[str, Any]:
+def _row(setting: ModelInputs, scheme: Scheme, reference: Mapping[str, Any]) -> dict[str, Any]:
     """A scheme's numbers and its ratios to the reference, or why it cannot fly."""
     told = {
         "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
         "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
     }  # fmt: skip
-    numbers = [key.name for key in fields(SchemePerformance) if key.name not in ("scheme", "bound")]
-    if setting.velocity_mps(scheme) is None:
-        nothing = dict.fromkeys([*numbers, *RATIOS, "bound"])
+    try:
+        flown = setting.performance(scheme)
+    except CannotLift as error:
         weights = {"mass_kg": setting.mass_kg(scheme.copies),
                    "compute_kg": setting.carried_kg(scheme.copies)}  # fmt: skip
-        return {**told, **nothing, **weights, "problem": str(setting.too_heavy(scheme.copies))}
-    flown = outcome(setting, scheme)
-    return {
-        **told,
-        **{key: getattr(flown, key) for key in numbers},
-        "bound": flown.bound.value,
-        **{ratio: getattr(flown, of) / getattr(reference, of) for ratio, of in RATIOS.items()},
-        "problem": None,
-    }
+        nothing = dict.fromkeys([*reference, *RATIOS])
+        return {**told, **nothing, **weights, "problem": str(error)}
+    ratios = {ratio: flown[of] / reference[of] for ratio, of in RATIOS.items()}
+    return {**told, **flown, **ratios, "problem": None}
 
 
 def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict[str, Any]]:
@@ -258,7 +248,7 @@ def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict
         return []
     both = [found]
     if found.board.name != OTHER_BOARD:
-        both.append(calibrated(vehicle, Board.load(OTHER_BOARD)))
+        both.append(_calibrate(vehicle, Board.load(OTHER_BOARD)))
     return [
         {
             "board": each.board.name,
@@ -274,9 +264,9 @@ def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict
     ]
 
 
-def _curves(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> dict[str, Any]:
+def _curves(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
     """Safe velocity against action throughput for the numbers of boards that can fly."""
-    copies = sorted({scheme.copies for scheme in schemes})
+    copies = sorted({scheme.copies for scheme in schemes.values()})
     flying = [(n, setting.acceleration_mps2(n)) for n in copies]
     return {
         "throughput_hz": _CURVE_HZ.tolist(),
@@ -311,7 +301,7 @@ def _scaled(setting: ModelInputs, field: str, factor: float) -> ModelInputs:
     return replace(setting, **{field: value})
 
 
-def _sensitivity(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> list[dict[str, Any]]:
+def _sensitivity(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> list[dict[str, Any]]:
     """One row for each parameter: the answer at each factor, and its elasticity at factor 1.
 
     An elasticity is d ln(answer) / d ln(parameter): the change of the answer in per cent for one
@@ -345,14 +335,14 @@ def _sensitivity(setting: ModelInputs, schemes: tuple[Scheme, ...]) -> list[dict
 
 
 def _answers(
-    setting: ModelInputs, schemes: tuple[Scheme, ...]
+    setting: ModelInputs, schemes: Mapping[str, Scheme]
 ) -> tuple[float | None, float | None]:
-    fast = setting.velocity_mps(named(schemes, REFERENCE))
-    slow = setting.velocity_mps(named(schemes, "tmr"))
+    fast = setting.velocity_mps(schemes[REFERENCE])
+    slow = setting.velocity_mps(schemes["tmr"])
     return fast, None if fast is None or slow is None else fast / slow
 
 
-def _point(setting: ModelInputs, schemes: tuple[Scheme, ...], value: float) -> dict[str, Any]:
+def _point(setting: ModelInputs, schemes: Mapping[str, Scheme], value: float) -> dict[str, Any]:
     velocity, ratio = _answers(setting, schemes)
     return {"value": value, "velocity_mps": velocity, "tmr_flight_time_ratio": ratio}
 
@@ -376,7 +366,7 @@ class _Calibrated:
     dmr_ratio: float  # a prediction, not fitted
 
 
-def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated:
+def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated:
     """Find the vehicle's free number that gives its published ratio.
 
     The ratio falls as the free number grows, so bisection finds it.
@@ -391,7 +381,6 @@ def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated
     plan = vehicle.calibration
     assert plan is not None
     board = board or Board.load(plan.board)
-    known = {scheme.name: scheme for scheme in SCHEMES}
 
     def setting(value: float) -> ModelInputs:
         """The vehicle with a trial value of the parameter."""
@@ -410,13 +399,13 @@ def calibrated(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated
 
     def ratio(value: float, scheme: str) -> float:
         """Flight time of a scheme over the reference's; infinite if one of them cannot fly."""
-        fast = setting(value).velocity_mps(named(SCHEMES, REFERENCE))
-        slow = setting(value).velocity_mps(known[scheme])
+        fast = setting(value).velocity_mps(SCHEMES[REFERENCE])
+        slow = setting(value).velocity_mps(SCHEMES[scheme])
         return math.inf if fast is None or slow is None else fast / slow
 
     low = 1.0 / vehicle.sensor_hz
     if plan.parameter == "rotor_pull_n":
-        three_kg = vehicle.mass_kg + known["tmr"].copies * board.total_kg
+        three_kg = vehicle.mass_kg + SCHEMES["tmr"].copies * board.total_kg
         low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
     value = _halving(lambda trial: ratio(trial, "tmr"), plan.tmr_time_ratio, low, low * _SPAN)
     if value is None:

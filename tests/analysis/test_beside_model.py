@@ -7,7 +7,7 @@ import re
 import pyarrow as pa
 import pytest
 
-from mavfi_cli.analysis.beside_model import Beside, flight_plan, side_by_side
+from mavfi_cli.analysis.beside_model import FlightPlan, side_by_side
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
@@ -15,7 +15,7 @@ from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model import PICTURES, model_lines, redundancy_csv
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
-from mavfi_cli.vpm.report import Choices, report, setting_of
+from mavfi_cli.vpm.report import Choices, report
 
 HOVER_SHAFT_W = 20.0  # of the simulated vehicle, with one board
 STRAIGHT_M = 40.0 - 1.0
@@ -23,7 +23,7 @@ STRAIGHT_M = 40.0 - 1.0
 
 def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
     """What a flight as the model has it records; or a slower one, or one of a longer path."""
-    hover_w = HOVER_SHAFT_W * plan.limits.rotors_w
+    hover_w = HOVER_SHAFT_W * plan.rotors_w
     velocity = row["velocity_mps"] / slower
     time_s = longer * STRAIGHT_M / velocity
     return {
@@ -43,17 +43,24 @@ def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
 
 
 def flights_of(records):
-    """Records as the columns of a ledger's table."""
+    """Records of each arm as the columns of a ledger's table."""
     return pa.Table.from_pylist(
         [
             {
+                "label_group": vehicle,
+                "label_arm": scheme,
+                "number": seed,
+                "labels": "{}",
+                "reason": "",
+                "state": "flown",
                 "world": "w",
                 "seed": seed,
                 "outcome": record["outcome"],
                 "succeeded": record["outcome"] == "success",
                 **measures_of(record),
             }
-            for seed, record in enumerate(records)
+            for (vehicle, scheme), those in records.items()
+            for seed, record in enumerate(those)
         ]
     )
 
@@ -64,33 +71,25 @@ def spark(tmp_path):
     vehicle, x86 = ModelVehicle.load("spark"), load_platform("x86")
     chain_s = sum(kernel.latency_s for kernel in x86.kernels.values())
     told = report([vehicle], Choices(), SCHEMES)
-    setting = setting_of(vehicle, Choices())
+    setting = Choices().inputs(vehicle)
     rows = {row["scheme"]: row for row in told["vehicles"][0]["schemes"]}
     plans = {
-        ("spark", scheme.name): flight_plan(setting, scheme, x86, chain_s, tmp_path)
-        for scheme in SCHEMES
+        ("spark", name): FlightPlan.of(setting, scheme, x86, chain_s, tmp_path)
+        for name, scheme in SCHEMES.items()
     }
 
     def beside(change=None, refused=(), count=3):
         flown = {
-            key: Beside(limits="too heavy to fly")
-            if key[1] in refused
-            else Beside(
-                limits=plan.limits,
-                flights=flights_of(
-                    [
-                        flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))
-                        for _ in range(count)
-                    ]
-                ),
-            )
+            key: [flight(rows[key[1]], plan, **(change or {}).get(key[1], {}))] * count
             for key, plan in plans.items()
+            if key[1] not in refused
         }
+        asked = {key: "too heavy to fly" if key[1] in refused else plans[key] for key in plans}
         overhead = ComputeOverhead(
             detector="aad", flights=3, detection_s=0.01, recompute_s=0.0, compute_s=10.0,
             host_compute_s=0.2, alarms=9, platforms=("x86",),
         )  # fmt: skip
-        compared = side_by_side(told, flown, {"aad": overhead})
+        compared = side_by_side(told, asked, flights_of(flown), {"aad": overhead})
         flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",
                    "stack": "mavbench", **compared}  # fmt: skip
         return {**told, "flights": flights}

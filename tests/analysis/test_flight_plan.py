@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.analysis.beside_model import RedundancyPlan, flight_plan
+from mavfi_cli.analysis.beside_model import FlightPlan, RedundancyPlan
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.vpm.model import SCHEMES, Board, ModelVehicle, hover_power_w, named, outcome
-from mavfi_cli.vpm.report import Choices, setting_of
+from mavfi_cli.vpm.model import SCHEMES, Board, ModelVehicle, hover_power_w
+from mavfi_cli.vpm.report import Choices
 
 X86 = load_platform("x86")
 SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())
@@ -18,8 +18,8 @@ SUM_S = sum(kernel.latency_s for kernel in X86.kernels.values())
 @pytest.fixture
 def plan(tmp_path):
     def of(vehicle, scheme, choices=None, platform=X86, chain_s=SUM_S):
-        setting = setting_of(ModelVehicle.load(vehicle), choices or Choices())
-        return flight_plan(setting, named(SCHEMES, scheme), platform, chain_s, tmp_path), setting
+        setting = (choices or Choices()).inputs(ModelVehicle.load(vehicle))
+        return FlightPlan.of(setting, SCHEMES[scheme], platform, chain_s, tmp_path), setting
 
     return of
 
@@ -33,43 +33,43 @@ def files_of(plan):
 @pytest.mark.parametrize("scheme", ["none", "dmr", "tmr"])
 def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
     planned, setting = plan("spark", scheme)
-    flown = outcome(setting, named(SCHEMES, scheme))
+    flown = setting.performance(SCHEMES[scheme])
     vehicle, _ = files_of(planned)
     assert vehicle["base"] == "spark"
-    assert vehicle["mass_kg"] + vehicle["extra_payload_kg"] == pytest.approx(flown.mass_kg)
+    assert vehicle["mass_kg"] + vehicle["extra_payload_kg"] == pytest.approx(flown["mass_kg"])
     assert vehicle["rotor_pull_n"] == setting.pull_n
-    assert planned.mission.v_max_mps == flown.velocity_mps
-    assert planned.mission.a_max_mps2 == pytest.approx(min(flown.acceleration_mps2, 8.0))
+    assert planned.mission.v_max_mps == flown["velocity_mps"]
+    assert planned.mission.a_max_mps2 == pytest.approx(min(flown["acceleration_mps2"], 8.0))
     assert planned.mission.map_range_m == 7.0
     assert planned.mission.camera_rate_hz == 30.0
     assert planned.mission.detector is None
-    assert planned.limits.boards_w == 10.0 * flown.scheme.copies
-    assert planned.limits.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown.mass_kg))
-    assert vehicle["avionics_w"] == planned.limits.boards_w
+    assert planned.boards_w == 10.0 * SCHEMES[scheme].copies
+    assert planned.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown["mass_kg"]))
+    assert vehicle["avionics_w"] == planned.boards_w
 
 
 def test_the_stack_is_the_mission_s(tmp_path):
-    setting = setting_of(ModelVehicle.load("spark"), Choices())
-    arguments = (setting, named(SCHEMES, "none"), X86, SUM_S, tmp_path)
-    assert flight_plan(*arguments).mission.stack == "mavbench"
-    assert flight_plan(*arguments, stack="hardened").mission.stack == "hardened"
+    setting = Choices().inputs(ModelVehicle.load("spark"))
+    arguments = (setting, SCHEMES["none"], X86, SUM_S, tmp_path)
+    assert FlightPlan.of(*arguments).mission.stack == "mavbench"
+    assert FlightPlan.of(*arguments, stack="hardened").mission.stack == "hardened"
 
 
 def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
-    assert planned.limits.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
-    assert plan("spark", "tmr")[0].limits.cut == ()
+    assert planned.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
+    assert plan("spark", "tmr")[0].cut == ()
     fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=Board.load("ncs")))
     assert fast.mission.v_max_mps == 12.0
-    assert fast.limits.cut[0].startswith("velocity 12 m/s instead of ")
-    assert fast.limits.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
+    assert fast.cut[0].startswith("velocity 12 m/s instead of ")
+    assert fast.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
 
 
 @pytest.mark.parametrize("scheme", ["none", "tmr", "gad", "aad"])
 def test_the_platform_takes_the_model_s_response_time(plan, scheme):
     planned, setting = plan("airsim", scheme)
     _, platform = files_of(planned)
-    overhead = named(SCHEMES, scheme).overhead
+    overhead = SCHEMES[scheme].overhead
     taken_s = sum(kernel["latency_s"] for kernel in platform["kernels"].values())
     assert taken_s == pytest.approx(setting.compute_s * (1.0 + overhead))
     loaded = load_platform(planned.mission.platform)

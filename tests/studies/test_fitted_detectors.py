@@ -2,13 +2,13 @@
 
 import pytest
 
-from mavfi_cli.analysis.beside_model import RedundancyPlan, flight_plan
+from mavfi_cli.analysis.beside_model import FlightPlan, RedundancyPlan
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import redundancy
-from mavfi_cli.vpm.model import SCHEMES, ModelVehicle, named
-from mavfi_cli.vpm.report import Choices, setting_of
+from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
+from mavfi_cli.vpm.report import Choices
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def ask(tmp_path):
 
 @pytest.fixture
 def bare(tmp_path):
-    setting = setting_of(ModelVehicle.load("spark"), Choices())
-    return flight_plan(setting, named(SCHEMES, "none"), load_platform("x86"), 0.39, tmp_path)
+    setting = Choices().inputs(ModelVehicle.load("spark"))
+    return FlightPlan.of(setting, SCHEMES["none"], load_platform("x86"), 0.39, tmp_path)
 
 
 def test_they_are_fitted_once_to_the_bare_vehicle_s_flights(ask, bare, monkeypatch):
@@ -54,8 +54,8 @@ def test_they_are_fitted_once_to_the_bare_vehicle_s_flights(ask, bare, monkeypat
 def test_flights_name_the_fitted_models(tmp_path):
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "aad.json").touch()
-    setting = setting_of(ModelVehicle.load("spark"), Choices())
-    planned = flight_plan(
-        setting, named(SCHEMES, "aad"), load_platform("x86"), 0.39, tmp_path, tmp_path / "models"
+    setting = Choices().inputs(ModelVehicle.load("spark"))
+    planned = FlightPlan.of(
+        setting, SCHEMES["aad"], load_platform("x86"), 0.39, tmp_path, tmp_path / "models"
     )
     assert planned.mission.detector.model == str(tmp_path / "models" / "aad.json")

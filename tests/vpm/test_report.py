@@ -10,7 +10,7 @@ from mavfi_cli.core.config import Shipped
 from mavfi_cli.core.errors import CannotLift, ConfigError, UnknownName
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import GRAVITY_MPS2, SCHEMES, Board, ModelVehicle, schemes_with
-from mavfi_cli.vpm.report import Choices, calibrated, report
+from mavfi_cli.vpm.report import Choices, report
 
 VPM = Path(vpm.__file__).parent
 
@@ -70,7 +70,7 @@ def test_a_ratio_out_of_reach(tmp_path):
     text = (vehicle_file("airsim")).read_text()
     (tmp_path / "mine.toml").write_text(text.replace("= 1.06", "= 1.5"))
     with pytest.raises(ConfigError, match=r"no response_s gives .* it can be 1\.000 to 1\.15"):
-        calibrated(ModelVehicle.load(str(tmp_path / "mine.toml")))
+        told(str(tmp_path / "mine.toml"))
 
 
 def vehicle_file(name):
