@@ -12,7 +12,6 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -56,26 +55,24 @@ SCHEMA = pa.schema(
 )  # fmt: skip
 
 
-class Harm(Enum):
-    """Effect of a fault on an unprotected flight, compared with its golden flight."""
-
-    NONE = "none"
-    LOST = "lost"  # the golden flight reached the goal, this one did not
-    LONGER = "longer"  # both did, this one took more than LONGER longer
-    OTHERWISE = "otherwise"  # both failed, in different ways
+# Effects of a fault on an unprotected flight, compared with its golden flight.
+HARMLESS = "none"
+LOST = "lost"  # the golden flight reached the goal, this one did not
+LATE = "longer"  # both did, this one took more than LONGER longer
+OTHERWISE = "otherwise"  # both failed, in different ways
 
 
-def _harm_of(golden: Flight, flown: Flight) -> Harm:
+def _harm_of(golden: Flight, flown: Flight) -> str:
     """Effect of a treatment on a mission, compared with its golden flight.
 
     A mission that succeeds although its golden flight failed is not harmed.
     """
     if flown["succeeded"]:
         longer = golden["succeeded"] and (_lengthening(golden, flown) or 0.0) > LONGER
-        return Harm.LONGER if longer else Harm.NONE
+        return LATE if longer else HARMLESS
     if golden["succeeded"]:
-        return Harm.LOST
-    return Harm.NONE if flown["outcome"] == golden["outcome"] else Harm.OTHERWISE
+        return LOST
+    return HARMLESS if flown["outcome"] == golden["outcome"] else OTHERWISE
 
 
 def _lengthening(golden: Flight, flown: Flight) -> float | None:
@@ -141,7 +138,7 @@ def _fault_pair(
         "state": "+".join(faulty["struck_sites"]) or labels["target"],
         "bits": " ".join(map(str, faulty["first_bits"])),
         "injected": faulty["injected"],
-        "harm": harm.value if active else "",
+        "harm": harm if active else "",
         "crashed": faulty["crashed"],
         "faulty_outcome": faulty["outcome"],
         "faulty_time_s": faulty["flight_time_s"],
@@ -150,12 +147,12 @@ def _fault_pair(
         "alarm_stage": alarm and alarm["stage"],
         "latency_s": None if alarm is None else max(0.0, alarm["stamp_s"] - struck_s),
         "by_chance": _first_alarm(watched, struck_s) is not None,
-        "remaining_harm": remaining.value if active else "",
+        "remaining_harm": remaining if active else "",
         "faulty_won": faulty["succeeded"],
         "active": active,
         "struck": struck_s is not None,
         "seen": alarm is not None,
-        "undone": remaining is Harm.NONE,
+        "undone": remaining == HARMLESS,
         "complete": complete,
         "faulty_lengthening": _lengthening(golden, faulty),
         "faulty_struck_s": faulty["struck_s"],
@@ -202,7 +199,7 @@ def _placed(table: pa.Table) -> Iterator[tuple[Place, Flight]]:
 def harmful(faults: pa.Table) -> pa.Table:
     """The pairs without a detector whose fault was active and did harm."""
     active = chosen(faults, active=True, detector=NONE)
-    return active.filter(pc.not_equal(active["harm"], Harm.NONE.value))
+    return active.filter(pc.not_equal(active["harm"], HARMLESS))
 
 
 RESAMPLES = 999
@@ -360,16 +357,16 @@ def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
     """
     injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
     active = chosen(injected, active=True)
-    harms = {harm: chosen(active, harm=harm.value).num_rows for harm in Harm}
-    harmful_count = active.num_rows - harms[Harm.NONE]
+    harms = {harm: chosen(active, harm=harm).num_rows for harm in (HARMLESS, LOST, LATE, OTHERWISE)}
+    harmful_count = active.num_rows - harms[HARMLESS]
     flown = chosen(pairs, active=True)
     complete = chosen(flown, complete=True)
-    harmful = flown.filter(pc.not_equal(flown["harm"], Harm.NONE.value))
-    harmless = chosen(complete, harm=Harm.NONE.value)
+    harmful = flown.filter(pc.not_equal(flown["harm"], HARMLESS))
+    harmless = chosen(complete, harm=HARMLESS)
     latencies_s = known(numbers(harmful, "latency_s"))
     middle, late = _interval(latencies_s, median), _interval(latencies_s, _p95)
     protected = mixture(
-        [(harmful_count, _share(harmful, "won")), (harms[Harm.NONE], _share(harmless, "won"))]
+        [(harmful_count, _share(harmful, "won")), (harms[HARMLESS], _share(harmless, "won"))]
     )
     return {
         "planned": bare.num_rows,
@@ -378,7 +375,7 @@ def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
         "active": active.num_rows,
         "crashed": int(flags(active, "crashed").sum()),
         "harmful": asdict(rate(harmful_count, active.num_rows)),
-        **{harm.value: harms[harm] for harm in (Harm.LOST, Harm.LONGER, Harm.OTHERWISE)},
+        **{harm: harms[harm] for harm in (LOST, LATE, OTHERWISE)},
         "flown": flown.num_rows,
         "not_struck": chosen(flown, struck=False).num_rows,
         "latency_s": asdict(middle),
@@ -392,7 +389,7 @@ def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
                 chosen(pairs, active=False, complete=True, struck=True), "seen"
             ),
             "by_chance": _share(chosen(complete, struck=True), "by_chance"),
-            "recovered": _share(chosen(harmful, harm=Harm.LOST.value), "won"),
+            "recovered": _share(chosen(harmful, harm=LOST), "won"),
             "undone": _share(harmful, "undone"),
             "added": _share(harmless, "undone", wanted=False),
             "golden": _share(active, "golden_won"),
@@ -412,7 +409,7 @@ def _recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, Mc
     def test(among: pa.Array, column: str) -> McNemar:
         return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
 
-    lost, harmful = pc.equal(harm, Harm.LOST.value), pc.not_equal(harm, Harm.NONE.value)
+    lost, harmful = pc.equal(harm, LOST), pc.not_equal(harm, HARMLESS)
     return test(lost, "won"), test(harmful, "undone")
 
 

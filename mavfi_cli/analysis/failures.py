@@ -36,7 +36,8 @@ def kernel_summary(path: Path) -> Mapping[str, Any]:
         found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]
         for each in found["kernels"]:
-            each["kernel"], silent_of_all(each)
+            sdc = each["outcomes"]["sdc"]
+            each["kernel"], sdc["count"], sdc["of"]
     except OSError as error:
         raise RecordError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError) as error:
@@ -55,14 +56,7 @@ def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
     return Share(count=told["count"], total=told["of"], share=share, low=low, high=high)
 
 
-def silent_of_all(kernel: Mapping[str, Any]) -> tuple[int, int]:
-    """Silent corruptions of a kernel, and faults that were injected into it."""
-    sdc = kernel["outcomes"]["sdc"]
-    return sdc["count"], sdc["of"]
-
-
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
-Runs = Mapping[str, tuple[int, int]]  # kernel -> silent corruptions, injected faults
 
 
 def failures(
@@ -88,7 +82,8 @@ def failures(
         RecordError: the folder does not exist or cannot be read.
         ConfigError: the kernels were attacked with other faults; a negative rate.
     """
-    alone = None if kernels is None else _Alone(kernels)
+    alone = None if kernels is None else kernel_summary(kernels / KERNELS)
+    silent = {each["kernel"]: each["outcomes"]["sdc"] for each in alone["kernels"]} if alone else {}
     succeeds = [each.codes("pair")[each.counted & each.succeeded]
                 for each in found if each.golden and not each.watched]  # fmt: skip
     golden = np.concatenate([np.zeros(0, dtype=np.int64), *succeeds])
@@ -103,9 +98,10 @@ def failures(
         numbers = group.codes("number")[places].tolist()
         configs = [each.mission.config for each in ledger.results(numbers)] if alone else []
         kernel, layers = _kernel(configs), None
-        if alone is not None and kernel is not None and kernel in alone.runs:
-            alone.require(configs[0])
-            layers = cross_layer(*alone.runs[kernel], failed, struck, confidence)
+        if kernels is not None and alone is not None and kernel in silent:
+            _require_same_faults(configs[0], alone["plan"], kernels / KERNELS)
+            sdc = silent[kernel]
+            layers = cross_layer(sdc["count"], sdc["of"], failed, struck, confidence)
         hourly = None if upsets_per_hour is None else failures_per_hour(upsets_per_hour, failure)
         rows.append(
             {
@@ -133,24 +129,16 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
     return nodes.pop() if len(nodes) == 1 else None
 
 
-class _Alone:
-    """Effects of faults on the isolated kernels."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / KERNELS
-        told = kernel_summary(self._path)
-        self._population = {name: told["plan"][name] for name in ("rule", "compat", "model")}
-        self.runs: Runs = {each["kernel"]: silent_of_all(each) for each in told["kernels"]}
-
-    def require(self, config: MissionConfig) -> None:
-        """Require that a mission's fault is drawn like those of the isolated kernels."""
-        fault = config.instruction
-        assert fault is not None
-        drawn = fault.strategy()
-        ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
-        if ours != self._population:
-            raise ConfigError(
-                f"faults were drawn by {canonical(self._population)}, in the campaign by "
-                f"{canonical(ours)}: not the same population",
-                path=self._path,
-            )
+def _require_same_faults(config: MissionConfig, plan: Mapping[str, Any], path: Path) -> None:
+    """Require that a mission's fault is drawn like those of the isolated kernels."""
+    fault = config.instruction
+    assert fault is not None
+    drawn = fault.strategy()
+    ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
+    theirs = {name: plan[name] for name in ours}
+    if ours != theirs:
+        raise ConfigError(
+            f"faults were drawn by {canonical(theirs)}, in the campaign by {canonical(ours)}: not "
+            "the same population",
+            path=path,
+        )

@@ -43,8 +43,8 @@ _SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Struck:
-    """The counted flights of a platform and setting, with their own golden flights.
+class FaultCosts:
+    """The cost of the faults of a platform and setting, over their own golden flights.
 
     Attributes:
         costs: one row per pair that reached the goal: `seed`, `target`, `fault_seed`, `cost_s`,
@@ -57,93 +57,86 @@ class _Struck:
     lost: int
     longest_s: float
 
-    @property
-    def worst(self) -> dict[str, Any] | None:
-        """The row with the largest ratio to its golden flight; the lowest seed of equal ones."""
-        rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
-        return rows.slice(0, 1).to_pylist()[0] if rows.num_rows else None
+    @classmethod
+    def of(cls, golden: pa.Table, counted: pa.Table) -> FaultCosts:
+        """Compare flights with the golden flights of the same missions."""
+        own, known = paired(golden, counted, ["seed"])
+        won = known["succeeded"]
+        own_s = numbers(own.filter(won), "flight_time_s")
+        pairs = known.filter(won)
+        time_s = numbers(pairs, "flight_time_s")
+        costs = pairs.select([*MISSION, "fault_seed"]).append_column(
+            "cost_s", pa.array(time_s - own_s)
+        )
+        longest = numbers(chosen(counted, succeeded=True), "flight_time_s")
+        return cls(
+            costs=costs.append_column("over_own", pa.array(time_s / own_s)),
+            lost=known.num_rows - pairs.num_rows,
+            longest_s=max(longest.tolist(), default=math.nan),
+        )
 
-    def largest(self, measure: str) -> float:
+    def _largest(self, measure: str) -> float:
         """Largest value of a column; NaN without pairs."""
         found = pc.max(self.costs[measure]).as_py()
         return math.nan if found is None else float(found)
 
+    def row(self, bare: FaultCosts, *, protected: bool) -> dict[str, Any]:
+        """The cost of a setting's faults on a platform.
 
-def struck(golden: pa.Table, counted: pa.Table) -> _Struck:
-    """Compare flights with the golden flights of the same missions."""
-    own, known = paired(golden, counted, ["seed"])
-    won = known["succeeded"]
-    own, pairs = own.filter(won), known.filter(won)
-    own_s, time_s = numbers(own, "flight_time_s"), numbers(pairs, "flight_time_s")
-    costs = pairs.select([*MISSION, "fault_seed"])
-    return _Struck(
-        costs=costs.append_column("cost_s", pa.array(time_s - own_s)).append_column(
-            "over_own", pa.array(time_s / own_s)
-        ),
-        lost=known.num_rows - pairs.num_rows,
-        longest_s=max(
-            numbers(chosen(counted, succeeded=True), "flight_time_s").tolist(), default=math.nan
-        ),
-    )
+        Args:
+            bare: the same without a detector on this platform, the reference of recovery.
 
+        Returns:
+            `cost_s`: mean with its interval and the largest; `over_own`: the 95th percentile with
+            its interval and the largest. Several faults of one mission are no independent samples:
+            intervals draw missions. `recovered_share` is the part of the largest increase without
+            detector that is gone, not a number where there is none. `worst_flight`: the one with
+            the largest ratio to its golden flight; the lowest seed of equal ones.
+        """
+        cost_s, over_own = (_by_mission(self.costs, name) for name in ("cost_s", "over_own"))
+        worst, count = self._largest("over_own"), len(cost_s)
+        recovered = worst_case(OWN, [bare._largest("over_own")], [worst])["recovered_share"]
+        rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
+        flight = rows.select([*MISSION, "fault_seed"]).slice(0, 1).to_pylist()
+        return {
+            "pairs": self.costs.num_rows,
+            "lost": self.lost,
+            "cost_s": {
+                "mean": _over(count, lambda drawn: _mean(cost_s[drawn])),
+                "largest": self._largest("cost_s"),
+            },
+            "over_own": {
+                "p95": _over(count, lambda drawn: _late(over_own[drawn])),
+                "largest": worst,
+                "recovered_share": recovered if protected else math.nan,
+            },
+            "worst_flight": flight[0] if flight else None,
+        }
 
-def cost_row(found: _Struck, faults: _Struck, *, protected: bool) -> dict[str, Any]:
-    """The cost of a setting's faults on a platform.
+    def extra(self, first: FaultCosts) -> dict[str, Any]:
+        """The additional cost of the same faults compared with the reference platform.
 
-    Args:
-        faults: the same without a detector on this platform, the reference of recovery.
-
-    Returns:
-        `cost_s`: mean with its interval and the largest; `over_own`: the 95th percentile with its
-        interval and the largest. Several faults of one mission are no independent samples:
-        intervals draw missions. `recovered_share` is the part of the largest increase without
-        detector that is gone, not a number where there is none.
-    """
-    cost_s, over_own = (_by_mission(found.costs, name) for name in ("cost_s", "over_own"))
-    worst, bare = found.largest("over_own"), faults.largest("over_own")
-    flight, count = found.worst, len(cost_s)
-    return {
-        "pairs": found.costs.num_rows,
-        "lost": found.lost,
-        "cost_s": {
-            "mean": _over(count, lambda drawn: _mean(cost_s[drawn])),
-            "largest": found.largest("cost_s"),
-        },
-        "over_own": {
-            "p95": _over(count, lambda drawn: _late(over_own[drawn])),
-            "largest": worst,
-            "recovered_share": worst_case(OWN, [bare], [worst])["recovered_share"]
-            if protected
-            else math.nan,
-        },
-        "worst_flight": flight and {name: flight[name] for name in (*MISSION, "fault_seed")},
-    }
-
-
-def cost_difference(first: _Struck, second: _Struck) -> dict[str, Any]:
-    """The additional cost of the same faults compared with the reference platform.
-
-    Returns:
-        `extra_s`: the mean difference of costs; `differ`: how many of them are not zero; `p_value`:
-        of the mean, by missions; `p95_ratio`: of the 95th percentiles over own golden; all are
-        over the faults that both platforms have a cost of. Of all flights of
-        each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
-        longest in seconds.
-    """
-    there, here = paired(first.costs, second.costs, MISSION)
-    extra = _by_mission(here, "cost_s") - _by_mission(there, "cost_s")
-    extra[np.abs(extra) < _SAME_S] = 0.0
-    first_own, second_own = _by_mission(there, "over_own"), _by_mission(here, "over_own")
-    count = len(extra)
-    return {
-        "pairs": here.num_rows,
-        "differ": int(np.count_nonzero(np.nan_to_num(extra))),
-        "extra_s": _over(count, lambda drawn: _mean(extra[drawn])),
-        "p_value": sign_flips(np.nansum(extra, axis=1).tolist()) if count else math.nan,
-        "p95_ratio": _over(count, lambda drawn: _late(second_own[drawn]) / _late(first_own[drawn])),
-        "largest_ratio": second.largest("over_own") / first.largest("over_own"),
-        "longest_ratio": second.longest_s / first.longest_s,
-    }
+        Returns:
+            `extra_s`: the mean difference of costs; `differ`: how many of them are not zero;
+            `p_value`: of the mean, by missions; `p95_ratio`: of the 95th percentiles over own
+            golden; all are over the faults that both platforms have a cost of. Of all flights of
+            each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
+            longest in seconds.
+        """
+        there, here = paired(first.costs, self.costs, MISSION)
+        extra = _by_mission(here, "cost_s") - _by_mission(there, "cost_s")
+        extra[np.abs(extra) < _SAME_S] = 0.0
+        before, after = _by_mission(there, "over_own"), _by_mission(here, "over_own")
+        count = len(extra)
+        return {
+            "pairs": here.num_rows,
+            "differ": int(np.count_nonzero(np.nan_to_num(extra))),
+            "extra_s": _over(count, lambda drawn: _mean(extra[drawn])),
+            "p_value": sign_flips(np.nansum(extra, axis=1).tolist()) if count else math.nan,
+            "p95_ratio": _over(count, lambda drawn: _late(after[drawn]) / _late(before[drawn])),
+            "largest_ratio": self._largest("over_own") / first._largest("over_own"),
+            "longest_ratio": self.longest_s / first.longest_s,
+        }
 
 
 def _worst_row(
@@ -276,7 +269,7 @@ def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
     counted = {place: chosen(table, counted=True) for place, table in every.items()}
     won = {place: chosen(table, succeeded=True) for place, table in counted.items()}
     found = {
-        (platform, setting): struck(won[platform, GOLDEN], counted[platform, setting])
+        (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
         for platform, setting in itertools.product(platforms, faulty)
     }
 
@@ -294,11 +287,11 @@ def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
             for p, s in itertools.product(others, settings)
         ],
         "costs": [
-            {**at(p, s), **cost_row(found[p, s], found[p, NONE], protected=s != NONE)}
+            {**at(p, s), **found[p, s].row(found[p, NONE], protected=s != NONE)}
             for p, s in itertools.product(platforms, faulty)
         ],
         "cost_differences": [
-            {**at(p, s), "reference": first, **cost_difference(found[first, s], found[p, s])}
+            {**at(p, s), "reference": first, **found[p, s].extra(found[first, s])}
             for p, s in itertools.product(others, faulty)
         ],
         "worst": [

@@ -104,36 +104,34 @@ class Group:
         """A metric of the counted successful missions that have it."""
         return known(self.metrics[metric][self.succeeded & self.counted])
 
+    def matched(self, other: Group) -> tuple[IntArray, IntArray]:
+        """Counted missions of equal pairs: row indices in this and in the other, (m,) each.
 
-def matched(first: Group, second: Group) -> tuple[IntArray, IntArray]:
-    """Counted missions of equal pairs: row indices in the first and in the second, (m,) each.
+        The order is that of the other. Missions with faults match if the same faults strike them.
+        If a pair was flown several times, the first flights match, then the second ones, and so on.
+        One golden flight matches all.
+        """
+        alike = ("pair",) if self.golden else ("pair", "strike")
+        here, there = self._timed(alike), other._timed(alike)
+        if self.golden:
+            here, there = paired(here.filter(pc.equal(here["time"], 0)), there, alike)
+        else:
+            here, there = paired(here, there, (*alike, "time"))
+        return here["place"].to_numpy(), there["place"].to_numpy()
 
-    The order is that of the second. Missions with faults match if the same faults strike them.
-    If a pair was flown several times, the first flights match, then the second ones, and so on.
-    One golden flight matches all.
-    """
-    alike = ("pair",) if first.golden else ("pair", "strike")
-    here, there = _timed(first, alike), _timed(second, alike)
-    if first.golden:
-        here = here.filter(pc.equal(here["time"], 0))
-        here, there = paired(here, there, alike)
-    else:
-        here, there = paired(here, there, (*alike, "time"))
-    return here["place"].to_numpy(), there["place"].to_numpy()
-
-
-def _timed(group: Group, alike: Sequence[str]) -> pa.Table:
-    """Row index and `alike` of each counted mission, and the number of earlier equal ones."""
-    places = np.flatnonzero(group.counted)
-    columns = {name: group.codes(name)[places] for name in alike}
-    order = np.lexsort([*columns.values()])  # stable
-    new = np.ones(len(places), dtype=bool)
-    if len(places):
-        new[1:] = np.any([np.diff(column[order]) != 0 for column in columns.values()], axis=0)
-    begins = np.flatnonzero(new)
-    times = np.empty(len(places), dtype=np.int64)
-    times[order] = np.arange(len(places)) - np.repeat(begins, np.diff(begins, append=len(places)))
-    return pa.table({**columns, "time": times, "place": places})
+    def _timed(self, alike: Sequence[str]) -> pa.Table:
+        """Row index and `alike` of each counted mission, and the number of earlier equal ones."""
+        places = np.flatnonzero(self.counted)
+        columns = {name: self.codes(name)[places] for name in alike}
+        order = np.lexsort([*columns.values()])  # stable
+        new = np.ones(len(places), dtype=bool)
+        if len(places):
+            new[1:] = np.any([np.diff(column[order]) != 0 for column in columns.values()], axis=0)
+        begins = np.flatnonzero(new)
+        earlier = np.repeat(begins, np.diff(begins, append=len(places)))
+        times = np.empty(len(places), dtype=np.int64)
+        times[order] = np.arange(len(places)) - earlier
+        return pa.table({**columns, "time": times, "place": places})
 
 
 def untreated(labels: Mapping[str, Any]) -> str:
@@ -247,7 +245,7 @@ class _Match:
     def _golden_of_first(self) -> IntArray:
         """Row index of the golden flight of each pair, (m,); -1 if there is none."""
         own = np.full(self.first.flights.num_rows, -1)
-        at_golden, at_faulty = matched(self.golden, self.first)
+        at_golden, at_faulty = self.golden.matched(self.first)
         own[at_faulty] = at_golden
         return own[self.at_first]
 
@@ -275,7 +273,7 @@ def _against_golden(groups: Sequence[Group], confidence: float) -> list[dict[str
     for group in groups:
         golden = _golden_for(group, groups)
         if golden is not None:
-            found.append(_Match(golden, group, golden, *matched(golden, group)))
+            found.append(_Match(golden, group, golden, *golden.matched(group)))
     return _compared(found, confidence)
 
 
@@ -294,7 +292,7 @@ def _protection(groups: Sequence[Group], confidence: float) -> list[dict[str, An
             continue
         faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
         if faulty is not None and golden is not None:
-            found.append(_Match(faulty, group, golden, *matched(faulty, group)))
+            found.append(_Match(faulty, group, golden, *faulty.matched(group)))
     return _compared(found, confidence)
 
 

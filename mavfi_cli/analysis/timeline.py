@@ -15,11 +15,7 @@ from mavfi_cli.core.types import Invocation, Outcome, Reaction
 from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.spec.platform import KERNELS
 
-CHAIN = (
-    "point_cloud",
-    "octomap",
-    "collision_check",
-)  # from a frame to the verdict on the trajectory
+_CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict
 LEAST_S = 1.0  # least duration of a timeline
 _ANSWERS = ("slow", "stop")  # events: reactions of the pilot to a foreseen collision
 _PLAN_WITHIN_S = 3.0
@@ -58,11 +54,11 @@ def _timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, An
     ran, reactions = run.folder.read_timetable()
     told = {e["stamp_s"]: e["text"] for e in run.record.events if e["kind"] in _ANSWERS}
     stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
-    reaction = typical(reactions, told)
+    reaction = _typical(reactions, told)
     if reaction is None:
         return None
     zero_s, answer_s = reaction.frame_stamp_s, reaction.setpoint_stamp_s
-    chain = chain_of(ran, reaction)
+    chain = _chain_of(ran, reaction)
     plan = _planned(ran, answer_s) if answer_s in told else None
     plan_setpoint_s = None if plan is None else _answered(ran, stamps, plan.end_s)
     last_s = max(answer_s, plan_setpoint_s or 0.0) + _MARGIN_S
@@ -77,12 +73,19 @@ def _timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, An
             each.node: [each.start_s - zero_s, each.end_s - zero_s]
             for each in (*chain, *(() if plan is None else (plan,)))
         },
-        "lanes_s": {kernel: _spans(ran, kernel, shown, zero_s) for kernel in KERNELS},
+        "lanes_s": {
+            kernel: [
+                [each.start_s - zero_s, each.end_s - zero_s]
+                for each in ran
+                if each.node == kernel and each.end_s >= shown[0] and each.start_s <= shown[1]
+            ]
+            for kernel in KERNELS
+        },
         "setpoints_s": [s - zero_s for s in stamps if shown[0] <= s <= shown[1]],
     }
 
 
-def typical(reactions: Sequence[Reaction], told: Collection[float] = ()) -> Reaction | None:
+def _typical(reactions: Sequence[Reaction], told: Collection[float]) -> Reaction | None:
     """The reaction whose time is nearest the median of the flight's; the first of equals.
 
     Args:
@@ -90,39 +93,28 @@ def typical(reactions: Sequence[Reaction], told: Collection[float] = ()) -> Reac
     """
     if not reactions:
         return None
-    median_s = statistics.median(map(_time_s, reactions))
+    times_s = {each: each.setpoint_stamp_s - each.frame_stamp_s for each in reactions}
+    median_s = statistics.median(times_s.values())
     chosen = [each for each in reactions if each.setpoint_stamp_s in told] or reactions
-    return min(chosen, key=lambda each: (abs(_time_s(each) - median_s), each.frame_stamp_s))
+    return min(chosen, key=lambda each: (abs(times_s[each] - median_s), each.frame_stamp_s))
 
 
-def _time_s(reaction: Reaction) -> float:
-    return reaction.setpoint_stamp_s - reaction.frame_stamp_s
-
-
-def chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
+def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
     """The invocations through which a frame reached its setpoint, in order; control's is the last.
 
     The list is shorter if the time table lacks some.
     """
     found: list[Invocation] = []
     before_s = reaction.setpoint_stamp_s
-    for kernel in reversed(CHAIN):
-        last = _last(invocations, kernel, before_s)
-        if last is None:
+    for kernel in reversed(_CHAIN):  # the newest output of each
+        over = [e for e in invocations if e.node == kernel and e.end_s <= before_s + _SAME_S]
+        if not over:
             break
-        found.insert(0, last)
-        before_s = last.start_s
+        found.insert(0, max(over, key=lambda each: each.end_s))
+        before_s = found[0].start_s
     ends_s = found[-1].end_s if found else reaction.frame_stamp_s
-    control = [
-        each for each in invocations if each.node == "control" and ends_s - _SAME_S <= each.start_s
-    ]
+    control = [e for e in invocations if e.node == "control" and ends_s - _SAME_S <= e.start_s]
     return [*found, *control[:1]]
-
-
-def _last(invocations: Sequence[Invocation], kernel: str, before_s: float) -> Invocation | None:
-    """The newest output of a kernel at a time."""
-    over = [e for e in invocations if e.node == kernel and e.end_s <= before_s + _SAME_S]
-    return max(over, key=lambda each: each.end_s, default=None)
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
@@ -143,17 +135,6 @@ def _answered(
             due_s = each.start_s if delay_s < SAME_TICK_S else each.end_s
             return next((stamp for stamp in stamps_s if stamp >= due_s - _SAME_S), None)
     return None
-
-
-def _spans(
-    invocations: Sequence[Invocation], kernel: str, shown: tuple[float, float], zero_s: float
-) -> list[list[float]]:
-    """Start and end of a kernel's invocations in a window, s from its zero."""
-    return [
-        [each.start_s - zero_s, each.end_s - zero_s]
-        for each in invocations
-        if each.node == kernel and each.end_s >= shown[0] and each.start_s <= shown[1]
-    ]
 
 
 def timeline_seed(flown: Sequence[Mapping[str, Any]], platforms: Sequence[str]) -> int | None:

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.failures import silent_of_all
 from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.paper.beyond import (
@@ -49,7 +48,8 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
     as_paper = {stack: those.chosen(as_paper=True) for stack, those in flown.items()}
     flights = {stack: those.chosen(at=(None, "random")) for stack, those in as_paper.items()}
     kernels = evidence.isolated
-    silent = {name: silent_of_all(each) for name, each in kernels.items()}
+    sdc = {name: each["outcomes"]["sdc"] for name, each in kernels.items()}
+    silent = {name: (each["count"], each["of"]) for name, each in sdc.items()}
     claims = [claim.judged(flights, kernels) for claim in CLAIMS]
     maps = {stack: state_map(as_paper[stack]) for stack in STACKS}
     return {

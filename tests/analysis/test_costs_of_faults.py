@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from flown_twice import SEEDS, flight, table
 
-from mavfi_cli.analysis import platforms as question
-from mavfi_cli.analysis.platforms import cost_difference
+from mavfi_cli.analysis.platforms import FaultCosts
 
 
 def struck(golden, counted):
-    return question.struck(table(golden), table(counted))
+    return FaultCosts.of(table(golden), table(counted))
 
 
 def cost_row(setting, found, faults):
-    return question.cost_row(found, faults, protected=setting != "none")
+    return found.row(faults, protected=setting != "none")
 
 
 def of(platform, costs, *, golden_s=20.0, target="planning", lost=()):
@@ -94,7 +93,7 @@ def test_missing_flights_of_a_mission_leave_the_others():
 def test_platforms_are_compared_over_the_faults_that_both_have_a_cost_of():
     first = of("x86", {1: 0.0, 2: 1.0, 3: 0.0, 4: 99.0})
     second = of("tx2", {1: 0.5, 2: 3.0, 3: 0.5, 5: 99.0})
-    told = cost_difference(first, second)
+    told = second.extra(first)
     assert told["pairs"] == 3
     assert told["extra_s"]["value"] == pytest.approx(1.0)
     assert told["extra_s"]["low"] >= 0.5
@@ -111,13 +110,13 @@ def test_the_longest_flight_counts_where_its_golden_one_failed_too():
     first = struck([flight("x86", 1, 20.0)], [flight("x86", s, 20.0 * s, "none") for s in (1, 2)])
     second = struck([flight("tx2", 1, 20.0)], [flight("tx2", s, 30.0 * s, "none") for s in (1, 2)])
     assert (second.costs.num_rows, second.longest_s) == (1, 60.0)
-    told = cost_difference(first, second)
+    told = second.extra(first)
     assert (told["pairs"], told["longest_ratio"]) == (1, 1.5)
 
 
 def test_equal_costs_differ_by_nothing_with_no_width():
     costs = {seed: float(seed % 3) for seed in SEEDS}
-    told = cost_difference(of("x86", costs), of("tx2", costs))
+    told = of("tx2", costs).extra(of("x86", costs))
     assert told["extra_s"] == {"value": 0.0, "low": 0.0, "high": 0.0, "count": 10}
     assert told["p95_ratio"] == {"value": 1.0, "low": 1.0, "high": 1.0, "count": 10}
 
@@ -125,7 +124,7 @@ def test_equal_costs_differ_by_nothing_with_no_width():
 def test_three_faults_that_cost_more_are_no_difference_whatever_the_interval():
     """A bootstrap of zeros and a few positive costs never falls below zero; chance is 2 in 8."""
     costs = dict.fromkeys(range(1, 51), 0.0)
-    told = cost_difference(of("x86", costs), of("tx2", costs | {3: 1.84, 14: 0.38, 15: 0.5}))
+    told = of("tx2", costs | {3: 1.84, 14: 0.38, 15: 0.5}).extra(of("x86", costs))
     assert (told["pairs"], told["differ"]) == (50, 3)
     assert told["extra_s"]["low"] > 0.0
     assert told["p_value"] == pytest.approx(0.25)
@@ -139,5 +138,5 @@ def test_the_chance_takes_the_faults_of_one_mission_as_one():
         return struck(own, [flight(platform, s, 20.0 + cost_s, "none", target=target)
                             for s in (1, 2, 3) for target in ("planning", "control")])  # fmt: skip
 
-    told = cost_difference(found("x86", 0.0), found("tx2", 1.0))
+    told = found("tx2", 1.0).extra(found("x86", 0.0))
     assert (told["pairs"], told["differ"], told["p_value"]) == (6, 6, 0.25)

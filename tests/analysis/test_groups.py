@@ -5,7 +5,7 @@ import pyarrow as pa
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavfi_cli.analysis.summary import METRICS, Group, matched
+from mavfi_cli.analysis.summary import METRICS, Group
 from mavfi_cli.campaigns.missions import Injected
 
 FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)
@@ -46,7 +46,7 @@ def expected(first, second, *, golden):
 
 @given(first=MISSIONS, second=MISSIONS)
 def test_missions_of_a_pair_meet_one_by_one(first, second):
-    found = matched(group([*first, ("a", True)]), group(second))
+    found = group([*first, ("a", True)]).matched(group(second))
     assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
         [*first, ("a", True)], second, golden=False
     )
@@ -55,7 +55,7 @@ def test_missions_of_a_pair_meet_one_by_one(first, second):
 @given(pairs=st.lists(st.sampled_from(PAIRS), max_size=12), second=MISSIONS)
 def test_one_golden_flight_serves_all_of_its_pair(pairs, second):
     first = [(pair, True) for pair in pairs]
-    found = matched(group(first, (Injected.GOLDEN.value,) * 2), group(second))
+    found = group(first, (Injected.GOLDEN.value,) * 2).matched(group(second))
     assert list(zip(*map(np.ndarray.tolist, found), strict=True)) == expected(
         first, second, golden=True
     )

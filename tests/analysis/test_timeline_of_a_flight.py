@@ -1,8 +1,10 @@
 """The way of a frame through the kernels, found again in a time table."""
 
+from types import SimpleNamespace
+
 import pytest
 
-from mavfi_cli.analysis.timeline import chain_of, timelines, typical
+from mavfi_cli.analysis.timeline import timelines
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.types import Invocation, Reaction
 from mavfi_cli.mission.run_folder import RunFolder, load_run
@@ -35,6 +37,13 @@ def test_a_damaged_time_table_is_one_line(tmp_path, bad):
         folder.read_timetable()
 
 
+def flight(invocations, reactions, events=()):
+    """What a timeline reads of a run."""
+    folder = SimpleNamespace(read_timetable=lambda: (invocations, reactions))
+    record = SimpleNamespace(events=[{"kind": "slow", "stamp_s": s, "text": "?"} for s in events])
+    return {"x86": SimpleNamespace(folder=folder, record=record, trace=None)}
+
+
 def test_the_chain_takes_the_newest_output_that_was_there():
     """The frame of 1.1 waits for the map; that of 1.0 was overtaken, that of 1.2 came too late."""
     table = [
@@ -43,18 +52,24 @@ def test_the_chain_takes_the_newest_output_that_was_there():
         ran("collision_check", 1.15, 1.2), ran("collision_check", 1.6, 1.65),
         ran("control", 1.64, 1.641), ran("control", 1.66, 1.661), ran("control", 1.68, 1.681),
     ]  # fmt: skip
-    assert chain_of(table, reaction(1.1, 1.66)) == [
-        ran("point_cloud", 1.1, 1.11), ran("octomap", 1.15, 1.6),
-        ran("collision_check", 1.6, 1.65), ran("control", 1.66, 1.661),
-    ]  # fmt: skip
+    (told,) = timelines(flight(table, [reaction(1.1, 1.66)]))
+    assert told["chain_s"] == {
+        node: [pytest.approx(start_s - 1.1), pytest.approx(end_s - 1.1)]
+        for node, start_s, end_s in (
+            ("point_cloud", 1.1, 1.11), ("octomap", 1.15, 1.6),
+            ("collision_check", 1.6, 1.65), ("control", 1.66, 1.661),
+        )
+    }  # fmt: skip
 
 
 def test_the_typical_reaction_is_near_the_median_and_one_that_did_something():
     slow, middle, acted = reaction(1.0, 1.9), reaction(2.0, 2.4), reaction(3.0, 3.5)
-    fast = reaction(4.0, 4.1)
-    assert typical([slow, middle, acted, fast]) is middle
-    assert typical([slow, middle, acted, fast], {3.5}) is acted
-    assert typical([]) is None
+    reactions = [slow, middle, acted, reaction(4.0, 4.1)]
+    (told,) = timelines(flight([], reactions))
+    assert told["frame_stamp_s"] == middle.frame_stamp_s
+    (told,) = timelines(flight([], reactions, events=(3.5,)))
+    assert told["frame_stamp_s"] == acted.frame_stamp_s
+    assert timelines(flight([], [])) == []
 
 
 def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_flight):
