@@ -22,7 +22,7 @@ import numpy as np
 
 from mavfi_cli import library
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import ResultState, injected_of
+from mavfi_cli.campaigns.missions import Injected, ResultState
 from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -58,7 +58,7 @@ def make(folder: Path, missions: int) -> None:
             }
             ledger.add(
                 number, state=ResultState.FLOWN, result=told, reason="", path=None,
-                injected=injected_of(told, asked=not golden), wall_s=1.0, attempts=1,
+                injected=Injected.of(told, asked=not golden), wall_s=1.0, attempts=1,
             )  # fmt: skip
 
 

@@ -21,14 +21,14 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import (
-    BatchLimiter,
+    MissionQueue,
     Options,
     require_unchanged,
     run_campaign,
     store_plan,
 )
-from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec, differences
-from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced, to_toml
+from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced
 from mavfi_cli.core.errors import (
     ConfigError,
     FaultSpecError,
@@ -158,7 +158,7 @@ def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[
     ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
     grows = asked.repetitions > stored.repetitions
     alike = replace(ours, repetitions=stored.repetitions) if grows else ours
-    if found := differences(stored, alike, repetitions=repetitions):
+    if found := stored.differences(alike, repetitions):
         raise ConfigError(
             f"holds another {what}: {'; '.join(found)}; choose another --out", path=folder
         )
@@ -177,8 +177,8 @@ def stopped(ledger: Ledger) -> list[str]:
     if spec is None or spec.stop is None:
         return []
     cells = ledger.cells()
-    gate = BatchLimiter(spec.stop, ledger.cell_of_each(), ledger.fates())
-    return [label_text(cells[cell]) for cell in sorted(gate.stopped)]
+    queue = MissionQueue(iter(()), spec.stop, ledger.cell_of_each(), ledger.fates())
+    return [label_text(cells[cell]) for cell in sorted(queue.stopped)]
 
 
 def begin(
@@ -211,7 +211,7 @@ def begin(
             spec, missions or flyable(spec), folder, options or Options(), spectator or Spectator()
         )
         missions = flyable(spec)
-    text = to_toml(spec)
+    text = spec.to_toml()
     with contextlib.ExitStack() as undo:
         ledger = undo.enter_context(Ledger(folder, writing=True))
         if begun and ledger.meta("spec") == text:  # the list is what it would expand to
@@ -222,7 +222,7 @@ def begin(
                 ledger,
                 missions or flyable(spec),
                 append=append,
-                differing=[] if stored is None else differences(stored, spec),
+                differing=[] if stored is None else stored.differences(spec),
                 can_append=_APPEND,
             )
             ledger.set_meta({"spec": text, "name": spec.name})

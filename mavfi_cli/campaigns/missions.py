@@ -134,6 +134,19 @@ class ResultState(Enum):
     ERROR = "error"  # it could not begin: no result, and counted nowhere
 
 
+# By the activation in a record; any other is active.
+_BY_ACTIVATION = {
+    "read": "active",
+    "withheld": "active",
+    "unchanged": "not_activated",
+    "not_read": "not_activated",
+    "not_injected": "not_injected",
+    "overwritten": "not_activated",
+    "ended_before_read": "not_activated",
+    "not_read_in_window": "unread",
+}
+
+
 class Injected(Enum):
     """What happened to the fault of a flown mission."""
 
@@ -144,6 +157,42 @@ class Injected(Enum):
     NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was over
     NOT_INJECTED = "not_injected"  # the mission ended, or the run parted, before the trigger
     NULL = "null"  # everything but the flip, as was asked for
+
+    @classmethod
+    def of(cls, result: Mapping[str, Any], *, asked: bool) -> Injected:
+        """What happened to the fault of a mission, by its record.
+
+        Args:
+            result: result.json.
+            asked: true if the mission was to have a fault.
+        """
+        flight = record_of(result)
+        fault = flight.fault
+        if not asked:
+            return cls.GOLDEN
+        if not fault or fault["state"] in ("planned", "not_injected"):
+            return cls.NOT_INJECTED
+        if fault["state"] == "null":
+            return cls.NULL
+        activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
+        found = cls(_BY_ACTIVATION.get(activation["activation"], "active"))
+        return cls.CAUGHT if found is cls.NOT_ACTIVATED and _caught(flight) else found
+
+
+def _caught(flight: FlightRecord) -> bool:
+    """True if an alarm withheld the struck value: at its stamp, or by the name of its state."""
+    strikes = flight.fault.get("strikes") or []
+    stamps = {strike["stamp_s"] for strike in strikes}
+    states = {change["state"] for strike in strikes for change in strike["changes"]}
+    alarms = flight.detection.get("alarms", [])
+    return any(
+        alarm["response"] != "accept"
+        and (
+            alarm["stamp_s"] in stamps
+            or (alarm["stamp_s"] >= min(stamps) and not states.isdisjoint(alarm["states"]))
+        )
+        for alarm in (alarms if stamps else [])
+    )
 
 
 # Missions whose success the fault, if there was one, could affect.
@@ -177,51 +226,3 @@ class MissionResult:
     wall_s: float
     attempts: int
     path: Path | None
-
-
-_BY_ACTIVATION = {
-    "read": Injected.ACTIVE,
-    "withheld": Injected.ACTIVE,
-    "unchanged": Injected.NOT_ACTIVATED,
-    "not_read": Injected.NOT_ACTIVATED,
-    "not_injected": Injected.NOT_INJECTED,
-    "overwritten": Injected.NOT_ACTIVATED,
-    "ended_before_read": Injected.NOT_ACTIVATED,
-    "not_read_in_window": Injected.UNREAD,
-}
-
-
-def injected_of(result: Mapping[str, Any], *, asked: bool) -> Injected:
-    """Read from the record of the mission what happened to its fault.
-
-    Args:
-        result: result.json.
-        asked: true if the mission was to have a fault.
-    """
-    flight = record_of(result)
-    fault = flight.fault
-    if not asked:
-        return Injected.GOLDEN
-    if not fault or fault["state"] in ("planned", "not_injected"):
-        return Injected.NOT_INJECTED
-    if fault["state"] == "null":
-        return Injected.NULL
-    activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
-    found = _BY_ACTIVATION.get(activation["activation"], Injected.ACTIVE)
-    return Injected.CAUGHT if found is Injected.NOT_ACTIVATED and _caught(flight) else found
-
-
-def _caught(flight: FlightRecord) -> bool:
-    """True if an alarm withheld the struck value: at its stamp, or by the name of its state."""
-    strikes = flight.fault.get("strikes") or []
-    stamps = {strike["stamp_s"] for strike in strikes}
-    states = {change["state"] for strike in strikes for change in strike["changes"]}
-    alarms = flight.detection.get("alarms", [])
-    return any(
-        alarm["response"] != "accept"
-        and (
-            alarm["stamp_s"] in stamps
-            or (alarm["stamp_s"] >= min(stamps) and not states.isdisjoint(alarm["states"]))
-        )
-        for alarm in (alarms if stamps else [])
-    )

@@ -24,11 +24,11 @@ from typing import Any
 from mavfi_cli.campaigns.ledger import RUNS, Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
+    Injected,
     PlannedMission,
     ResultState,
     canonical,
     changes_of,
-    injected_of,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
@@ -36,10 +36,9 @@ from mavfi_cli.campaigns.workers import (
     TASK,
     AttemptEnd,
     CampaignStopped,
+    Cluster,
     LocalWorkers,
     Verdict,
-    Workers,
-    judge,
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
@@ -53,103 +52,6 @@ from mavfi_cli.stats.shares import rate
 
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
 Row = tuple[str | None, str | None]  # outcome, what happened to the fault
-
-
-class BatchLimiter:
-    """Lets missions through a batch of their setting at a time.
-
-    Args:
-        stop: the rule.
-        cells: the setting of each mission, in the order of the list.
-        over: number, outcome and fate of the fault of every mission that is over.
-    """
-
-    def __init__(
-        self, stop: Stop, cells: Sequence[int], over: Iterable[tuple[int, Row]] = ()
-    ) -> None:
-        self._stop = stop
-        self._cells = cells
-        self._members: dict[int, list[int]] = {}
-        self._place: list[int] = []
-        for number, cell in enumerate(cells):
-            members = self._members.setdefault(cell, [])
-            self._place.append(len(members))
-            members.append(number)
-        self._open = dict.fromkeys(self._members, stop.batch)
-        self._over: dict[int, Row] = {}
-        self._finished: Counter[int] = Counter()  # missions over below the open boundary
-        self.stopped: set[int] = set()
-        for number, row in over:
-            self.record(number, row)
-
-    def passes(self, number: int) -> bool:
-        """True if this mission may begin now."""
-        cell = self._cells[number]
-        return cell not in self.stopped and self._place[number] < self._open[cell]
-
-    def record(self, number: int, row: Row) -> None:
-        """Note that a mission is over."""
-        cell = self._cells[number]
-        self._over[number] = row
-        if self._place[number] < self._open[cell]:
-            self._finished[cell] += 1
-        while self._complete(cell):
-            if self._narrow(cell):
-                self.stopped.add(cell)
-                return
-            first = self._open[cell]
-            self._open[cell] += self._stop.batch
-            batch = self._members[cell][first : self._open[cell]]
-            self._finished[cell] += sum(number in self._over for number in batch)
-
-    def _complete(self, cell: int) -> bool:
-        """True if all admitted missions are over and more follow."""
-        return cell not in self.stopped and self._finished[cell] == self._open[cell] < len(
-            self._members[cell]
-        )
-
-    def _narrow(self, cell: int) -> bool:
-        rows = [self._over[number] for number in self._members[cell][: self._open[cell]]]
-        counted = [outcome for outcome, injected in rows if injected in COUNTED]
-        wins = sum(outcome == "success" for outcome in counted)
-        share = rate(wins, len(counted), self._stop.confidence)
-        return (share.high - share.low) / 2.0 <= self._stop.margin
-
-
-class Queue:
-    """The missing missions in the order of the list, each as soon as its limiter admits it.
-
-    Args:
-        missing: number, setting and changes of each mission.
-    """
-
-    def __init__(self, missing: Iterator[Entry], gate: BatchLimiter | None) -> None:
-        self._missing = missing
-        self._gate = gate
-        self._held: dict[int, deque[Entry]] = {}  # by setting, in the order of the list
-
-    def next(self) -> Entry | None:
-        """The next mission that may begin; None where there is none now."""
-        if self._gate is None:
-            return next(self._missing, None)
-        return self._released(self._gate) or self._fresh(self._gate)
-
-    def _released(self, gate: BatchLimiter) -> Entry | None:
-        """The first waiting mission that may begin now."""
-        self._held = {
-            cell: held for cell, held in self._held.items() if held and cell not in gate.stopped
-        }
-        ready = [held for held in self._held.values() if gate.passes(held[0][0])]
-        return min(ready, key=lambda held: held[0][0]).popleft() if ready else None
-
-    def _fresh(self, gate: BatchLimiter) -> Entry | None:
-        for entry in self._missing:
-            number, cell, _ = entry
-            if gate.passes(number):
-                return entry
-            if cell not in gate.stopped:
-                self._held.setdefault(cell, deque()).append(entry)
-        return None
 
 
 WORK, PROFILES = "work", "profiles"
@@ -304,6 +206,88 @@ def _prepared(folder: Path) -> Iterator[None]:
         shutil.rmtree(work, ignore_errors=True)
 
 
+class MissionQueue:
+    """The missing missions in the order of the list; with a stopping rule, each in its batch.
+
+    Args:
+        missing: number, setting and changes of each mission.
+        stop: the rule; None lets all missions through.
+        cells: the setting of each mission, in the order of the list.
+        over: number, outcome and fate of the fault of every mission that is over.
+
+    Attributes:
+        stopped: the settings that are known well enough.
+    """
+
+    def __init__(
+        self,
+        missing: Iterator[Entry],
+        stop: Stop | None,
+        cells: Sequence[int] = (),
+        over: Iterable[tuple[int, Row]] = (),
+    ) -> None:
+        self._missing, self._stop, self._cells = missing, stop, cells
+        self._held: dict[int, deque[Entry]] = {}  # by setting, in the order of the list
+        self._members: dict[int, list[int]] = {}
+        self._place: list[int] = []
+        for number, cell in enumerate(cells):
+            members = self._members.setdefault(cell, [])
+            self._place.append(len(members))
+            members.append(number)
+        self._open = dict.fromkeys(self._members, stop.batch if stop else 0)
+        self._over: dict[int, Row] = {}
+        self._finished: Counter[int] = Counter()  # missions over below the open boundary
+        self.stopped: set[int] = set()
+        for number, row in over if stop else ():
+            self.record(number, row)
+
+    def next(self) -> Entry | None:
+        """The next mission that may begin; None where there is none now."""
+        if self._stop is None:
+            return next(self._missing, None)
+        self._held = {
+            cell: held for cell, held in self._held.items() if held and cell not in self.stopped
+        }
+        ready = [held for held in self._held.values() if self._passes(held[0][0])]
+        if ready:
+            return min(ready, key=lambda held: held[0][0]).popleft()
+        for entry in self._missing:
+            number, cell, _ = entry
+            if self._passes(number):
+                return entry
+            if cell not in self.stopped:
+                self._held.setdefault(cell, deque()).append(entry)
+        return None
+
+    def _passes(self, number: int) -> bool:
+        cell = self._cells[number]
+        return cell not in self.stopped and self._place[number] < self._open[cell]
+
+    def record(self, number: int, row: Row) -> None:
+        """Note that a mission is over."""
+        if self._stop is None:
+            return
+        cell = self._cells[number]
+        self._over[number] = row
+        if self._place[number] < self._open[cell]:
+            self._finished[cell] += 1
+        # All admitted missions are over and more follow.
+        while self._finished[cell] == self._open[cell] < len(self._members[cell]):
+            if cell in self.stopped or self._narrow(cell, self._stop):
+                self.stopped.add(cell)
+                return
+            first = self._open[cell]
+            self._open[cell] += self._stop.batch
+            batch = self._members[cell][first : self._open[cell]]
+            self._finished[cell] += sum(number in self._over for number in batch)
+
+    def _narrow(self, cell: int, stop: Stop) -> bool:
+        rows = [self._over[number] for number in self._members[cell][: self._open[cell]]]
+        counted = [outcome for outcome, injected in rows if injected in COUNTED]
+        share = rate(counted.count("success"), len(counted), stop.confidence)
+        return (share.high - share.low) / 2.0 <= stop.margin
+
+
 class _Run:
     """One run over the missing missions."""
 
@@ -315,11 +299,11 @@ class _Run:
         self._spectator = spectator
         self._folder = ledger.folder.absolute()
         over = partial(ledger.fates, errors=not options.errors)
-        self._gate = None if stop is None else BatchLimiter(stop, ledger.cell_of_each(), over())
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
         only = options.only
         missing = ledger.missing(errors=options.errors)
-        self._queue = Queue((e for e in missing if only is None or e[0] in only), self._gate)
+        wanted = (e for e in missing if only is None or e[0] in only)
+        self._queue = MissionQueue(wanted, stop, ledger.cell_of_each() if stop else (), over())
         self._again: list[Entry] = []
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
@@ -335,7 +319,7 @@ class _Run:
     def fly(self, asked: Sequence[int]) -> None:
         """Fly until nothing is missing, or the user asks to stop."""
         told = False
-        with self._workers() as workers:
+        with contextlib.closing(self._workers()) as workers:
             while len(asked) < 2:
                 self._fill(workers, asked)
                 if not self._flying:
@@ -358,15 +342,13 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _workers(self) -> Workers:
+    def _workers(self) -> LocalWorkers | Cluster:
         options = self._options
         if options.cluster is None:
             return LocalWorkers(self._jobs, options.task)
-        from mavfi_cli.campaigns.workers import Cluster
-
         return Cluster(options.cluster, options.keep, options.task)
 
-    def _fill(self, workers: Workers, asked: Sequence[int]) -> None:
+    def _fill(self, workers: LocalWorkers | Cluster, asked: Sequence[int]) -> None:
         """Start as many missions as there are free workers."""
         while workers.free and not asked:
             entry = self._again.pop() if self._again else self._queue.next()
@@ -397,7 +379,7 @@ class _Run:
         self._inside_s += ended.wall_s
         config = structure(entry[2], MissionConfig).to_dict()
         out = self._out(number)
-        verdict = judge(ended, out, config, self._options.limit_s)
+        verdict = ended.judge(out, config, self._options.limit_s)
         last = self._attempts[number] >= ATTEMPTS
         if (verdict.state is None or verdict.doubtful) and not last:
             self._repeated += 1
@@ -420,7 +402,7 @@ class _Run:
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
         asked = bool(config.get("fault") or config.get("instruction"))
-        injected = injected_of(result, asked=asked) if flown else None
+        injected = Injected.of(result, asked=asked) if flown else None
         self._ledger.add(
             number,
             state=verdict.state,
@@ -432,9 +414,7 @@ class _Run:
             path=path,
         )
         self._over += 1
-        if self._gate is not None:
-            fate = None if injected is None else injected.value
-            self._gate.record(number, (outcome, fate))
+        self._queue.record(number, (outcome, None if injected is None else injected.value))
         if flown:
             self._outcomes[self._setting_of[number]][str(outcome)] += 1
             return

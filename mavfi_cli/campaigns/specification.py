@@ -6,12 +6,12 @@ import itertools
 import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
 
 from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
-from mavfi_cli.core.config import structure
+from mavfi_cli.core.config import structure, toml_text
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.spec.detector import DetectorConfig
@@ -359,77 +359,77 @@ class Spec:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)
 
+    def differences(self, asked: Spec, repetitions: str = "repetitions") -> list[str]:
+        """A phrase for each factor or number that differs; names and stops do not count.
+
+        Args:
+            repetitions: the word for repetitions.
+        """
+        there, here = self._choices(repetitions), asked._choices(repetitions)
+        if there == here:  # equal values in other settings
+            there, here = self._by_setting(), asked._by_setting()
+        pairs = {key: (there.get(key), here.get(key)) for key in (*there, *here)}
+        return [
+            f"{key} {_told(old)} there, {_told(new)} here"
+            for key, (old, new) in pairs.items()
+            if old != new
+        ]
+
+    def _choices(self, repetitions: str) -> dict[str, list[Any]]:
+        """Factors with all their values, and the numbers."""
+        found: dict[str, list[Any]] = {}
+        for axes in (self.axes, *(setting.axes for setting in self.settings)):
+            for name, values in axes.items():
+                known = found.setdefault(name, [])
+                known += [value for value in values if value not in known]
+        found |= {f"mission.{name}": [value] for name, value in self.fixed.items()}
+        if self.fixed_world is not None:
+            found["rule of fixed worlds"] = [self.fixed_world.rule()]
+            seeds = self.fixed_world.world_seed.items()
+            found["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
+        return {
+            **found,
+            repetitions: [self.repetitions],
+            "first seed": [self.first_seed],
+            "fault seed": [self.seed],
+            "settings": [setting.name for setting in self.settings],
+        }
+
+    def _by_setting(self) -> dict[str, list[Any]]:
+        found = {name: list(values) for name, values in self.axes.items()}
+        for number, setting in enumerate(self.settings):
+            own = dict(setting.axes)
+            if setting.repetitions is not None:
+                own["repetitions"] = (setting.repetitions,)
+            name = setting.name or number
+            found |= {f"{factor} of setting {name}": list(own[factor]) for factor in own}
+        return found
+
+    def to_toml(self) -> str:
+        """TOML from which `parse_spec` makes an equal specification."""
+        names = ("name", "about", "seed", "first_seed", "repetitions")
+        settings = []
+        for each in self.settings:
+            own = {"name": each.name or None, "repetitions": each.repetitions}
+            own = {key: value for key, value in own.items() if value is not None}
+            settings.append({**own, **each.axes})
+        tables = {
+            "mission": self.fixed,
+            "factors": self.axes,
+            "setting": settings,
+            "stop": asdict(self.stop) if self.stop else {},
+            "fixed_world": asdict(self.fixed_world) if self.fixed_world else {},
+        }
+        plain = {name: getattr(self, name) for name in names}
+        return toml_text({**plain, "keep": self.keep.value, **tables})
+
+
+def _told(values: Sequence[Any] | None) -> str:
+    return ", ".join(map(str, values)) if values else "none"
+
 
 def _label(value: Any) -> Label:
     return "+".join(map(str, value)) if isinstance(value, list | tuple) else value
-
-
-_Choices = Mapping[str, Sequence[Any]]
-
-
-def differences(stored: Spec, asked: Spec, repetitions: str = "repetitions") -> list[str]:
-    """Return a phrase for each factor or number that differs; names and stops do not count.
-
-    Args:
-        repetitions: the word for repetitions.
-    """
-    found = list(_phrases(_choices(stored, repetitions), _choices(asked, repetitions)))
-    return found or list(_between_settings(stored, asked))
-
-
-def _phrases(there: _Choices, here: _Choices) -> Iterator[str]:
-    for key in dict.fromkeys((*there, *here)):
-        old, new = there.get(key, ()), here.get(key, ())
-        if old == new:
-            continue
-        gone = [value for value in old if value not in new]
-        added = [value for value in new if value not in old]
-        if len(gone) < len(old) and (gone or added):  # they share values: name only the others
-            parts = [f"{_told(gone)} only there"] if gone else []
-            parts += [f"{_told(added)} only here"] if added else []
-            yield f"{key} {', '.join(parts)}"
-        else:
-            yield f"{key} {_told(old)} there, {_told(new)} here"
-
-
-def _choices(spec: Spec, repetitions: str) -> _Choices:
-    """Factors with all their values, and the numbers."""
-    found: dict[str, list[Any]] = {}
-    for axes in (spec.axes, *(setting.axes for setting in spec.settings)):
-        for name, values in axes.items():
-            known = found.setdefault(name, [])
-            known += [value for value in values if value not in known]
-    found |= {f"mission.{name}": [value] for name, value in spec.fixed.items()}
-    if spec.fixed_world is not None:
-        found["rule of fixed worlds"] = [spec.fixed_world.rule()]
-        seeds = spec.fixed_world.world_seed.items()
-        found["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
-    return {
-        **found,
-        repetitions: [spec.repetitions],
-        "first seed": [spec.first_seed],
-        "fault seed": [spec.seed],
-        "settings": [setting.name for setting in spec.settings],
-    }
-
-
-def _between_settings(stored: Spec, asked: Spec) -> Iterator[str]:
-    """Phrases for equal values in other settings."""
-    for there, here in zip(stored.settings, asked.settings, strict=True):
-        name = f" of setting {here.name}" if here.name else ""
-        for phrase in _phrases(_of_setting(there), _of_setting(here)):
-            factor, _, rest = phrase.partition(" ")
-            yield f"{factor}{name} {rest}"
-    yield from _phrases(stored.axes, asked.axes)
-
-
-def _of_setting(setting: Setting) -> _Choices:
-    own = () if setting.repetitions is None else (setting.repetitions,)
-    return {**setting.axes, "repetitions": own}
-
-
-def _told(values: Sequence[Any]) -> str:
-    return ", ".join(map(str, values)) if values else "none"
 
 
 def require_named(

@@ -7,18 +7,17 @@ import hashlib
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
-from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Setting, Spec
+from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Spec
 from mavfi_cli.core.config import (
     Shipped,
     parse_toml,
     read_text,
     structure,
-    toml_text,
 )
 from mavfi_cli.core.errors import ConfigError, named_member
 
@@ -139,29 +138,6 @@ class _Reader:
         return ConfigError(problem, path=self._path, key=key)
 
 
-def to_toml(spec: Spec) -> str:
-    """Write TOML from which `parse_spec` makes an equal specification."""
-    return toml_text(_values_of(spec))
-
-
-def _values_of(spec: Spec) -> dict[str, Any]:
-    """The tables of the specification's file."""
-    names = ("name", "about", "seed", "first_seed", "repetitions")
-    tables = {
-        "mission": spec.fixed,
-        "factors": spec.axes,
-        "setting": [_setting_values(each) for each in spec.settings],
-        "stop": asdict(spec.stop) if spec.stop else {},
-        "fixed_world": asdict(spec.fixed_world) if spec.fixed_world else {},
-    }
-    return {**{name: getattr(spec, name) for name in names}, "keep": spec.keep.value, **tables}
-
-
-def _setting_values(setting: Setting) -> dict[str, Any]:
-    own = {"name": setting.name or None, "repetitions": setting.repetitions}
-    return {key: value for key, value in own.items() if value is not None} | dict(setting.axes)
-
-
 _ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name
 _COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')  # outside double quotes
 _LONGEST = 100  # characters of a folder's name; a longer one ends with a digest of the changes
@@ -184,7 +160,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     """
     if not changes:
         return spec
-    data = tomllib.loads(to_toml(spec))
+    data = tomllib.loads(spec.to_toml())
     seen: set[str] = set()
     for change in changes:
         key, equals, text = change.partition("=")

@@ -19,12 +19,11 @@ import threading
 import time
 import uuid
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.missions import ResultState
@@ -39,6 +38,29 @@ from mavfi_cli.spec.fault import PROCESS
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+
+
+class CampaignStopped(MavfiError):
+    """The machine has a problem that does not concern one mission only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """The judgement of an attempt.
+
+    Attributes:
+        state: state of the mission; None if something outside ended the attempt.
+        result: the mission's record; empty if there is none.
+        reason: the reason in words.
+        run: its run folder; None if there is none.
+        doubtful: true if there is a record, but something outside may have affected it.
+    """
+
+    state: ResultState | None
+    result: Mapping[str, Any]
+    reason: str
+    run: Path | None = None
+    doubtful: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,46 +84,43 @@ class AttemptEnd:
     lost: str = "its guard was killed"
     wall_s: float = 0.0
 
-
-class Workers(ABC):
-    """Keeps missions flying. A context manager that ends them."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    @abstractmethod
-    def free(self) -> int:
-        """Number of missions that may be started now."""
-
-    @abstractmethod
-    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
-        """Start a mission.
+    def judge(self, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
+        """Judge the end of the attempt.
 
         Args:
-            number: its number, for the message of its end.
-            changes: its values that differ from the defaults.
-            out: the folder for its run folder.
-            limit_s: limit of wall time, s.
+            out: the attempt's own folder.
+            config: configuration of the mission, as in records.
+            limit_s: its limit of wall time, s.
+
+        Raises:
+            CampaignStopped: the machine keeps missions from being flown: a full disk.
         """
-
-    @abstractmethod
-    def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for news or the time-out; return the missions that ended."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End all missions that still run."""
+        report = self.report or {}
+        if self.exit == 0 and "folder" in report:
+            return _recorded(out / report["folder"], config)
+        _require_space(out)
+        if "error" in report:
+            return _refused(report["error"], report["text"])
+        if self.timeout:
+            reason = f"no end within {limit_s:g} s of wall time"
+            return _cut_off(Outcome.HANG, reason, out, config)
+        if self.signal is None and self.exit is None:
+            return Verdict(state=None, result={}, reason=self.lost)
+        if self.signal is not None:
+            name = signal.Signals(self.signal).name
+            if self.signal in _FROM_OUTSIDE:
+                return Verdict(state=None, result={}, reason=f"killed by {name}")
+            return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
+        if "traceback" in report:  # our own defect; the ledger shows where
+            return Verdict(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
+        return _cut_off(Outcome.CRASH, f"the companion ended with code {self.exit}", out, config)
 
 
 TASK = "mavfi_cli.campaigns.task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 
-class LocalWorkers(Workers):
+class LocalWorkers:
     """Keeps up to `jobs` missions flying.
 
     Args:
@@ -126,6 +145,12 @@ class LocalWorkers(Workers):
 
     def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
         """Start a mission.
+
+        Args:
+            number: its number, for the message of its end.
+            changes: its values that differ from the defaults.
+            out: the folder for its run folder.
+            limit_s: limit of wall time, s.
 
         Raises:
             MavfiError: the processes cannot be started.
@@ -185,62 +210,6 @@ _OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
 _BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
 # Errors that every other mission would have too.
 _OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
-
-
-class CampaignStopped(MavfiError):
-    """The machine has a problem that does not concern one mission only."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """The judgement of an attempt.
-
-    Attributes:
-        state: state of the mission; None if something outside ended the attempt.
-        result: the mission's record; empty if there is none.
-        reason: the reason in words.
-        run: its run folder; None if there is none.
-        doubtful: true if there is a record, but something outside may have affected it.
-    """
-
-    state: ResultState | None
-    result: Mapping[str, Any]
-    reason: str
-    run: Path | None = None
-    doubtful: bool = False
-
-
-def judge(ended: AttemptEnd, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
-    """Judge the end of an attempt.
-
-    Args:
-        ended: how it ended.
-        out: the attempt's own folder.
-        config: configuration of the mission, as in records.
-        limit_s: its limit of wall time, s.
-
-    Raises:
-        CampaignStopped: the machine keeps missions from being flown, for example by a full disk.
-    """
-    report = ended.report or {}
-    if ended.exit == 0 and "folder" in report:
-        return _recorded(out / report["folder"], config)
-    _require_space(out)
-    if "error" in report:
-        return _refused(report["error"], report["text"])
-    if ended.timeout:
-        reason = f"no end within {limit_s:g} s of wall time"
-        return _cut_off(Outcome.HANG, reason, out, config)
-    if ended.signal is None and ended.exit is None:
-        return Verdict(state=None, result={}, reason=ended.lost)
-    if ended.signal is not None:
-        name = signal.Signals(ended.signal).name
-        if ended.signal in _FROM_OUTSIDE:
-            return Verdict(state=None, result={}, reason=f"killed by {name}")
-        return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
-    if "traceback" in report:  # our own defect; the ledger shows where
-        return Verdict(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
-    return _cut_off(Outcome.CRASH, f"the companion ended with code {ended.exit}", out, config)
 
 
 def _require_space(out: Path) -> None:
@@ -310,7 +279,7 @@ _BACKLOG = 2  # missions queued for each thread, so that it never waits for us
 _LOOK_S = 2.0  # interval between queries for the number of threads
 
 
-class Cluster(Workers):
+class Cluster:
     """The workers of one scheduler.
 
     Args:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.campaigns.specification_file import to_toml
+from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.columns import csv_text
@@ -234,6 +234,6 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
     "csv": csv_text,
     "link": _link,
-    "toml": to_toml,
+    "toml": Spec.to_toml,
 }
 """By the names that page.html uses."""

@@ -9,7 +9,7 @@ from mavfi_cli.campaigns import begin as beginning
 from mavfi_cli.campaigns.begin import SEARCH, begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import FixedWorld
-from mavfi_cli.campaigns.specification_file import parse_spec, replaced, to_toml
+from mavfi_cli.campaigns.specification_file import parse_spec, replaced
 from mavfi_cli.core.errors import ConfigError
 
 SPEC = """
@@ -148,7 +148,7 @@ def test_a_rule_that_makes_no_sense_is_refused(old, new, error, told):
 
 def test_the_rule_comes_back_as_it_was():
     spec = spec_of(SPEC.replace("worlds =", 'world_seed = {"train-0.05-3" = 2}\nworlds ='))
-    assert spec_of(to_toml(spec)) == spec
+    assert spec_of(spec.to_toml()) == spec
 
 
 def test_a_candidate_whose_flights_could_not_begin_does_not_fit():

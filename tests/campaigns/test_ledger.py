@@ -12,7 +12,6 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     changes_of,
-    injected_of,
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -175,8 +174,8 @@ def test_a_database_of_somebody_else_is_refused(tmp_path):
     ],
 )
 def test_what_became_of_a_fault(fault, injected):
-    assert injected_of({"fault": fault}, asked=True) is injected
-    assert injected_of({"fault": fault}, asked=False) is Injected.GOLDEN
+    assert Injected.of({"fault": fault}, asked=True) is injected
+    assert Injected.of({"fault": fault}, asked=False) is Injected.GOLDEN
 
 
 @pytest.mark.parametrize(
@@ -198,5 +197,5 @@ def test_a_fault_that_a_detector_withheld_was_no_idle_one(alarm, injected):
         "strikes": [{"stamp_s": 11.0, "changes": [{"state": "command_yaw"}]}],
     }
     result = {"fault": fault, "detection": {"alarms": [told]}}
-    assert injected_of(result, asked=True) is injected
-    assert injected_of({**result, "detection": None}, asked=True) is Injected.NOT_ACTIVATED
+    assert Injected.of(result, asked=True) is injected
+    assert Injected.of({**result, "detection": None}, asked=True) is Injected.NOT_ACTIVATED

@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.campaigns.begin import flyable
 from mavfi_cli.campaigns.specification import Keep, Stop
-from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, to_toml
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.spec.stack import Stack, load_stack
 
@@ -88,7 +88,7 @@ def test_more_repetitions_begin_with_the_same_missions():
 @pytest.mark.parametrize("text", [CROSSED, "", "[factors]\nsites = [['flags'], []]\nsite = 'x'"])
 def test_a_specification_comes_back_as_it_was(text):
     spec = spec_of(text)
-    assert spec_of(to_toml(spec)) == spec
+    assert spec_of(spec.to_toml()) == spec
 
 
 def test_detectors_and_what_they_protect():

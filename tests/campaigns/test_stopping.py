@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from plans import planned
 
 from mavfi_cli.campaigns.missions import Injected
-from mavfi_cli.campaigns.run import BatchLimiter, Queue
+from mavfi_cli.campaigns.run import MissionQueue
 from mavfi_cli.campaigns.specification import Stop
 from mavfi_cli.stats.shares import rate
 
@@ -17,18 +17,17 @@ STOP = Stop(margin=0.12, batch=10)
 
 def fly(outcomes, cells, slots, seed):
     """Which missions are flown where `slots` of them fly at a time and end in a random order."""
-    gate = BatchLimiter(STOP, cells)
-    queue = Queue(((n, cell, {}) for n, cell in enumerate(cells)), gate)
+    queue = MissionQueue(((n, cell, {}) for n, cell in enumerate(cells)), STOP, cells)
     rng = random.Random(seed)
     flying, flown = [], []
     while True:
         while len(flying) < slots and (entry := queue.next()) is not None:
             flying.append(entry[0])
         if not flying:
-            return sorted(flown), gate
+            return sorted(flown), queue
         number = flying.pop(rng.randrange(len(flying)))
         flown.append(number)
-        gate.record(number, (outcomes[number], "golden"))
+        queue.record(number, (outcomes[number], "golden"))
 
 
 @given(
@@ -54,7 +53,7 @@ def test_slots_and_order_make_no_difference(outcomes, seed):
 
 
 def test_faults_that_did_nothing_make_no_interval_narrow():
-    gate = BatchLimiter(STOP, [0] * 100)
+    gate = MissionQueue(iter(()), STOP, [0] * 100)
     for number in range(20):
         gate.record(number, ("success", Injected.NOT_ACTIVATED.value))
     assert not gate.stopped
@@ -67,12 +66,13 @@ def test_what_was_flown_before_counts():
     cells = [0] * 100
     outcomes = dict(zip(range(100), ["success"] * 100, strict=True))
     flown, _ = fly(outcomes, cells, 1, 0)
-    gate = BatchLimiter(STOP, cells, [(n, ("success", "golden")) for n in flown])
-    assert Queue(((n, 0, {}) for n in range(100) if n not in flown), gate).next() is None
+    left = ((n, 0, {}) for n in range(100) if n not in flown)
+    over = [(n, ("success", "golden")) for n in flown]
+    assert MissionQueue(left, STOP, cells, over).next() is None
 
 
 def test_without_a_rule_everything_is_flown():
-    queue = Queue(((n, 0, {}) for n in range(3)), None)
+    queue = MissionQueue(((n, 0, {}) for n in range(3)), None)
     assert [queue.next() for _ in range(4)] == [(0, 0, {}), (1, 0, {}), (2, 0, {}), None]
 
 

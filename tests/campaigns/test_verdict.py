@@ -4,13 +4,13 @@ import json
 
 import pytest
 
-from mavfi_cli.campaigns.workers import AttemptEnd, judge
+from mavfi_cli.campaigns.workers import AttemptEnd
 from mavfi_cli.core.errors import Interrupted
 
 
 def test_a_mission_that_was_interrupted_before_its_record_does_not_count(tmp_path):
     last_words = {"error": Interrupted.__name__, "text": "interrupted"}
-    verdict = judge(AttemptEnd(number=1, exit=0, report=last_words), tmp_path, {}, 60.0)
+    verdict = AttemptEnd(number=1, exit=0, report=last_words).judge(tmp_path, {}, 60.0)
     assert (verdict.state, verdict.reason) == (None, "interrupted")
 
 
@@ -22,4 +22,4 @@ def test_a_killed_node_is_a_doubt_unless_the_fault_killed_it(tmp_path, stage, do
     result = {"outcome": "success", "reason": "", "nodes": nodes, "fault": {"stage": stage}}
     (run / "result.json").write_text(json.dumps(result))
     ended = AttemptEnd(number=1, exit=0, report={"folder": "run"})
-    assert judge(ended, tmp_path, {}, 60.0).doubtful is doubtful
+    assert ended.judge(tmp_path, {}, 60.0).doubtful is doubtful
