@@ -7,10 +7,10 @@ the scores do not depend on the threshold. They include the checks of the plan i
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -34,31 +34,83 @@ SCORES = "scores.json"
 _WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Kept:
-    """The stored part of a flight that a gate sees."""
-
-    columns: Columns
-    plans: Sequence[Trajectory]
-    strikes: Sequence[PlanStrike]
+_Seen = tuple[Columns, Sequence[Trajectory], list[PlanStrike]]  # the part of a flight at the gate
 
 
-def _kept_of(path: Path) -> _Kept:
+def scored(
+    detectors: Sequence[DetectorConfig],
+    stack: str,
+    folder: Path,
+    pairs: tuple[pa.Table, pa.Table],
+    tell: Callable[[str], None],
+) -> Scored:
+    """Scores of the harmful faults and of the error-free flights, by detector.
+
+    Args:
+        detectors: all except `none`.
+        folder: stores the scores by the name of the run folder; only missing ones are computed.
+        pairs: without faults and with one, as `detectors.pairs_of` returns them.
+        tell: receives a text with the number of replayed flights.
+    """
+    store = folder / SCORES
+    kept: dict[str, dict[str, float | None]] = {}
+    with contextlib.suppress(OSError, ValueError):  # missing or damaged
+        kept = json.loads(store.read_text(encoding="utf-8"))
+    names = {
+        each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/"
+        f"{model_digest(each, stack)}"
+        for each in detectors
+    }
+    scores = {each.name: kept.setdefault(names[each.name], {}) for each in detectors}
+    struck = harmful(pairs[1])
+    paths = struck["faulty_path"].to_pylist()
+    golden = chosen(pairs[0], detector=NONE)["golden_path"].to_pylist()
+    begins = [*struck["faulty_struck_s"].to_pylist(), *[None] * len(golden)]
+    missing = [
+        (Path(path), struck_s)
+        for path, struck_s in zip([*paths, *golden], begins, strict=True)
+        if path is not None and any(Path(path).name not in own for own in scores.values())
+    ]
+    if missing:
+        tell(f"replaying {len(missing)} flights through {len(names)} detectors")
+        for path, struck_s in missing:
+            seen = _seen_of(path)
+            for each in detectors:
+                if path.name not in scores[each.name]:
+                    scores[each.name][path.name] = _score(seen, struck_s, each, stack)
+        write_json(store, kept)
+
+    def known(path: str | None, detector: str) -> float | None:
+        """The score of a flight; None where it has no trace. A score that is NaN is an alarm."""
+        if path is None or Path(path).name not in scores[detector]:
+            return None
+        score = scores[detector][Path(path).name]
+        return math.inf if score is None else score
+
+    def of(detector: str) -> tuple[pa.Table, list[float]]:
+        positive = pa.array([known(path, detector) for path in paths], pa.float64())
+        table = struck.select(["stage", "field"]).append_column("score", positive)
+        negative = (known(path, detector) for path in golden)
+        return table.drop_null(), [score for score in negative if score is not None]
+
+    return of
+
+
+def _seen_of(path: Path) -> _Seen:
     run = load_run(path)
     if run.trace is None:
-        return _Kept(columns={}, plans=(), strikes=())
-    fault = run.record.fault
+        return {}, (), []
     strikes = [
         PlanStrike(
             stamp_s=strike["stamp_s"], state=change["state"], waypoint=change["index"],
             before=_value(change["state"], change["before_hex"]),
             after=_value(change["state"], change["after_hex"]),
         )
-        for strike in fault.get("strikes", ())
+        for strike in run.record.fault.get("strikes", ())
         for change in strike["changes"]
         if change["state"] in BY_NAME and BY_NAME[change["state"]].stage is Stage.PLANNING
     ]  # fmt: skip
-    return _Kept(columns=columns_of(run.trace), plans=run.folder.read_plans(), strikes=strikes)
+    return columns_of(run.trace), run.folder.read_plans(), strikes
 
 
 def _value(state: str, pattern: str) -> float | int | bool:
@@ -67,107 +119,24 @@ def _value(state: str, pattern: str) -> float | int | bool:
     return kind.value(int(pattern, 16))
 
 
-class Scores:
-    """Scores of flights by detector; the folder stores them.
-
-    Args:
-        detectors: all except `none`.
-    """
-
-    def __init__(self, detectors: Sequence[DetectorConfig], stack: str, folder: Path) -> None:
-        self._detectors = detectors
-        self._stack = stack
-        self._path = folder / SCORES
-        self._names = {
-            each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/"
-            f"{model_digest(each, stack)}"
-            for each in detectors
-        }
-        self._kept: dict[str, dict[str, float | None]] = _read(self._path)
-
-    def scored(self, error_free: pa.Table, faults: pa.Table, tell: Callable[[str], None]) -> Scored:
-        """Scores of the harmful faults and of the error-free flights, by detector.
-
-        Args:
-            error_free, faults: as `detector_pairs.pairs_of` returns them.
-            tell: receives a text with the number of replayed flights.
-        """
-        struck = harmful(faults)
-        paths, golden = (
-            table[name].to_pylist()
-            for table, name in (
-                (struck, "faulty_path"),
-                (chosen(error_free, detector=NONE), "golden_path"),
-            )
-        )
-        begins = [*struck["faulty_struck_s"].to_pylist(), *[None] * len(golden)]
-        self._score_all(zip([*paths, *golden], begins, strict=True), tell)
-
-        def of(detector: str) -> tuple[pa.Table, list[float]]:
-            positive = pa.array([self._of(path, detector) for path in paths], pa.float64())
-            table = struck.select(["stage", "field"]).append_column("score", positive)
-            negative = (self._of(path, detector) for path in golden)
-            return table.drop_null(), [score for score in negative if score is not None]
-
-        return of
-
-    def _score_all(
-        self, flights: Iterable[tuple[str | None, float | None]], tell: Callable[[str], None]
-    ) -> None:
-        """Score the flights that have none, by run folder and time of the strike, s."""
-        missing = [
-            (Path(path), struck_s)
-            for path, struck_s in flights
-            if path is not None
-            and any(Path(path).name not in self._kept.get(n, {}) for n in self._names.values())
-        ]
-        if not missing:
-            return
-        tell(f"replaying {len(missing)} flights through {len(self._names)} detectors")
-        for path, struck_s in missing:
-            flight = _kept_of(path)
-            for detector in self._detectors:
-                kept = self._kept.setdefault(self._names[detector.name], {})
-                if path.name not in kept:
-                    kept[path.name] = self._score(flight, struck_s, detector)
-        write_json(self._path, self._kept)
-
-    def _of(self, path: str | None, detector: str) -> float | None:
-        """The score of a flight; None where it has no trace. A score that is NaN is an alarm."""
-        kept = self._kept.get(self._names[detector], {})
-        if path is None or Path(path).name not in kept:
-            return None
-        score = kept[Path(path).name]
-        return math.inf if score is None else score
-
-    def _score(self, flight: _Kept, struck_s: float | None, detector: DetectorConfig) -> float:
-        """The highest score from the strike on, or of the whole flight without one."""
-        if not flight.columns:  # it ended before the first tick
-            return 0.0
-        path = detector.model_path(self._stack)
-        fresh = detector.built(self._stack)
-        from_s = -math.inf if struck_s is None else struck_s - 1e-9
-        highest = 0.0
-        judgements = replay(
-            flight.columns, fresh, None if path is None else Model.read(path).preprocess,
-            protect=frozenset(map(Stage, detector.protect)),
-            plans=flight.plans, strikes=flight.strikes,
-        )  # fmt: skip
-        for judged in judgements:
-            if judged.stamp_s >= from_s and not judged.score <= highest:
-                highest = judged.score
-                if math.isnan(highest):
-                    return math.inf
-        return highest / fresh.threshold
-
-
-def _read(path: Path) -> dict[str, dict[str, float | None]]:
-    """The stored scores; empty if the file is damaged or missing."""
-    try:
-        kept: dict[str, dict[str, float | None]] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return kept
+def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack: str) -> float:
+    """The highest score from the strike on, or of the whole flight without one."""
+    columns, plans, strikes = seen
+    if not columns:  # it ended before the first tick
+        return 0.0
+    path, fresh = detector.model_path(stack), detector.built(stack)
+    from_s = -math.inf if struck_s is None else struck_s - 1e-9
+    highest = 0.0
+    judgements = replay(
+        columns, fresh, None if path is None else Model.read(path).preprocess,
+        protect=frozenset(map(Stage, detector.protect)), plans=plans, strikes=strikes,
+    )  # fmt: skip
+    for judged in judgements:
+        if judged.stamp_s >= from_s and not judged.score <= highest:
+            highest = judged.score
+            if math.isnan(highest):
+                return math.inf
+    return highest / fresh.threshold
 
 
 def samples_of(run: Run, name: str) -> FlightSamples:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -347,70 +348,51 @@ def _with_worlds(
         MavfiError: as `run_campaign`.
     """
     rule = spec.fixed_world
-    if rule is None:
-        return spec
+    assert rule is not None
     judged: dict[str, MissionConfig] = {}
     for mission in missions:
         config = mission.config
         if config.world_seed is None and rule.rules(config.world):
             judged.setdefault(config.world, config.golden)
+    quiet = Spectator()  # without progress: that of a search is not the campaign's
+    quiet.on_note = spectator.on_note  # type: ignore[method-assign]
     for world, config in judged.items():
-        flown = _search(rule, config, spec.first_seed, folder / SEARCH, options, spectator)
-        rule = replace(
-            rule,
-            world_seed={**rule.world_seed, world: len(flown)},
-            flown={**rule.flown, world: flown},
-        )
+        golden = replace(config, seed=spec.first_seed)
+        flown = _search(rule, golden, folder / SEARCH, replace(options, keep=Keep.NONE), quiet)
+        seeds = {**rule.world_seed, world: len(flown)}
+        rule = replace(rule, world_seed=seeds, flown={**rule.flown, world: flown})
         spectator.on_note(f"fixed world {world}: seed {len(flown)}")
     return replace(spec, fixed_world=rule)
 
 
 def _search(
-    rule: FixedWorld,
-    config: MissionConfig,
-    first_seed: int,
-    folder: Path,
-    options: Options,
-    spectator: Spectator,
+    rule: FixedWorld, config: MissionConfig, folder: Path, options: Options, spectator: Spectator
 ) -> Flown:
     """Find the replans of candidates 1, 2, 3, ... up to the one that fits."""
     flown: Flown = ()
     for first in range(1, rule.candidates + 1, _AT_ONCE):
-        last = min(first + _AT_ONCE - 1, rule.candidates)
-        spectator.on_note(f"fixed world {config.world}: seeds {first} to {last} are flown")
-        missions = {
-            seed: [
-                replace(config, world_seed=seed, seed=first_seed + flight)
-                for flight in range(rule.flights)
-            ]
-            for seed in range(first, last + 1)
-        }
-        replans = _replans(missions, folder, options, spectator)
-        for seed, configs in missions.items():
-            counts = (replans[each] for each in configs)
-            flown = (*flown, tuple(count for count in counts if count is not None))
+        seeds = range(first, min(first + _AT_ONCE, rule.candidates + 1))
+        spectator.on_note(f"fixed world {config.world}: seeds {first} to {seeds[-1]} are flown")
+        planned = [
+            PlannedMission(
+                config=replace(config, world_seed=seed, seed=config.seed + flight),
+                labels={"world": config.world, "world_seed": seed},
+            )
+            for seed in seeds
+            for flight in range(rule.flights)
+        ]
+        with run_campaign(planned, folder, options, spectator, append=True) as ledger:
+            replans = {each.mission.config: fields_of(each.result)["replans"]
+                       for each in ledger.results()}  # fmt: skip
+        for seed in seeds:
+            own = (replans[each.config] for each in planned if each.config.world_seed == seed)
+            flown = (*flown, tuple(count for count in own if count is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]
-    often = sorted(count for replans in flown for count in replans)
+    often = sorted(itertools.chain.from_iterable(flown))
     seen = f"; they replan {often[0]} to {often[-1]} times" if often else ""
     raise ConfigError(
         f"no world seed of {config.world} up to {rule.candidates} is {rule.rule()}{seen}; leave "
         f"the world out of `worlds`, or name its seed in [fixed_world.world_seed]",
         key="fixed_world",
     )
-
-
-def _replans(
-    missions: dict[int, list[MissionConfig]], folder: Path, options: Options, spectator: Spectator
-) -> dict[MissionConfig, int | None]:
-    """The number of replans of each flight; None if it could not begin."""
-    planned = [
-        PlannedMission(config=config, labels={"world": config.world, "world_seed": seed})
-        for seed, configs in missions.items()
-        for config in configs
-    ]
-    quiet = replace(options, keep=Keep.NONE)
-    notes = Spectator()  # without progress: that of a search is not the campaign's
-    notes.on_note = spectator.on_note  # type: ignore[method-assign]
-    with run_campaign(planned, folder, quiet, notes, append=True) as ledger:
-        return {each.mission.config: fields_of(each.result)["replans"] for each in ledger.results()}

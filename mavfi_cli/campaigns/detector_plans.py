@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 from mavfi_cli.campaigns.missions import Label, PlannedMission, changes_of
 from mavfi_cli.campaigns.specification import require_named
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import DType, Stage
-from mavfi_cli.detect.base import detector_names
+from mavfi_cli.detect.base import Model, detector_names
 from mavfi_cli.detect.fit import KINDS
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.spec.detector import STAGES, DetectorConfig
@@ -157,6 +157,27 @@ class EvaluationPlan:
             ModelError: the folder of models has no such file.
         """
         return DetectorConfig.with_model(detector, self.models, self.protect)
+
+    def require_held_out(self) -> None:
+        """Reject detectors that cannot be loaded, and missions that trained a model.
+
+        Seeds are compared across worlds, because two worlds may use the same random numbers.
+
+        Raises:
+            ModelError: a model cannot be used; the message names the training flight.
+        """
+        for detector in map(self.detector_config, self.protectors):
+            detector.built(self.base.stack)
+            path = detector.model_path(self.base.stack)
+            for flight in () if path is None else Model.read(path).training_flights:
+                seed = flight.rpartition("/")[2]
+                if seed.isdigit() and int(seed) in self.seeds:
+                    raise ModelError(
+                        f"{detector.name} was made with the flight {flight}: seeds "
+                        f"{self.seeds.start} to {self.seeds.stop - 1} are not held out, choose "
+                        "another --first-seed",
+                        path=path,
+                    )
 
     def told(self) -> dict[str, Any]:
         """The plan, with descriptions of the detectors, as plain values."""

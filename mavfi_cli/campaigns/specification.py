@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
@@ -25,15 +25,9 @@ _WORD = 1 << 32
 # Factors: what may differ between missions, and the record that has it as a field ----------------
 
 
-class _Level(Enum):
-    """The level at which faults strike."""
-
-    SOURCE = "source"
-    INSTRUCTION = "instruction"
-
-
-_RECORDS = {_Level.SOURCE: FaultConfig, _Level.INSTRUCTION: InstructionConfig}
-# Other names in a specification for fields of the mission and of either level's fault.
+# Level at which faults strike -> the field of the mission, and its record.
+_LEVELS = {"source": ("fault", FaultConfig), "instruction": ("instruction", InstructionConfig)}
+# Other names in a specification for a field of either level's fault.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
@@ -44,21 +38,10 @@ _DETECTOR = {"detector": "name"} | {
 }
 _FAULT = {
     level: tuple(each.name for each in fields(record) if each.name != "seed")
-    for level, record in _RECORDS.items()
+    for level, (_, record) in _LEVELS.items()
 }
-
-
-def _names() -> tuple[str, ...]:
-    fault = dict.fromkeys((*_ALIASES, "level", *_FAULT[_Level.SOURCE], *_FAULT[_Level.INSTRUCTION]))
-    return (*MISSION, *_DETECTOR, *(name for name in fault if name != "target"))
-
-
-NAMES = _names()
-
-
-def _target_of(values: Mapping[str, Any]) -> str:
-    """The target of the fault in a combination of factors; empty without a fault."""
-    return next((str(values[name]) for name in _ALIASES if name in values), "")
+_OF_FAULTS = dict.fromkeys((*_ALIASES, "level", *_FAULT["source"], *_FAULT["instruction"]))
+NAMES = (*MISSION, *_DETECTOR, *(name for name in _OF_FAULTS if name != "target"))
 
 
 def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> MissionConfig:
@@ -81,34 +64,24 @@ def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> Missio
 def _fault(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
     """The field `fault` or `instruction` of the mission; empty without a fault."""
     asked = {name: each for name, each in values.items() if name not in (*MISSION, *_DETECTOR)}
-    level = _member(asked.pop("level", _Level.SOURCE.value))
+    level = asked.pop("level", "source")
+    if level not in [*_LEVELS]:
+        raise ConfigError(f"expected {' or '.join(_LEVELS)}, got {level!r}", key="level")
     targets = [name for name in _ALIASES if name in asked]
     if len(targets) > 1:
         raise ConfigError("a fault strikes a stage or a site, not both")
     fault = {_ALIASES[name] if name in targets else name: each for name, each in asked.items()}
     for name in fault:
         if name not in _FAULT[level]:
-            raise _no_factor(name, level)
+            match = nearest(name, (*_ALIASES, *_FAULT[level]))
+            hint = f"; did you mean {match!r}?" if match else ""
+            raise ConfigError(f"no factor of faults at {level} level{hint}", key=name)
     if targets:
-        return {"fault" if level is _Level.SOURCE else "instruction": {**fault, "seed": seed}}
+        return {_LEVELS[level][0]: {**fault, "seed": seed}}
     if asked or "level" in values:
         named = sorted({*asked, *({"level"} & set(values))})
         raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
     return {}
-
-
-def _no_factor(name: str, level: _Level) -> ConfigError:
-    match = nearest(name, (*_ALIASES, *_FAULT[level]))
-    hint = f"; did you mean {match!r}?" if match else ""
-    return ConfigError(f"no factor of faults at {level.value} level{hint}", key=name)
-
-
-def _member(name: Any) -> _Level:
-    try:
-        return _Level(name)
-    except ValueError:
-        known = " or ".join(level.value for level in _Level)
-        raise ConfigError(f"expected {known}, got {name!r}", key="level") from None
 
 
 # Settings, repetitions, stopping rule, worlds -----------------------------------------------------
@@ -126,16 +99,12 @@ class Keep(Enum):
         """True if the run folder of this mission is kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        return outcome != "success" or (self is Keep.SAMPLED and _sampled(number))
-
-
-def _sampled(number: int) -> bool:
-    """True if this success is in the sample, which covers every setting however they alternate."""
-    mixed = number
-    for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
-        mixed = mixed * factor % _WORD
-        mixed ^= mixed >> 15
-    return mixed < _WORD // SAMPLE
+        mixed = number  # a sample of the successes covers all settings however they alternate
+        for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
+            mixed = mixed * factor % _WORD
+            mixed ^= mixed >> 15
+        sampled = self is Keep.SAMPLED and mixed < _WORD // SAMPLE
+        return outcome != "success" or sampled
 
 
 Flown = tuple[tuple[int, ...], ...]  # for each candidate, the replans of its golden runs
@@ -184,10 +153,12 @@ class FixedWorld:
 
     def told(self) -> str:
         """The rule and the worlds that it has found, in one line."""
-        found = [
-            f"{world} {seed}{self._median(world)}" for world, seed in self.world_seed.items()
-        ] or ["none yet"]
-        return f"world seeds: {', '.join(found)}; {self.rule()}"
+        found = []
+        for world, seed in self.world_seed.items():
+            flown = self.flown.get(world)
+            median = "named" if flown is None else f"median {statistics.median(flown[-1]):g}"
+            found.append(f"{world} {seed} ({median})")
+        return f"world seeds: {', '.join(found or ['none yet'])}; {self.rule()}"
 
     def rule(self) -> str:
         """The rule in words."""
@@ -195,12 +166,6 @@ class FixedWorld:
         often = f"{least} to {most} times" if most > least else f"{least} times"
         often = "once" if often == "1 times" else often
         return f"the first from 1 on whose golden flights replan {often} (median of {self.flights})"
-
-    def _median(self, world: str) -> str:
-        """Median replans of the found candidate; empty if the user has named the seed."""
-        if world not in self.flown:
-            return " (named)"
-        return f" (median {statistics.median(self.flown[world][-1]):g})"
 
 
 Axes = Mapping[str, tuple[Any, ...]]
@@ -284,17 +249,12 @@ class Spec:
         if not (math.isfinite(scale) and scale > 0.0):
             raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
 
-        def share(count: int) -> int:
-            """Scale a number of repetitions, to at least one."""
-            return max(1, round(count * scale))
-
         settings = tuple(
-            setting
-            if setting.repetitions is None
-            else replace(setting, repetitions=share(setting.repetitions))
-            for setting in self.settings
+            replace(each, repetitions=each.repetitions and max(1, round(each.repetitions * scale)))
+            for each in self.settings
         )
-        return replace(self, repetitions=share(self.repetitions), settings=settings)
+        repetitions = max(1, round(self.repetitions * scale))
+        return replace(self, repetitions=repetitions, settings=settings)
 
     def missions(self) -> list[PlannedMission]:
         """List the missions repetition by repetition, so that pairs and settings grow together.
@@ -320,31 +280,26 @@ class Spec:
 
     def _points(self) -> list[tuple[dict[str, Any], dict[str, Label], int]]:
         """Combine the factors; return each combination with its labels and repetitions."""
-        if (planned := sum(self._size(setting) for setting in self.settings)) > MOST:
-            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
-        points = [
-            ({**self.fixed, **values}, labels, self._count(setting))
-            for setting in self.settings
-            for values, labels in self._combinations(setting)
+        crossed = [
+            ({**self.axes, **each.axes}, each.name, each.repetitions or self.repetitions)
+            for each in self.settings
         ]
+        planned = sum(count * math.prod(map(len, axes.values())) for axes, _, count in crossed)
+        if planned > MOST:
+            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
+        points = []
+        for axes, name, count in crossed:
+            for values in itertools.product(*axes.values()):
+                chosen = dict(zip(axes, values, strict=True))
+                labels: dict[str, Label] = {"setting": name} if name else {}
+                for key, value in chosen.items():
+                    if key != "seed":
+                        several = isinstance(value, list | tuple)
+                        labels[key] = "+".join(map(str, value)) if several else value
+                points.append(({**self.fixed, **chosen}, labels, count))
         if not points:
             raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
         return points
-
-    def _count(self, setting: Setting) -> int:
-        return self.repetitions if setting.repetitions is None else setting.repetitions
-
-    def _size(self, setting: Setting) -> int:
-        """Number of missions of a setting, without making them."""
-        return self._count(setting) * math.prod(map(len, {**self.axes, **setting.axes}.values()))
-
-    def _combinations(self, setting: Setting) -> Iterator[tuple[dict[str, Any], dict[str, Label]]]:
-        axes = {**self.axes, **setting.axes}
-        named = {"setting": setting.name} if setting.name else {}
-        for values in itertools.product(*axes.values()):
-            chosen = dict(zip(axes, values, strict=True))
-            varied = {name: value for name, value in chosen.items() if name != "seed"}
-            yield chosen, {**named, **{name: _label(value) for name, value in varied.items()}}
 
     def _mission(
         self, values: Mapping[str, Any], labels: Mapping[str, Label], repetition: int
@@ -352,7 +307,8 @@ class Spec:
         seed = values.get("seed", self.first_seed + repetition)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
-        drawn = ("campaign", seed, repetition, _target_of(values))
+        target = next((str(values[name]) for name in _ALIASES if name in values), "")
+        drawn = ("campaign", seed, repetition, target)
         with naming(labels):
             config = _mission_of(values, seed, Stream.FAULT.seed(self.seed, *drawn))
             if self.fixed_world is not None and config.world_seed is None:
@@ -426,10 +382,6 @@ class Spec:
 
 def _told(values: Sequence[Any] | None) -> str:
     return ", ".join(map(str, values)) if values else "none"
-
-
-def _label(value: Any) -> Label:
-    return "+".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
 def require_named(

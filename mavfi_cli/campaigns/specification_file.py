@@ -51,91 +51,69 @@ def parse_spec(text: str, path: Path) -> Spec:
 
 def _read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
     """Read a specification from TOML's tables; `path` as for `parse_spec`, `text` for lines."""
-    read = _Reader(path)
-    read.known(data, _TOP, "")
+    _require_table(data, "", _TOP, path)
+    mission, factors = data.get("mission", {}), data.get("factors", {})
+    settings = data.get("setting", [{}])
+    if not isinstance(settings, list):
+        raise ConfigError("expected tables [[setting]]", path=path, key="setting")
+    _require_table(mission, "mission", NAMES, path)
+    for name, value in mission.items():
+        _require_usable(name, value, f"mission.{name}", path)
+    _require_table(factors, "factors", NAMES, path)
+    found = []
+    for number, each in enumerate(settings):
+        place = f"setting[{number}]"
+        _require_table(each, place, (*NAMES, *_SETTING), path)
+        own = {name: each[name] for name in _SETTING if name in each}
+        rest = {name: value for name, value in each.items() if name not in own}
+        found.append({**own, "axes": _axes(rest, place, path)})
     values: dict[str, Any] = {
         "name": path.stem,
         **{name: value for name, value in data.items() if name not in _FACTORS},
-        "fixed": read.fixed(read.table(data.get("mission", {}), "mission")),
-        "axes": read.axes(read.table(data.get("factors", {}), "factors"), "factors."),
-        "settings": read.settings(data.get("setting", [{}])),
+        "fixed": mission,
+        "axes": _axes(factors, "factors", path),
+        "settings": found,
     }
     if "keep" in values:
         values["keep"] = named_member(Keep, "policy of keeping runs", str(values["keep"]))
     return structure(values, Spec, path=path, text=text)
 
 
-class _Reader:
-    """Reads the tables of factors of one file; its errors name the table."""
+def _require_table(table: Any, key: str, known: Sequence[str], path: Path) -> None:
+    if not isinstance(table, dict):
+        raise ConfigError("expected a table", path=path, key=key)
+    for name in table:
+        if name not in known:
+            place = f"{key}.{name}" if key else name
+            raise ConfigError.unknown_key(place, tuple(known), path=path)
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
-    def settings(self, tables: Any) -> list[dict[str, Any]]:
-        """Read the tables [[setting]]."""
-        if not isinstance(tables, list):
-            raise self._error("expected tables [[setting]]", "setting")
-        found = []
-        for number, each in enumerate(tables):
-            place = f"setting[{number}]"
-            table = self.table(each, place)
-            axes = {name: value for name, value in table.items() if name not in _SETTING}
-            own = {name: value for name, value in table.items() if name in _SETTING}
-            found.append({**own, "axes": self.axes(axes, f"{place}.", also=_SETTING)})
-        return found
+def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
+    """Refuse a value that no mission can have, whatever the factor's type."""
+    if name in LISTS and not isinstance(value, list):
+        raise ConfigError(f"expected a list, got {value!r}", path=path, key=key)
+    if isinstance(value, datetime.date | datetime.time):
+        raise ConfigError(f"no factor is a date or a time, got {value}", path=path, key=key)
 
-    def fixed(self, table: dict[str, Any]) -> dict[str, Any]:
-        """Read factors that all missions share."""
-        self.known(table, NAMES, "mission.")
-        for name, value in table.items():
-            self._require_usable(name, value, "mission.")
-        return table
 
-    def axes(self, data: Mapping[str, Any], prefix: str, also: tuple[str, ...] = ()) -> Axes:
-        """Read factors, each with its value or values."""
-        self.known(data, (*NAMES, *also), prefix)
-        return {name: self._values(name, value, prefix) for name, value in data.items()}
-
-    def _values(self, name: str, value: Any, prefix: str) -> tuple[Any, ...]:
-        several = isinstance(value, list)
+def _axes(table: Mapping[str, Any], place: str, path: Path) -> Axes:
+    """Read factors, each with its value or values."""
+    axes: dict[str, tuple[Any, ...]] = {}
+    for name, value in table.items():
+        key, several = f"{place}.{name}", isinstance(value, list)
         if name in LISTS:
             several = several and any(isinstance(each, list) for each in value)
         values = tuple(value) if several else (value,)
         for each in values:
-            self._require_usable(name, each, prefix)
-        if name in LISTS:
-            return values
+            _require_usable(name, each, key, path)
         if name == "planner":  # one planner is one setting, however it is written
-            values = tuple(
-                canonical_planner(each) if isinstance(each, str) else each for each in values
-            )
-        if not values:
-            raise self._error("an empty list of values", f"{prefix}{name}")
-        if len({repr(each) for each in values}) < len(values):
-            raise self._error("a value is listed twice", f"{prefix}{name}")
-        return values
-
-    def _require_usable(self, name: str, value: Any, prefix: str) -> None:
-        """Refuse a value that no mission can have, whatever the factor's type."""
-        if name in LISTS and not isinstance(value, list):
-            raise self._error(f"expected a list, got {value!r}", f"{prefix}{name}")
-        if isinstance(value, datetime.date | datetime.time):
-            raise self._error(f"no factor is a date or a time, got {value}", f"{prefix}{name}")
-
-    def known(self, data: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
-        """Refuse keys that are not among the names."""
-        for key in data:
-            if key not in names:
-                raise ConfigError.unknown_key(f"{prefix}{key}", names, path=self._path)
-
-    def table(self, value: Any, key: str) -> dict[str, Any]:
-        """Require that the value of a key is a table."""
-        if not isinstance(value, dict):
-            raise self._error("expected a table", key)
-        return value
-
-    def _error(self, problem: str, key: str) -> ConfigError:
-        return ConfigError(problem, path=self._path, key=key)
+            values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
+        if name not in LISTS and not values:
+            raise ConfigError("an empty list of values", path=path, key=key)
+        if name not in LISTS and len(set(map(repr, values))) < len(values):
+            raise ConfigError("a value is listed twice", path=path, key=key)
+        axes[name] = values
+    return axes
 
 
 _ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name

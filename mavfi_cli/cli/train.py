@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -31,12 +32,8 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 @click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
               help="Fit to the error-free flights in this folder of run folders, of any "
                    "autopilot, instead of flying.")  # fmt: skip
-@click.option(
-    "--kind",
-    "kinds",
-    multiple=True,
-    help="Detector to fit: gad, aad, range, l2. May be repeated  [all].",
-)
+@click.option("--kind", "kinds", multiple=True,
+              help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
 @click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
 @click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0),
               help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
@@ -44,22 +41,7 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
               help="Number of parallel missions  [one per core].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the provenance of the models as JSON.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
-def train(
-    out: Path,
-    stack: str,
-    worlds: tuple[str, ...],
-    flights: int,
-    first_seed: int,
-    autopilot: str,
-    firmware: str | None,
-    flown: Path | None,
-    kinds: tuple[str, ...],
-    n_sigma: float | None,
-    seed: int,
-    jobs: int | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Fly error-free missions and fit the detectors to them.
 
     The same command resumes an interrupted training. Fitting the autoencoder needs torch:
@@ -74,22 +56,20 @@ def train(
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
     from mavfi_cli.studies.train import train as run
 
+    flown, stack, autopilot = (options[name] for name in ("flown", "stack", "autopilot"))
     if autopilot == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     if flown is not None:
         refuse_given(_FLYING, "means nothing with --flown")
+    named = ("flights", "first_seed", "seed", "n_sigma", "flown")
     plan = TrainingPlan(
-        worlds=worlds or TRAINING_WORLDS,
-        flights=flights,
-        first_seed=first_seed,
-        seed=seed,
-        n_sigma=n_sigma,
-        kinds=kinds or KINDS,
-        base=MissionConfig(stack=stack, autopilot=autopilot, firmware=firmware),
-        flown=flown,
+        worlds=options["worlds"] or TRAINING_WORLDS,
+        kinds=options["kinds"] or KINDS,
+        base=MissionConfig(stack=stack, autopilot=autopilot, firmware=options["firmware"]),
+        **{name: options[name] for name in named},
     )
     with missions_view(quiet=quiet) as view:
-        trained = run(plan, out, Options(jobs=jobs or 0), view)
+        trained = run(plan, out, Options(jobs=options["jobs"] or 0), view)
     if "aad" in trained.models:
         model, _ = trained.models["aad"]
         write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")

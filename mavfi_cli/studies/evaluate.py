@@ -16,15 +16,14 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.detectors import Scored, found, harmful, pairs_of
 from mavfi_cli.analysis.flights import errors, flown
-from mavfi_cli.analysis.scores import Scores
+from mavfi_cli.analysis.scores import scored
 from mavfi_cli.campaigns.begin import check_names
 from mavfi_cli.campaigns.detector_plans import NONE, EvaluationPlan, model_digest
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import ModelError, RecordError
+from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
-from mavfi_cli.detect.base import Model
 from mavfi_cli.studies import fly
 
 SCHEMA = 1
@@ -47,7 +46,7 @@ def evaluate(
         ConfigError: other versions of mavfi or its libraries flew in the folder.
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
-    require_held_out(plan)
+    plan.require_held_out()
     for world in plan.worlds:
         check_names(replace(plan.base, world=world, seed=plan.first_seed))
     spectator.on_note("flights without detectors")
@@ -62,31 +61,10 @@ def evaluate(
         tables.append(fly(missions, place, Keep.NONE, options, spectator))
     pairs = pairs_of(map(flown, tables), (NONE, *plan.protectors), plan.complete)
     detectors = [plan.detector_config(name) for name in plan.protectors]
-    scored = Scores(detectors, plan.base.stack, folder).scored(*pairs, spectator.on_note)
+    scores = scored(detectors, plan.base.stack, folder, pairs, spectator.on_note)
     spectator.on_note("counting")
     failed = [text for table in tables for text in errors(table, "{labels}: {reason}")]
-    return told(plan, pairs, failed, scored), pairs
-
-
-def require_held_out(plan: EvaluationPlan) -> None:
-    """Reject detectors that cannot be loaded, and missions that trained a model.
-
-    Seeds are compared across worlds, because two worlds may use the same random numbers.
-
-    Raises:
-        ModelError: a model cannot be used; the message names the training flight.
-    """
-    for detector in map(plan.detector_config, plan.protectors):
-        detector.built(plan.base.stack)
-        path = detector.model_path(plan.base.stack)
-        for flight in () if path is None else Model.read(path).training_flights:
-            seed = flight.rpartition("/")[2]
-            if seed.isdigit() and int(seed) in plan.seeds:
-                raise ModelError(
-                    f"{detector.name} was made with the flight {flight}: seeds {plan.seeds.start} "
-                    f"to {plan.seeds.stop - 1} are not held out, choose another --first-seed",
-                    path=path,
-                )
+    return told(plan, pairs, failed, scores), pairs
 
 
 def _protected_folder(plan: EvaluationPlan, folder: Path, detector: str) -> Path:

@@ -14,7 +14,6 @@ from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.preprocess import EXTENDED
 from mavfi_cli.spec.stack import load_stack
-from mavfi_cli.studies.evaluate import require_held_out
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,
@@ -111,21 +110,21 @@ def test_instruction_level_attacks_each_node():
 
 def test_seeds_that_a_model_was_made_with_are_refused(models):
     plan = replace(PLAN, models=models)
-    require_held_out(plan)
+    plan.require_held_out()
     with pytest.raises(ModelError, match=r"gad was made with the flight train-0.2-5/41: seeds 41"):
-        require_held_out(replace(plan, first_seed=41))
+        replace(plan, first_seed=41).require_held_out()
     with pytest.raises(ModelError, match=r"train-0.05-3/40"):
-        require_held_out(replace(plan, first_seed=38))
-    require_held_out(replace(plan, first_seed=42))
+        replace(plan, first_seed=38).require_held_out()
+    replace(plan, first_seed=42).require_held_out()
 
 
 def test_a_model_that_is_missing_or_damaged_is_refused(models):
     plan = replace(PLAN, models=models)
     with pytest.raises(ModelError, match="no such model file"):
-        require_held_out(replace(plan, detectors=("aad",)))
+        replace(plan, detectors=("aad",).require_held_out())
     (models / "gad.json").write_text(json.dumps({"schema": 2}))
     with pytest.raises(ModelError, match="corrupt"):
-        require_held_out(plan)
+        plan.require_held_out()
 
 
 def test_all_parts_of_the_split_are_seen(models):
