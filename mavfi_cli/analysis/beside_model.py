@@ -166,7 +166,6 @@ def _vehicle(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> 
 
 
 def _platform(platform: PlatformProfile, factor: float) -> dict[str, Any]:
-    """A platform whose latencies are those of another times a factor."""
     source = f"{platform.name}{TIMES}{factor:.6g}"
     kernels = {
         name: {"latency_s": factor * kernel.latency_s, "spread": kernel.spread, "source": source}

@@ -85,7 +85,6 @@ def _lengthening(golden: Flight, flown: Flight) -> float | None:
 
 
 def _common(kind: str, golden: Flight, flown: Flight) -> dict[str, Any]:
-    """Columns of all pairs."""
     return {
         "kind": kind,
         "golden_outcome": golden["outcome"],
@@ -272,7 +271,6 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, A
 
 
 def _curves(scores: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
-    """Curves over all harmful faults, and the areas of each stage and bit field."""
     told = ("positives", "area", "area_low", "area_high", "average_precision")
     areas = []
     for by in ("stage", "field"):

@@ -130,7 +130,6 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
 
 
 def _require_same_faults(config: MissionConfig, plan: Mapping[str, Any], path: Path) -> None:
-    """Require that a mission's fault is drawn like those of the isolated kernels."""
     fault = config.instruction
     assert fault is not None
     drawn = fault.strategy()

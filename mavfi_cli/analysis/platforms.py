@@ -76,7 +76,6 @@ class FaultCosts:
         )
 
     def _largest(self, measure: str) -> float:
-        """Largest value of a column; NaN without pairs."""
         found = pc.max(self.costs[measure]).as_py()
         return math.nan if found is None else float(found)
 

@@ -170,7 +170,6 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
 
 
 def _short_rows(ledger: Ledger, labels: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """All flown missions; see `Group.flights`."""
     kinds = dict.fromkeys(_WHOLE, pa.int64()) | dict.fromkeys(_WORDS, pa.string())
     schema = pa.schema(kinds | dict.fromkeys(METRICS, pa.float64()))
     portions = [

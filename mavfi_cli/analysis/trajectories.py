@@ -79,7 +79,6 @@ def _told(numbers: Sequence[int]) -> str:
 
 
 def _most_prolonged(ledger: Ledger, among: Collection[int]) -> int:
-    """A mission of the pair that is drawn by default."""
     kept: dict[str, bool] = {}
     first: dict[str, int] = {}
     golden_s: dict[str, float] = {}

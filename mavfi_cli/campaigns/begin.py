@@ -368,7 +368,6 @@ def _with_worlds(
 def _search(
     rule: FixedWorld, config: MissionConfig, folder: Path, options: Options, spectator: Spectator
 ) -> Flown:
-    """Find the replans of candidates 1, 2, 3, ... up to the one that fits."""
     flown: Flown = ()
     for first in range(1, rule.candidates + 1, _AT_ONCE):
         seeds = range(first, min(first + _AT_ONCE, rule.candidates + 1))

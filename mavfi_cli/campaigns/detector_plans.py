@@ -82,8 +82,6 @@ _DRAWS = 1000  # number of fault seeds to try until one draws a state of the req
 
 
 class _Site(NamedTuple):
-    """Injection site of one kind of fault."""
-
     stage: str  # of the corrupted kernel or of its output
     target: str  # a stage, or a node
     field: str  # a bit field, `integer`, or `any`
@@ -239,7 +237,6 @@ class EvaluationPlan:
         return PlannedMission(config=config, labels=labels)
 
     def _fault(self, site: _Site, world: str, seed: int) -> dict[str, Any]:
-        """Draw the fault of a mission, as settings of the mission."""
         drawn = (self.seed, "evaluation", world, seed, site.target, site.field)
         if self.level == INSTRUCTION:
             return {

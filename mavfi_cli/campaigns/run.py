@@ -172,7 +172,6 @@ def _row(mission: PlannedMission) -> tuple[str, str, str]:
 
 
 def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]) -> list[str]:
-    """Phrases for the first new mission and the first missing one."""
     firsts = {"new": _row(new[0]) if new else None, "gone": next(iter(gone), None)}
     return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
 
@@ -289,8 +288,6 @@ class MissionQueue:
 
 
 class _Run:
-    """One run over the missing missions."""
-
     def __init__(
         self, ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None
     ) -> None:
@@ -349,7 +346,6 @@ class _Run:
         return Cluster(options.cluster, options.keep, options.task)
 
     def _fill(self, workers: LocalWorkers | Cluster, asked: Sequence[int]) -> None:
-        """Start as many missions as there are free workers."""
         while workers.free and not asked:
             entry = self._again.pop() if self._again else self._queue.next()
             if entry is None:
@@ -360,7 +356,6 @@ class _Run:
             workers.start(number, changes, self._made(number), self._options.limit_s)
 
     def _made(self, number: int) -> Path:
-        """A folder for the next attempt at a mission."""
         out = self._out(number)
         try:
             out.mkdir()
@@ -373,7 +368,6 @@ class _Run:
         return self._folder / WORK / f"{number}-{self._attempts[number]}"
 
     def _take(self, ended: AttemptEnd) -> None:
-        """Handle one attempt that is over."""
         number = ended.number
         entry = self._flying.pop(number)
         self._inside_s += ended.wall_s
@@ -438,7 +432,6 @@ class _Run:
 
 
 def _settings(ledger: Ledger) -> tuple[list[str], dict[str, Counter[str]]]:
-    """The setting of each mission by its number, and a count of outcomes for each setting."""
     names = [str(labels.get("setting", "")) for labels in ledger.cells()]
     return [names[cell] for cell in ledger.cell_of_each()], {name: Counter() for name in names}
 

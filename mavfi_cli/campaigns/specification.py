@@ -45,11 +45,6 @@ NAMES = (*MISSION, *_DETECTOR, *(name for name in _OF_FAULTS if name != "target"
 
 
 def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> MissionConfig:
-    """The mission of a combination of factors.
-
-    Raises:
-        ConfigError: factors contradict each other, or a value has the wrong type.
-    """
     mission = {name: values[name] for name in MISSION if name in values}
     mission["seed"] = values.get("seed", seed)
     mission |= _fault(values, fault_seed)

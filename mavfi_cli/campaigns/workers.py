@@ -218,7 +218,6 @@ def _require_space(out: Path) -> None:
 
 
 def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
-    """Judge a mission that wrote its record."""
     try:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -242,7 +241,6 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
 
 
 def _refused(kind: str, text: str) -> Verdict:
-    """Judge a mission that could not begin or could not write its record."""
     if kind in _OF_THE_MACHINE:
         raise CampaignStopped(text)
     if kind == Interrupted.__name__:
@@ -379,7 +377,6 @@ def _connect(address: str) -> Client:
 
 
 def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:
-    """Require at least one worker, and our versions on all of them."""
     try:
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
@@ -399,7 +396,6 @@ _thread = threading.local()
 
 @cache
 def _worker_versions() -> dict[str, str]:
-    """Versions on this worker that results depend on."""
     return installed_versions()
 
 
@@ -439,7 +435,6 @@ def _fly(
 
 
 def _workers(task: str) -> LocalWorkers:
-    """The workers of this thread, one mission at a time."""
     kept: dict[str, LocalWorkers] = _thread.__dict__.setdefault("workers", {})
     if task not in kept:
         kept[task] = LocalWorkers(1, task)

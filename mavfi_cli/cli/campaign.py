@@ -344,7 +344,6 @@ def _show(
 def _summary(
     ledger: Ledger, by: Sequence[str], confidence: float, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Everything about a campaign, as plain values."""
     from dataclasses import asdict
 
     from mavfi_cli.analysis.summary import summarise

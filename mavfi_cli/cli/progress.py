@@ -196,7 +196,6 @@ def _progress_line(progress: Progress) -> str:
 
 
 def _by_setting(progress: Progress) -> str:
-    """The rate of each setting, if there are few."""
     if not 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
         return ""
     rates = [f"{name} {_percent(rate)}" for name, rate in progress.success_rates.items()]
@@ -208,7 +207,6 @@ def _percent(share: float) -> str:
 
 
 def _end_line(progress: Progress) -> str:
-    """The time that the missions took; empty if none was flown."""
     flown = progress.over - progress.before
     if not flown:
         return ""

@@ -209,7 +209,6 @@ def _choices(options: dict[str, Any]) -> Any:
 
 
 def _save(told: dict[str, Any], out: Path) -> list[str]:
-    """Write all files; return their names."""
     from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.model import PICTURES, model_csv, redundancy_csv

@@ -137,7 +137,6 @@ def compare(
 def _timelines(
     plan: ComparePlan, seed: int, folder: Path, options: Options, spectator: Spectator
 ) -> dict[str, Any]:
-    """Kernel invocations of a golden flight, one row per platform that flew."""
     spectator.on_note(f"the golden flights of seed {seed} again, for the timeline")
     golden = MissionConfig(world=plan.world, stack=plan.stack, seed=seed)
     missions = [

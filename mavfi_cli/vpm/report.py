@@ -163,7 +163,6 @@ def _setting(
 def _notes(
     vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: _Calibrated | None
 ) -> list[str]:
-    """Name what did not change with the computer, although a user may think so."""
     notes, board = [], setting.board.name
     own_time = choices.platform is None and choices.response_s is None
     if own_time and board != vehicle.board:
@@ -226,7 +225,6 @@ def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> lis
 
 
 def _row(setting: ModelInputs, scheme: Scheme, reference: Mapping[str, Any]) -> dict[str, Any]:
-    """A scheme's numbers and its ratios to the reference, or why it cannot fly."""
     told = {
         "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
         "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
@@ -292,7 +290,6 @@ _PARAMETERS = {
 
 
 def _scaled(setting: ModelInputs, field: str, factor: float) -> ModelInputs:
-    """The inputs with one of them times a factor."""
     value = factor * attrgetter(field)(setting)
     if field.startswith("board."):
         return replace(
