@@ -121,7 +121,7 @@ def test_seeds_that_a_model_was_made_with_are_refused(models):
 def test_a_model_that_is_missing_or_damaged_is_refused(models):
     plan = replace(PLAN, models=models)
     with pytest.raises(ModelError, match="no such model file"):
-        replace(plan, detectors=("aad",).require_held_out())
+        replace(plan, detectors=("aad",)).require_held_out()
     (models / "gad.json").write_text(json.dumps({"schema": 2}))
     with pytest.raises(ModelError, match="corrupt"):
         plan.require_held_out()
