@@ -76,7 +76,7 @@ def in_loop() -> None:
     empty = min(loop(lambda *_: None) for _ in range(7))
     print(f"{'detector':10} {'a check, us':>12} {'with waypoint':>15} {'share of 50 Hz':>15}"
           f" {'a report, us':>13}")  # fmt: skip
-    for name in base.detector_names():
+    for name in base.PLUG_INS.names:
         gate = Gate(DetectorConfig(name=name).built("hardened"))
         each = min(timed(gate) for _ in range(7)) - empty
         fresh = []
@@ -102,7 +102,7 @@ def in_flights(flights: int, fault_seed: int) -> None:
     fault = ("--inject", "planning", "--field", "exponent", "--fault-seed", str(fault_seed))
     print(f"\n{'detector':10} {'flight':8} {'checks/s':>9} {'a check, us':>12} {'detection':>10}"
           f" {'recovery':>9} {'alarms':>7}")  # fmt: skip
-    for name in base.detector_names():
+    for name in base.PLUG_INS.names:
         for kind, options in (("golden", ()), ("faulty", fault)):
             flown = [fly(*CALM, "--detector", name, *options).result
                      for _ in range(flights)]  # fmt: skip

@@ -95,7 +95,7 @@ def found(held: list[Run], count: int = 3000) -> None:
     struck = list(strikes(held, count))
     hours = sum(run.duration_s for run in held) / 3600.0
     kept: dict[str, np.ndarray] = {}
-    for name in base.detector_names():
+    for name in base.PLUG_INS.names:
         seen = []
         detector = DetectorConfig(name=name).built(STACK)
         for strike in struck:

@@ -85,11 +85,6 @@ class OccupancyMap:
         self._tree.setOccupancyThres(params.occupancy_threshold)
 
     @property
-    def nodes(self) -> int:
-        """Return the number of nodes in the tree."""
-        return int(self._tree.size())
-
-    @property
     def occupied_voxels(self) -> int:
         """Return the number of occupied voxels."""
         return int(self._occupied.sum())

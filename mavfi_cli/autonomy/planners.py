@@ -22,16 +22,15 @@ from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
-from mavfi_cli.autonomy import canonical_planner
+from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
 from mavfi_cli.autonomy.grid import ObstacleGrid, segment_free
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
-from mavfi_cli.core.installed import installed, load_plug_in
+from mavfi_cli.core.installed import PlugIns
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 MAX_SEED = 0x7FFF_FFFF
-_ENTRY_POINT_GROUP = "mavfi.planners"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -320,10 +319,7 @@ _OURS = {
 }
 
 
-def names() -> list[str]:
-    """Return the names of all installed planners, ours first."""
-    others = installed(_ENTRY_POINT_GROUP).names
-    return [*_OURS, *sorted(others - set(_OURS))]
+PLANNERS = PlugIns("mavfi.planners", "planner", OUR_PLANNERS)
 
 
 def find(name: str) -> Planner:
@@ -338,5 +334,5 @@ def find(name: str) -> Planner:
     plain = canonical_planner(name)
     if plain in _OURS:
         return _OURS[plain]
-    planner: Planner = load_plug_in(_ENTRY_POINT_GROUP, "planner", name, names())()
+    planner: Planner = PLANNERS.load(name)()
     return planner

@@ -19,7 +19,7 @@ from mavfi_cli.core.errors import ConfigError, ModelError
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import DType, Stage
-from mavfi_cli.detect.base import Model, detector_names
+from mavfi_cli.detect.base import PLUG_INS, Model
 from mavfi_cli.detect.fit import KINDS
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.spec.detector import STAGES, DetectorConfig
@@ -130,7 +130,7 @@ class EvaluationPlan:
     def __post_init__(self) -> None:
         require_named("level", (self.level,), (SOURCE, INSTRUCTION))
         require_named("world", self.worlds)
-        require_named("detector", self.detectors, (NONE, *detector_names()))
+        require_named("detector", self.detectors, (NONE, *PLUG_INS.names))
         require_named("stage", self.protect, STAGES)
         require_named("field", self.fields, FIELDS)
 

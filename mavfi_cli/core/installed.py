@@ -1,15 +1,12 @@
-"""What is installed: mavfi, the libraries that a record depends on, and plug-ins.
-
-A plug-in is what another package registers under an entry point.
-"""
+"""What is installed: mavfi, the libraries that a record depends on, and plug-ins."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import sys
-from collections.abc import Mapping
-from functools import cache
-from importlib.metadata import EntryPoints, entry_points
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from mavfi_cli.core.errors import MavfiError, UnknownName, described
@@ -23,10 +20,8 @@ _LIBRARIES = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "pyt
 
 def installed_versions() -> dict[str, str]:
     """Return the versions of all libraries that a record depends on."""
-    versions = {"mavfi": __version__, "python": sys.version.split()[0]}
-    for name in _LIBRARIES:
-        versions[name] = importlib.metadata.version(name)
-    return versions
+    own = {"mavfi": __version__, "python": sys.version.split()[0]}
+    return own | {name: importlib.metadata.version(name) for name in _LIBRARIES}
 
 
 def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]) -> list[str]:
@@ -38,25 +33,41 @@ def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]
     ]
 
 
-@cache
-def installed(group: str) -> EntryPoints:
-    """Return the entry points of a group. To find them reads the metadata of all packages."""
-    return entry_points(group=group)
+class PlugIns:
+    """What other packages, and ours, register under an entry point.
 
-
-def load_plug_in(group: str, kind: str, name: str, known: list[str]) -> Any:
-    """Return what a plug-in's entry point names.
-
-    Raises:
-        UnknownName: No plug-in has this name. Suggests the nearest.
-        MavfiError: Its module cannot be imported, or lacks the object.
+    Args:
+        group: Name of the entry point.
+        kind: Word for what is registered.
+        ours: Names that are known without an entry point.
     """
-    for entry in installed(group):
-        if entry.name == name:
-            try:
-                return entry.load()
-            except Exception as error:  # another package's code may raise anything
-                raise MavfiError(
-                    f"the plug-in {name!r} ({entry.value}) does not load: {described(error)}"
-                ) from None
-    raise UnknownName(kind, name, known)
+
+    def __init__(self, group: str, kind: str, ours: Sequence[str] = ()) -> None:
+        self.group, self._kind, self._ours = group, kind, ours
+
+    @cached_property
+    def _entries(self) -> dict[str, EntryPoint]:
+        """The entry points by name. To find them reads the metadata of all packages."""
+        return {entry.name: entry for entry in reversed([*entry_points(group=self.group)])}
+
+    @property
+    def names(self) -> list[str]:
+        """Known names: ours, then the others in alphabetical order."""
+        return [*self._ours, *sorted(self._entries.keys() - set(self._ours))]
+
+    def load(self, name: str) -> Any:
+        """Return what the entry point of that name names.
+
+        Raises:
+            UnknownName: No plug-in has this name. Suggests the nearest.
+            MavfiError: Its module cannot be imported, or lacks the object.
+        """
+        if name not in self._entries:
+            raise UnknownName(self._kind, name, self.names)
+        entry = self._entries[name]
+        try:
+            return entry.load()
+        except Exception as error:  # another package's code may raise anything
+            raise MavfiError(
+                f"the plug-in {name!r} ({entry.value}) does not load: {described(error)}"
+            ) from None

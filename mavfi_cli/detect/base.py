@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, MavfiError, ModelError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.installed import installed, load_plug_in
+from mavfi_cli.core.installed import PlugIns
 from mavfi_cli.core.types import FloatArray, StackMark, Stage
 from mavfi_cli.detect.preprocess import (
     EXTENDED,
@@ -37,9 +37,9 @@ from mavfi_cli.detect.preprocess import (
 SCHEMA = 2
 SHIPPED = Path(__file__).parent / "models"  # one folder per stack
 DEFAULT_STACK = "mavbench"  # stack of the default models
-# An entry point of this group names a function that creates a detector. It takes the arguments of
+# An entry point names a function that creates a detector. It takes the arguments of
 # `find_detector` but the name.
-ENTRY_POINT_GROUP = "mavfi.detectors"
+PLUG_INS = PlugIns("mavfi.detectors", "detector")
 
 
 class Detector(Protocol):
@@ -73,11 +73,6 @@ class Detector(Protocol):
         """Update the model with an accepted sample. A fixed model does nothing."""
 
 
-def detector_names() -> list[str]:
-    """Return the names of all installed detectors, sorted."""
-    return sorted(installed(ENTRY_POINT_GROUP).names)
-
-
 def find_detector(
     name: str, *, model: Path | None = None, threshold: float | None = None
 ) -> Detector:
@@ -93,8 +88,7 @@ def find_detector(
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
     """
-    factory = load_plug_in(ENTRY_POINT_GROUP, "detector", name, detector_names())
-    detector: Detector = factory(model=model, threshold=threshold)
+    detector: Detector = PLUG_INS.load(name)(model=model, threshold=threshold)
     return detector
 
 
@@ -144,7 +138,7 @@ class Model:
             RecordError: The file could not be written.
         """
         for name, array in self.arrays.items():
-            _require_finite(path, name, array)
+            _require_finite(name, array, path)
         write_json(path, asdict(self))
 
     @classmethod
@@ -162,7 +156,8 @@ class Model:
             raise ModelError("corrupt model file: not JSON", path=path) from None
         if not isinstance(data, dict):
             raise ModelError("corrupt model file: no JSON object", path=path)
-        _refuse_other(path, "model schema", data.get("schema", SCHEMA), SCHEMA)
+        if (schema := data.get("schema", SCHEMA)) != SCHEMA:
+            raise ModelError(f"made for model schema {schema!r}, this is {SCHEMA!r}", path=path)
         if odd := set(data) ^ {each.name for each in fields(cls)}:
             raise ModelError(f"corrupt model file: keys {', '.join(sorted(odd))}", path=path)
         try:
@@ -173,67 +168,30 @@ class Model:
             raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
         return model
 
-    @classmethod
-    def load(
-        cls,
-        path: Path,
-        detector: str,
-        shapes: Mapping[str, tuple[int, ...]],
-        positive: Collection[str] = (),
-    ) -> Model:
-        """Read a model of a kind with arrays of the given shapes, for any stack.
-
-        Args:
-            positive: Names of arrays whose numbers must all be above 0.
-
-        Raises:
-            ModelError: As `read`; or the file has another mavfi version, state table,
-                preprocessing or kind; an array is missing, unknown, of another shape, not finite,
-                or out of range.
-        """
-        model = cls.read(path)
-        _refuse_other(path, "mavfi", model.mavfi, version("mavfi"))
-        _refuse_other(path, "detector", model.detector, detector)
-        if model.states != STATES_DIGEST:
-            raise ModelError("made for another table of states; train it anew", path=path)
-        if model.preprocess_digest != model.preprocess.digest():
-            raise ModelError("made with another preprocessing; train it anew", path=path)
+    def problem_of(self, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> str:
+        """Return why this version has no detector of that kind for the model; empty if it has."""
         names = [state.name for state in EXTENDED]
-        if set(model.extended) != set(names):
-            raise ModelError(f"corrupt model file: extended must be {', '.join(names)}", path=path)
-        for name, (low, high) in model.extended.items():
+        if self.mavfi != version("mavfi"):
+            return f"made for mavfi {self.mavfi!r}, this is {version('mavfi')!r}"
+        if self.detector != detector:
+            return f"made for detector {self.detector!r}, this is {detector!r}"
+        if self.states != STATES_DIGEST:
+            return "made for another table of states; train it anew"
+        if self.preprocess_digest != self.preprocess.digest():
+            return "made with another preprocessing; train it anew"
+        if set(self.extended) != set(names):
+            return f"corrupt model file: extended must be {', '.join(names)}"
+        for name, (low, high) in self.extended.items():
             if not -LIMIT <= low <= 0 <= high <= LIMIT:
-                raise ModelError(f"corrupt model file: extended: {name} is not a range", path=path)
-        if set(model.arrays) != set(shapes):
-            raise ModelError(f"corrupt model file: arrays must be {', '.join(shapes)}", path=path)
-        arrays = {name: _array(path, name, model.arrays[name], shapes[name]) for name in shapes}
-        for name in positive:
-            if not (arrays[name] > 0.0).all():
-                raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
-        return replace(model, arrays=arrays)
+                return f"corrupt model file: extended: {name} is not a range"
+        if set(self.arrays) != set(shapes):
+            return f"corrupt model file: arrays must be {', '.join(shapes)}"
+        return ""
 
 
-def _refuse_other(path: Path, what: str, found: object, wanted: object) -> None:
-    if found != wanted:
-        raise ModelError(f"made for {what} {found!r}, this is {wanted!r}", path=path)
-
-
-def _require_finite(path: Path, name: str, array: FloatArray) -> None:
+def _require_finite(name: str, array: FloatArray, path: Path) -> None:
     if not np.isfinite(array).all():
         raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
-
-
-def _array(path: Path, name: str, data: object, shape: tuple[int, ...]) -> FloatArray:
-    try:
-        array: FloatArray = np.array(data, np.float64)
-    except (TypeError, ValueError):
-        problem = f"corrupt model file: array {name!r} does not contain numbers"
-        raise ModelError(problem, path=path) from None
-    if array.shape != shape:
-        problem = f"array {name!r} has shape {array.shape}, this version needs {shape}"
-        raise ModelError(problem, path=path)
-    _require_finite(path, name, array)
-    return array
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
@@ -250,7 +208,7 @@ def listing(models: Path | None = None) -> list[dict[str, Any]]:
         models: Folder of model files `NAME.json`; None takes those that are shipped.
     """
     rows = []
-    for name in detector_names():
+    for name in PLUG_INS.names:
         shipped_ones = sorted(SHIPPED.glob(f"*/{name}.json"))
         paths = shipped_ones if models is None else [models / f"{name}.json"]
         rows += [_row(name, path) for path in paths] or [_row(name, None)]
@@ -349,13 +307,33 @@ class FittedDetector:
         Without a file it takes the one that is shipped for the default stack.
         """
         path = shipped(cls.name) if model is None else model
-        positive = (next(iter(cls.shapes)), *cls.divisors)
-        loaded = Model.load(path, cls.name, cls.shapes, positive)
-        detector = cls(loaded.arrays)
+        loaded = Model.read(path)
+        detector = cls(cls._arrays(loaded, path))
         detector.stack, detector.extended = loaded.stack, loaded.extended
         if threshold is not None:
             detector.flat[0] = checked_threshold(threshold)
         return detector
+
+    @classmethod
+    def _arrays(cls, model: Model, path: Path) -> dict[str, FloatArray]:
+        """Return the arrays of a model. A ModelError says why this version cannot use it."""
+        if problem := model.problem_of(cls.name, cls.shapes):
+            raise ModelError(problem, path=path)
+        arrays = {}
+        for name, shape in cls.shapes.items():
+            try:
+                array: FloatArray = np.array(model.arrays[name], np.float64)
+            except (TypeError, ValueError):
+                problem = f"corrupt model file: array {name!r} does not contain numbers"
+                raise ModelError(problem, path=path) from None
+            if array.shape != shape:
+                problem = f"array {name!r} has shape {array.shape}, this version needs {shape}"
+                raise ModelError(problem, path=path)
+            _require_finite(name, array, path)
+            if name in (next(iter(cls.shapes)), *cls.divisors) and not (array > 0.0).all():
+                raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
+            arrays[name] = array
+        return arrays
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
         """Do nothing, because most models are fixed in flight. See `Detector`."""

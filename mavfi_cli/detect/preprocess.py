@@ -117,14 +117,6 @@ class PreprocessParams:
         sample, CODE and DELTA those of the last sample. FLOOR, CEILING and KIND define the
         encoding.
         """
-        floors = {
-            "time_to_collision": self.time_to_collision_floor,
-            "waypoint_position": self.position_floor,
-            "waypoint_yaw": self.yaw_floor,
-            "waypoint_velocity": self.velocity_floor,
-            "command_velocity": self.command_velocity_floor,
-            "command_yaw": self.command_yaw_floor,
-        }
         columns = []
         for state in DETECTED:
             if state.dtype is not DType.FLOAT64:
@@ -133,7 +125,8 @@ class PreprocessParams:
             endless = state.name == "time_to_collision"
             ceiling = self.time_to_collision_ceiling if endless else LIMIT
             kind = _ANGLE if state.unit == "rad" else _REAL
-            columns.append((floors[state.group], ceiling, kind))
+            floor = getattr(self, f"{state.group.removeprefix('waypoint_')}_floor")
+            columns.append((floor, ceiling, kind))
         work = np.zeros((ROWS, COUNT), np.int16)
         work[REFERENCE : PREVIOUS + 1] = UNKNOWN
         work[FLOOR:] = np.array(columns, np.int16).T

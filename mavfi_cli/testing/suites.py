@@ -300,7 +300,7 @@ class PlannerContract:
         problem = self.posed(self.wall_with_gap())
         planner = planners.find(name)
         first = planner.plan(problem, 7).path_enu_m
-        for other in planners.names():
+        for other in planners.PLANNERS.names:
             planners.find(other).plan(self.posed(self.wall_with_gap(5.0)), 3)
         assert np.array_equal(planner.plan(problem, 7).path_enu_m, first)
 

@@ -8,13 +8,13 @@ from mavfi_cli.testing import DetectorContract
 
 
 class TestDetectors(DetectorContract):
-    @pytest.fixture(params=base.detector_names())
+    @pytest.fixture(params=base.PLUG_INS.names)
     def name(self, request):
         return request.param
 
 
 def test_ours_are_there():
-    assert {"gad", "aad", "range", "l2"} <= set(base.detector_names())
+    assert {"gad", "aad", "range", "l2"} <= set(base.PLUG_INS.names)
 
 
 def test_an_unknown_name_names_the_nearest():

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 import numpy as np
 import pytest
 
-from mavfi_cli.autonomy import planners
+from mavfi_cli.autonomy import OUR_PLANNERS, planners
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.core import installed
 from mavfi_cli.core.errors import MavfiError, UnknownName
@@ -16,7 +16,7 @@ posed, wall_with_gap = PlannerContract.posed, PlannerContract.wall_with_gap
 
 
 class TestPlanners(PlannerContract):
-    @pytest.fixture(params=planners.names())
+    @pytest.fixture(params=planners.PLANNERS.names)
     def name(self, request):
         return request.param
 
@@ -69,13 +69,12 @@ def plugged_in(monkeypatch):
         for name, value in (("straight", f"{__name__}:Straight"), ("gone", "nowhere_at_all:Gone"))
     )
     monkeypatch.setattr(installed, "entry_points", lambda group: entries)
-    installed.installed.cache_clear()
-    yield
-    installed.installed.cache_clear()
+    found = installed.PlugIns("mavfi.planners", "planner", OUR_PLANNERS)
+    monkeypatch.setattr(planners, "PLANNERS", found)
 
 
 def test_other_packages_plug_in_by_entry_point(plugged_in):
-    assert planners.names()[3:] == ["gone", "straight"]
+    assert planners.PLANNERS.names[3:] == ["gone", "straight"]
     assert planners.find("straight").name == "straight"
 
 
