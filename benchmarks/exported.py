@@ -8,7 +8,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from mavfi_cli.stats.paired import McNemar, mcnemar
+from mavfi_cli.stats.paired import McNemar
 from mavfi_cli.stats.shares import wilson
 
 Row = Mapping[str, Any]
@@ -49,4 +49,4 @@ def share(count: int, total: int) -> str:
 def against(one: Mapping[Key, bool], other: Mapping[Key, bool]) -> McNemar:
     """McNemar's exact test of what happened to the faults that both arms flew."""
     both = sorted(one.keys() & other.keys(), key=repr)
-    return mcnemar([one[fault] for fault in both], [other[fault] for fault in both])
+    return McNemar.of([one[fault] for fault in both], [other[fault] for fault in both])

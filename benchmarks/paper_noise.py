@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 
+from scipy.stats import fisher_exact
+
 from mavfi_cli.paper.items import printed
-from mavfi_cli.stats.paired import fisher, recovered_share
+from mavfi_cli.stats.paired import recovered_share
 
 GOLDEN, FAULTY = 100, 300  # missions a world
 WORLDS = ("factory", "farm", "sparse", "dense")
@@ -21,6 +23,11 @@ SETTINGS = (
     "gad",
     "aad",
 )  # without a fault; with one, without and with a detector
+
+
+def fisher(first, second):
+    """Two-sided p-value of Fisher's exact test of two rates."""
+    return fisher_exact([[wins, missions - wins] for wins, missions in (first, second)]).pvalue
 
 
 def share(*keys: object) -> float:

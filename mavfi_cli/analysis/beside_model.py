@@ -208,7 +208,7 @@ NOT_SCALED = (
 )
 
 
-def arm(table: pa.Table, key: Key) -> pa.Table:
+def _arm(table: pa.Table, key: Key) -> pa.Table:
     """The flights of a vehicle with a scheme."""
     return chosen(table, label_group=key[0], label_arm=key[1])
 
@@ -269,7 +269,7 @@ def _scheme(
     }  # fmt: skip
     if isinstance(plan, str):
         return {**told, "problem": plan}
-    mine = arm(flights, (vehicle, row["scheme"]))
+    mine = _arm(flights, (vehicle, row["scheme"]))
     return {
         **told,
         "v_max_mps": plan.mission.v_max_mps,
@@ -299,7 +299,7 @@ def _over(
         base, own = (plans[key] for key in keys)
         if isinstance(base, str) or isinstance(own, str):
             continue
-        sides = [flown(arm(flights, key)) for key in keys]
+        sides = [flown(_arm(flights, key)) for key in keys]
         pairs = paired(sides[0], sides[1], PLACE)
         both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))
         first, second = (pair.filter(both).sort_by([*_BY_PLACE]) for pair in pairs)

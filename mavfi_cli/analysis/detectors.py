@@ -24,7 +24,7 @@ from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
-from mavfi_cli.stats.paired import OWN, McNemar, holm, mcnemar, worst_case
+from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
 from mavfi_cli.stats.roc import curves
 from mavfi_cli.stats.shares import Interval, Share, mixture, rate
 
@@ -405,7 +405,7 @@ def _recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, Mc
     harm = here["harm"]
 
     def test(among: pa.Array, column: str) -> McNemar:
-        return mcnemar(*(flags(each.filter(among), column) for each in (here, there)))
+        return McNemar.of(*(flags(each.filter(among), column) for each in (here, there)))
 
     lost, harmful = pc.equal(harm, LOST), pc.not_equal(harm, HARMLESS)
     return test(lost, "won"), test(harmful, "undone")
@@ -416,7 +416,7 @@ def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
 
 
 def _ends(pairs: pa.Table, first: str) -> McNemar:
-    return mcnemar(flags(pairs, first), flags(pairs, "won"))
+    return McNemar.of(flags(pairs, first), flags(pairs, "won"))
 
 
 def _worst(pairs: pa.Table) -> dict[str, Any]:

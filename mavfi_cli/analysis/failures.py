@@ -21,7 +21,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour, rate
+from mavfi_cli.stats.shares import Share, cross_layer, rate
 
 KERNELS = "kernels.json"
 
@@ -102,7 +102,7 @@ def failures(
             _require_same_faults(configs[0], alone["plan"], kernels / KERNELS)
             sdc = silent[kernel]
             layers = cross_layer(sdc["count"], sdc["of"], failed, struck, confidence)
-        hourly = None if upsets_per_hour is None else failures_per_hour(upsets_per_hour, failure)
+        hourly = None if upsets_per_hour is None else failure.per_hour(upsets_per_hour)
         rows.append(
             {
                 "labels": group.labels,

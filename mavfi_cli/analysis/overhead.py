@@ -126,6 +126,43 @@ class ComputeOverhead:
         """Checks over kernel time on the host, whose workload is far below the paper's."""
         return self.detection_s / self.host_compute_s
 
+    @classmethod
+    def of(
+        cls, records: Iterable[Mapping[str, Any]], platform: str | None = None
+    ) -> dict[str, ComputeOverhead]:
+        """The overhead of every detector in these records, summed over its flights.
+
+        Flights with a fault are ignored, because the fault may cause their alarms.
+
+        Args:
+            platform: use only flights on this platform; None uses all.
+        """
+        counted: dict[str, list[DetectionCost]] = {}
+        left_out: Counter[str] = Counter()
+        names: dict[str, str] = {}  # platform in a mission -> name
+        for cost in filter(None, map(detection_cost, records)):
+            if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
+                continue
+            name = names.setdefault(cost.platform, _platform_name(cost.platform))
+            if platform is None or _same(name, platform):
+                counted.setdefault(cost.detector, []).append(cost)
+            else:
+                left_out[cost.detector] += 1
+        return {
+            detector: cls(
+                detector=detector,
+                flights=len(costs),
+                detection_s=sum(cost.checks_host_s for cost in costs),
+                recompute_s=sum(cost.recovered_s for cost in costs),
+                compute_s=sum(cost.compute_s for cost in costs),
+                host_compute_s=sum(cost.host_compute_s for cost in costs),
+                alarms=sum(round(math.fsum(cost.recomputations.values())) for cost in costs),
+                platforms=tuple(sorted({names[cost.platform] for cost in costs})),
+                left_out=left_out[detector],
+            )
+            for detector, costs in counted.items()
+        }
+
     def told(self, where: str) -> str:
         """The source of the number, for the table."""
         again = self.share - self.checks_share
@@ -137,43 +174,6 @@ class ComputeOverhead:
             f"{'recomputation' if self.alarms == 1 else 'recomputations'} {100.0 * again:.4g} %; "
             f"{HOST_CHECKS}"
         )
-
-
-def compute_overheads(
-    records: Iterable[Mapping[str, Any]], platform: str | None = None
-) -> dict[str, ComputeOverhead]:
-    """The overhead of every detector in these records, summed over its flights.
-
-    Flights with a fault are ignored, because the fault may cause their alarms.
-
-    Args:
-        platform: use only flights on this platform; None uses all.
-    """
-    counted: dict[str, list[DetectionCost]] = {}
-    left_out: Counter[str] = Counter()
-    names: dict[str, str] = {}  # platform in a mission -> name
-    for cost in filter(None, map(detection_cost, records)):
-        if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
-            continue
-        name = names.setdefault(cost.platform, _platform_name(cost.platform))
-        if platform is None or _same(name, platform):
-            counted.setdefault(cost.detector, []).append(cost)
-        else:
-            left_out[cost.detector] += 1
-    return {
-        detector: ComputeOverhead(
-            detector=detector,
-            flights=len(costs),
-            detection_s=sum(cost.checks_host_s for cost in costs),
-            recompute_s=sum(cost.recovered_s for cost in costs),
-            compute_s=sum(cost.compute_s for cost in costs),
-            host_compute_s=sum(cost.host_compute_s for cost in costs),
-            alarms=sum(round(math.fsum(cost.recomputations.values())) for cost in costs),
-            platforms=tuple(sorted({names[cost.platform] for cost in costs})),
-            left_out=left_out[detector],
-        )
-        for detector, costs in counted.items()
-    }
 
 
 def _platform_name(called: str) -> str:
@@ -209,10 +209,10 @@ def recorded_overheads(
     Raises:
         RecordError: there are none; the message says what is there.
     """
-    of_each = compute_overheads(_records(path), platform)
+    of_each = ComputeOverhead.of(_records(path), platform)
     known = {name: each for name, each in of_each.items() if name in detectors}
     if not known and platform is not None:
-        elsewhere = compute_overheads(_records(path))
+        elsewhere = ComputeOverhead.of(_records(path))
         flown = sorted({on for name in detectors if name in elsewhere
                         for on in elsewhere[name].platforms})  # fmt: skip
         if flown:

@@ -34,7 +34,7 @@ from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, mean, median
-from mavfi_cli.stats.paired import OWN, mcnemar, sign_flips, worst_case
+from mavfi_cli.stats.paired import OWN, McNemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import rate
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
@@ -338,7 +338,7 @@ def _spread(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -
 
 def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
     pairs = paired(first, second, MISSION)
-    test = mcnemar(*(flags(each, "succeeded") for each in pairs))
+    test = McNemar.of(*(flags(each, "succeeded") for each in pairs))
     return {
         "pairs": test.pairs,
         "both_succeed": test.both,

@@ -20,7 +20,7 @@ from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical, label_tex
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.paired import OWN, holm, mcnemar, worst_case
+from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
 from mavfi_cli.stats.shares import rate
 
 RESAMPLES = 1999
@@ -310,7 +310,7 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
 
 def _compared(matches: Sequence[_Match], confidence: float) -> list[dict[str, Any]]:
     matches = [each for each in matches if len(each.at_second)]
-    tests = [mcnemar(*each.success) for each in matches]
+    tests = [McNemar.of(*each.success) for each in matches]
     corrected = holm([test.p_value for test in tests])
     rows = []
     for each, test, p_value in zip(matches, tests, corrected, strict=True):

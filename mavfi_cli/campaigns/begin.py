@@ -29,7 +29,7 @@ from mavfi_cli.campaigns.run import (
     store_plan,
 )
 from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
-from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets, replaced
+from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec, replaced
 from mavfi_cli.core.errors import (
     ConfigError,
     FaultSpecError,
@@ -116,22 +116,22 @@ def folder_of(what: str) -> Path:
 def _is_folder(what: str) -> bool:
     """True if the name is that of a campaign's folder, not of a preset or a file."""
     folder = Path(what)
-    return what not in presets() and (
+    return what not in PRESETS.names and (
         folder.is_dir() or (os.sep in what and folder.suffix != ".toml")
     )
 
 
 def _require_known(what: str) -> None:
     """Refuse a word that is not a preset; the error may suggest campaigns/NAME."""
-    if what not in presets() and Path(what).suffix != ".toml":
+    if what not in PRESETS.names and Path(what).suffix != ".toml":
         begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
         meant = [each for each in begun if Path(each).name == what]
-        raise UnknownName("campaign", what, meant or [*presets(), *begun])
+        raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun])
 
 
 def _require_one_meaning(what: str) -> None:
     """Refuse a preset's name if a folder of that name holds a campaign."""
-    if what in presets() and (Path(what) / LEDGER).is_file():
+    if what in PRESETS.names and (Path(what) / LEDGER).is_file():
         own = DEFAULT / what
         raise ConfigError(
             f"{what} is a preset, and .{os.sep}{what} holds a campaign: say .{os.sep}{what} for "

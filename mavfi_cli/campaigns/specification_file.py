@@ -21,16 +21,11 @@ from mavfi_cli.core.config import (
 )
 from mavfi_cli.core.errors import ConfigError, named_member
 
-_PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
+PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
 _TOP = (*(each.name for each in fields(Spec) if each.name not in ("fixed", "axes", "settings")),
         *_FACTORS)  # fmt: skip
 _SETTING = ("name", "repetitions")
-
-
-def presets() -> tuple[str, ...]:
-    """The names of the campaigns that come with mavfi."""
-    return tuple(_PRESETS.names)
 
 
 def load_spec(name: str) -> Spec:
@@ -40,7 +35,7 @@ def load_spec(name: str) -> Spec:
         UnknownName: neither a preset nor a file.
         ConfigError: the file cannot be used; says where and why.
     """
-    path = _PRESETS.path(name)
+    path = PRESETS.path(name)
     return parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
 
 

@@ -94,7 +94,7 @@ def vpm(
     In the F-1 visual performance model a vehicle flies as fast as it can stop within its sensing
     range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
     """
-    from mavfi_cli.core.errors import ConfigError
+    from mavfi_cli.campaigns.specification import require_named
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.model import model_csv, model_lines, redundancy_csv
     from mavfi_cli.vpm.model import ModelVehicle, schemes_with
@@ -112,12 +112,10 @@ def vpm(
     if options["models"] is not None and options["train"]:
         raise click.UsageError("--models and --train exclude each other")
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
-    names = [vehicle.name for vehicle in chosen]
-    if twice := [name for place, name in enumerate(names) if name in names[:place]]:
-        raise ConfigError(f"{twice[0]} is named twice", key="vehicle")
+    require_named("vehicle", [vehicle.name for vehicle in chosen])
     choices = _choices(options)
     platform = choices.platform
-    known = overheads(options["overheads"], None if platform is None else platform.name)
+    known = _overheads(options["overheads"], None if platform is None else platform.name)
     told = report(chosen, choices, schemes_with(known))
     if fly:
         out = out or Path("vpm")
@@ -132,7 +130,7 @@ def vpm(
         click.echo("\n".join([*model_lines(told), *written]))
 
 
-def overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
+def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
     """Overhead in per cent and its source for each detector; the last option counts.
 
     Args:

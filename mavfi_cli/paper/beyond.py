@@ -15,8 +15,8 @@ from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.flights import Flights
-from mavfi_cli.stats.paired import holm, mcnemar
-from mavfi_cli.stats.shares import Share, cross_layer, failures_per_hour, wilson
+from mavfi_cli.stats.paired import McNemar, holm
+from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
 Row = Mapping[str, Any]  # one flight
 
@@ -140,7 +140,7 @@ def hourly_failures(flights: Flights, upsets_per_hour: float) -> Iterator[dict[s
         lost = dict(
             sorted((name or "", each.share()) for (name,), each in those.by("detector").items())
         )
-        hourly = {name: failures_per_hour(upsets_per_hour, each) for name, each in lost.items()}
+        hourly = {name: each.per_hour(upsets_per_hour) for name, each in lost.items()}
         yield {"where": place, "lost": lost, "per_hour": hourly}
 
 
@@ -194,7 +194,7 @@ def arms(flights: Flights) -> list[dict[str, Any]]:
     order = sorted(trials, key=lambda name: name != PLAIN)
     kept = {name: [trials[name][trial] for trial in shared] for name in order}
     won = {name: [not each["lost"] for each in those] for name, those in kept.items()}
-    tests = {name: mcnemar(won[PLAIN], won[name]).p_value for name in order if name != PLAIN}
+    tests = {name: McNemar.of(won[PLAIN], won[name]).p_value for name in order if name != PLAIN}
     corrected = dict(zip(tests, holm([*tests.values()]), strict=True))
     return [
         {

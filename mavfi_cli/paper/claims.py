@@ -27,11 +27,10 @@ from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import (
     ClaimVerdict,
     Count,
+    McNemar,
     correlation,
-    fisher,
     judge,
     longest_reaches,
-    mcnemar,
     recovered_share,
 )
 from mavfi_cli.stats.shares import Interval, Share, wilson
@@ -118,7 +117,7 @@ def _success_lost(flights: Flights, **where: Any) -> _Finding:
     both = flights.struck(**where).chosen(own_lost=(True, False))
     if not len(both):
         return _Finding()
-    found = mcnemar(~both.flags("lost"), ~both.flags("own_lost")).effect
+    found = McNemar.of(~both.flags("lost"), ~both.flags("own_lost")).effect
     told = f"{both.share().counts} lost; golden {both.share('own_lost').counts}"
     return _Finding(effect=found, told=told)
 
@@ -246,7 +245,7 @@ def _autoencoder_better(flights: Flights, **where: Any) -> _Finding:
     both = sorted(gad.keys() & aad.keys())
     if not both:
         return _Finding()
-    test = mcnemar([gad[key] for key in both], [aad[key] for key in both])
+    test = McNemar.of([gad[key] for key in both], [aad[key] for key in both])
     told = f"{test.only_second} missions by AAD only, {test.only_first} by GAD only"
     return _Finding(effect=test.effect, told=f"{told}, of {test.pairs:,}")
 
@@ -366,9 +365,11 @@ def _read(path: Path) -> Iterator[_Claim]:
 
 
 def _in_the_paper(told: Mapping[str, Any], counts: Sequence[Count]) -> dict[str, Any]:
+    from scipy.stats import fisher_exact
+
     spread = _spread(counts)
     ends = {end: getattr(spread, end) for end in ("low", "high")}
-    chance = fisher(counts[0], counts[1])
+    chance = fisher_exact([[wins, missions - wins] for wins, missions in counts[:2]]).pvalue
     texts = {name: f"{100 * end:z.0f}" for name, end in ends.items()}
     texts["p"] = "p < 0.001" if chance < 0.001 else f"p = {chance:.2g}"
     found = {name: ends[name] for name in ends if told.get(name) == _AS_PRINTED}

@@ -16,7 +16,7 @@ from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Spec
-from mavfi_cli.campaigns.specification_file import load_spec, presets
+from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, read_parquet
 from mavfi_cli.core.installed import installed_versions, version_differences
@@ -210,7 +210,7 @@ def _spec_beside(path: Path) -> Spec | None:
     for stem in (path.stem, path.stem.rpartition("-part")[0]):
         if stem and (beside := path.with_name(stem + _SPEC)).is_file():
             return load_spec(str(beside))
-        if stem in presets():
+        if stem in PRESETS.names:
             return load_spec(stem)
     return None
 

@@ -14,7 +14,7 @@ from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.summary import METRICS, Group, groups
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
-from mavfi_cli.campaigns.specification_file import presets
+from mavfi_cli.campaigns.specification_file import PRESETS
 from mavfi_cli.core.errors import RecordError, UnknownName
 from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import (
@@ -63,7 +63,7 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
 def _item_of(ledger: Ledger, name: str | None) -> Item | None:
     """The named item of a campaign, or the one of its preset; None if the paper has none."""
     preset = (ledger.meta("name") or "").partition("-")[0]  # with or without changes
-    own = [item for item in ITEMS if item.preset == preset] if preset in presets() else []
+    own = [item for item in ITEMS if item.preset == preset] if preset in PRESETS.names else []
     if name is None:
         return min(own, key=lambda item: item.name != preset, default=None)
     (found,) = items_named([name])

@@ -45,6 +45,23 @@ class McNemar:
     neither: int
     p_value: float
 
+    @classmethod
+    def of(cls, first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArray) -> McNemar:
+        """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
+
+        Args:
+            first, second: success of each mission under each treatment, (n,).
+        """
+        ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
+        neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
+        return cls(
+            both=both,
+            only_first=only_first,
+            only_second=only_second,
+            neither=neither,
+            p_value=_coins(min(only_first, only_second), only_first + only_second),
+        )
+
     @property
     def pairs(self) -> int:
         """Number of pairs."""
@@ -75,23 +92,6 @@ class McNemar:
             high=min(1.0, centre + half),
             count=self.pairs,
         )
-
-
-def mcnemar(first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArray) -> McNemar:
-    """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
-
-    Args:
-        first, second: success of each mission under each treatment, (n,).
-    """
-    ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
-    neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
-    return McNemar(
-        both=both,
-        only_first=only_first,
-        only_second=only_second,
-        neither=neither,
-        p_value=_coins(min(only_first, only_second), only_first + only_second),
-    )
 
 
 def _coins(few: int, total: int) -> float:
@@ -215,14 +215,6 @@ def judge(effect: Interval | None, low: float = -math.inf, high: float = math.in
     if effect.high <= low or effect.low >= high:
         return ClaimVerdict.NOT_REPRODUCED
     return ClaimVerdict.OPEN
-
-
-def fisher(first: Count, second: Count) -> float:
-    """Two-sided p-value of Fisher's exact test of two independent rates."""
-    from scipy.stats import fisher_exact
-
-    table = [[wins, missions - wins] for wins, missions in (first, second)]
-    return float(fisher_exact(table).pvalue)
 
 
 def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:

@@ -71,6 +71,22 @@ class Share:
         found = self.effect.minus(other.effect)
         return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
 
+    def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
+        """Failed missions per flight hour, low and high, of a share of missions that fail.
+
+        The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
+
+        Args:
+            upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
+
+        Raises:
+            ConfigError: the rate is negative.
+        """
+        if not upsets_per_hour >= 0.0:
+            told = f"must not be negative, got {upsets_per_hour:g}"
+            raise ConfigError(told, key="upsets_per_hour")
+        return upsets_per_hour * self.share, upsets_per_hour * self.low, upsets_per_hour * self.high
+
 
 def wilson(
     count: int, total: int, *, design_effect: float = 1.0, confidence_z: float = 1.959963984540054
@@ -206,27 +222,6 @@ def cross_layer(
         "failure": asdict(failure),
         "failure_given_corruption": ends,
     }
-
-
-def failures_per_hour(upsets_per_hour: float, failure: Share) -> tuple[float, float, float]:
-    """Failed missions per flight hour at a rate of upsets: point, low, high.
-
-    The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
-
-    Args:
-        upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
-        failure: failure rate of missions with one fault each.
-
-    Raises:
-        ConfigError: the rate is negative.
-    """
-    if not upsets_per_hour >= 0.0:
-        raise ConfigError(f"must not be negative, got {upsets_per_hour:g}", key="upsets_per_hour")
-    return (
-        upsets_per_hour * failure.share,
-        upsets_per_hour * failure.low,
-        upsets_per_hour * failure.high,
-    )
 
 
 Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it

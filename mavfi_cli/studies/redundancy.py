@@ -13,11 +13,10 @@ from mavfi_cli.analysis.beside_model import (
     FlightPlan,
     Key,
     RedundancyPlan,
-    arm,
     side_by_side,
 )
-from mavfi_cli.analysis.flights import flown
-from mavfi_cli.analysis.overhead import compute_overheads
+from mavfi_cli.analysis.flights import chosen, flown
+from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.campaigns.begin import ask_vehicle, check_names
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import Ledger
@@ -117,9 +116,14 @@ def fly_and_report(
     }
     missions = plan.list_of({k: each for k, each in plans.items() if isinstance(each, FlightPlan)})
     table = fly(missions, plan.folder / FLIGHTS, Keep.NONE, options, spectator)
-    watched = [flown(arm(table, key))["number"].to_pylist() for key in plans if key[1] in DETECTORS]
+    over = flown(table)
+    watched = [
+        chosen(over, label_group=group, label_arm=name)["number"].to_pylist()
+        for group, name in plans
+        if name in DETECTORS
+    ]
     with Ledger(plan.folder / FLIGHTS) as ledger:
-        measured = compute_overheads(
+        measured = ComputeOverhead.of(
             each.result for numbers in watched for each in ledger.results(numbers)
         )
     found = {name: (100.0 * each.share, each.told("--fly")) for name, each in measured.items()}

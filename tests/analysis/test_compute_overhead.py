@@ -3,10 +3,10 @@
 import json
 
 import pytest
-from click import UsageError
+from click.testing import CliRunner
 
-from mavfi_cli.analysis.overhead import compute_overheads, recorded_overheads
-from mavfi_cli.cli.vpm import overheads
+from mavfi_cli.analysis.overhead import ComputeOverhead, recorded_overheads
+from mavfi_cli.cli.vpm import vpm
 from mavfi_cli.core.errors import RecordError
 
 
@@ -38,7 +38,7 @@ def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, 
 
 
 def test_checks_alone():
-    found = compute_overheads([flight()])["gad"]
+    found = ComputeOverhead.of([flight()])["gad"]
     assert found.share == pytest.approx(0.02 / 9.0)
     assert found.checks_share == pytest.approx(found.share)
     assert found.checks_host_share == pytest.approx(0.02 / 0.2)
@@ -49,7 +49,7 @@ def test_recomputation_costs_a_run_of_the_stage():
     """0.01 + 0.3 + 0.05 s for perception, 0.2 s for planning, 0.5 ms for control."""
     alarms = [("perception", "recompute"), ("planning", "hold"), ("control", "recompute"),
               ("control", "accept")]  # fmt: skip
-    found = compute_overheads([flight(alarms=alarms)])["gad"]
+    found = ComputeOverhead.of([flight(alarms=alarms)])["gad"]
     again_s = 0.36 + 0.2 + 0.0005
     assert found.recompute_s == pytest.approx(again_s)
     assert found.share == pytest.approx((0.02 + again_s) / (9.0 - again_s))
@@ -59,13 +59,13 @@ def test_recomputation_costs_a_run_of_the_stage():
 
 def test_alarms_beyond_the_listed_ones_are_counted():
     alarms = [("planning", "recompute")] * 3 + [("control", "recompute")]
-    found = compute_overheads([flight(alarms=alarms, counted={"recompute": 8})])["gad"]
+    found = ComputeOverhead.of([flight(alarms=alarms, counted={"recompute": 8})])["gad"]
     assert found.recompute_s == pytest.approx(6 * 0.2 + 2 * 0.0005)
     assert found.alarms == 8
 
 
 def test_flights_are_taken_together_and_faulty_ones_left_out():
-    found = compute_overheads(
+    found = ComputeOverhead.of(
         [flight(), flight(gate_s=0.04), flight("aad"), flight(None), flight(fault={"state": "x"}),
          {"outcome": "crash"}]
     )  # fmt: skip
@@ -83,8 +83,8 @@ def test_flights_are_taken_together_and_faulty_ones_left_out():
 def test_flights_on_another_platform_do_not_count():
     """Recomputations and kernels are those of the flight's platform; the checks are not scaled."""
     flights = [flight(), flight(gate_s=0.04, platform="tx2"), flight("aad")]
-    assert compute_overheads(flights)["gad"].platforms == ("tx2", "x86")
-    found = compute_overheads(flights, "tx2")
+    assert ComputeOverhead.of(flights)["gad"].platforms == ("tx2", "x86")
+    found = ComputeOverhead.of(flights, "tx2")
     assert set(found) == {"gad"}
     assert found["gad"].share == pytest.approx(0.04 / 9.0)
     told = found["gad"].told("here")
@@ -100,9 +100,9 @@ def test_a_platform_scaled_for_a_detector_s_share_is_the_platform(tmp_path, name
     """`mavfi vpm --fly` flies with such files; a file that is gone leaves its own name."""
     path = tmp_path / "flown.toml"
     path.write_text(f'name = "{name}"\nbase = "tx2"\ncores = 4\nscale = 1.0222\n')
-    assert ("gad" in compute_overheads([flight(platform=str(path))], "tx2")) is counts
+    assert ("gad" in ComputeOverhead.of([flight(platform=str(path))], "tx2")) is counts
     path.unlink()
-    assert compute_overheads([flight(platform=str(path))])["gad"].platforms == ("flown",)
+    assert ComputeOverhead.of([flight(platform=str(path))])["gad"].platforms == ("flown",)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def guarded(fly_short):
 
 def test_a_real_record_has_what_it_takes(guarded):
     result = json.loads(guarded.result.read_text())
-    found = compute_overheads([result])["gad"]
+    found = ComputeOverhead.of([result])["gad"]
     assert found.detection_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert found.compute_s == pytest.approx(sum(k["busy_s"] for k in result["kernels"].values()))
     assert 0.0 < found.share < 0.5
@@ -129,12 +129,14 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
     assert found.told("here").startswith("measured in 1 flight of here on x86: checks ")
     assert measured(guarded.result) == measured(guarded.path, "x86") == found
     assert measured(guarded.path.parent).share > 0.0  # the folder of runs
-    given = overheads((str(guarded.path), "aad=0.5"))
+    asked = ["--overhead", str(guarded.path), "--overhead", "aad=0.5", "--json"]
+    told = json.loads(CliRunner().invoke(vpm, asked).stdout)["vehicles"][0]["schemes"]
+    given = {row["scheme"]: (row["overhead_percent"], row["source"]) for row in told}
     assert given["aad"] == (0.5, "--overhead")
-    assert given["gad"] == (100.0 * found.share, found.told(str(guarded.path)))
+    assert given["gad"] == (pytest.approx(100.0 * found.share), found.told(str(guarded.path)))
     with pytest.raises(RecordError, match="flew on x86, not on tx2"):
         measured(guarded.path, "tx2")
     with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
         measured(tmp_path)
-    with pytest.raises(UsageError, match=r"folder; for a percentage write aad=0\.0062"):
-        overheads((str(tmp_path / "nowhere"),))
+    refused = CliRunner().invoke(vpm, ["--overhead", str(tmp_path / "nowhere")])
+    assert "folder; for a percentage write aad=0.0062" in refused.stderr

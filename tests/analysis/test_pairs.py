@@ -14,7 +14,7 @@ from mavfi_cli.analysis.flights import (
     numbers,
     paired,
 )
-from mavfi_cli.stats.paired import mcnemar
+from mavfi_cli.stats.paired import McNemar
 
 
 def flown(*ends, seeds=None):
@@ -86,5 +86,5 @@ def test_the_interval_holds_the_ratio_that_was_put_in():
 def test_success_of_pairs():
     first = flown("success", "success", "collision", "success")
     second = flown("timeout", "success", "timeout", "timeout")
-    test = mcnemar(*(flags(each, "succeeded") for each in (first, second)))
+    test = McNemar.of(*(flags(each, "succeeded") for each in (first, second)))
     assert (test.both, test.only_first, test.neither) == (1, 2, 1)

@@ -341,9 +341,9 @@ def test_wrong_usage_is_exit_code_2(mavfi, arguments):
 
 
 def test_every_preset_is_named_in_the_help():
-    from mavfi_cli.campaigns.specification_file import presets
+    from mavfi_cli.campaigns.specification_file import PRESETS
 
-    for name in presets():
+    for name in PRESETS.names:
         assert name in command.campaign.help
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.campaigns.begin import flyable
 from mavfi_cli.campaigns.specification import Keep, Stop
-from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, presets
+from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.spec.stack import Stack, load_stack
 
@@ -273,7 +273,7 @@ def missions_of(name):
     return load_spec(name).missions()
 
 
-@pytest.mark.parametrize("name", presets())
+@pytest.mark.parametrize("name", PRESETS.names)
 def test_every_preset_expands_to_its_numbers(name):
     missions = missions_of(name)
     cells = Counter(tuple(sorted(m.labels.items())) for m in missions)
@@ -322,7 +322,7 @@ def test_hardening_has_each_protection_alone_and_all_of_them():
     }
 
 
-@pytest.mark.parametrize("name", sorted({*presets()} - {"hardening", "ablation"}))
+@pytest.mark.parametrize("name", sorted({*PRESETS.names} - {"hardening", "ablation"}))
 def test_the_presets_of_the_paper_fly_its_stack(name):
     assert {m.config.stack for m in missions_of(name)} == {"mavbench"}
 

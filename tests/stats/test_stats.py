@@ -10,10 +10,9 @@ from scipy import stats
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.stats.bootstrap import BLOCKS, FEW, LARGE, interval, mean, median
-from mavfi_cli.stats.paired import holm, mcnemar, sign_flips, worst_case
+from mavfi_cli.stats.paired import McNemar, holm, sign_flips, worst_case
 from mavfi_cli.stats.shares import (
     cross_layer,
-    failures_per_hour,
     missions_for_margin,
     mixture,
     pairs_for_difference,
@@ -58,7 +57,7 @@ def test_an_impossible_margin_is_refused(margin):
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=200))
 def test_mcnemar_is_the_sign_test_of_the_pairs_that_differ(pairs):
-    found = mcnemar([a for a, _ in pairs], [b for _, b in pairs])
+    found = McNemar.of([a for a, _ in pairs], [b for _, b in pairs])
     differing = found.only_first + found.only_second
     oracle = stats.binomtest(found.only_first, differing).pvalue if differing else 1.0
     assert found.p_value == pytest.approx(oracle, rel=1e-9)
@@ -102,7 +101,7 @@ def test_mcnemar_of_thousands_of_pairs():
     pairs = [(True, False)] * 3000 + [(False, True)] * 2800
     first, second = zip(*pairs, strict=True)
     oracle = stats.binomtest(2800, 5800).pvalue
-    assert mcnemar(first, second).p_value == pytest.approx(oracle, rel=1e-6)
+    assert McNemar.of(first, second).p_value == pytest.approx(oracle, rel=1e-6)
 
 
 def test_pairs_for_a_difference_reach_the_power_that_was_asked_for():
@@ -209,9 +208,9 @@ def test_failure_given_corruption():
 
 def test_failures_an_hour_are_the_upsets_that_fail_missions():
     share = rate(20, 100)
-    assert failures_per_hour(3.0, share) == pytest.approx((0.6, 3.0 * share.low, 3.0 * share.high))
+    assert share.per_hour(3.0) == pytest.approx((0.6, 3.0 * share.low, 3.0 * share.high))
     with pytest.raises(ConfigError, match="negative"):
-        failures_per_hour(-1.0, share)
+        share.per_hour(-1.0)
 
 
 def test_a_mixture_of_one_part_is_that_part():
