@@ -13,7 +13,6 @@ from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, Resul
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.run_folder import RESULT
-from mavfi_cli.spec.mission import MissionConfig
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
@@ -110,25 +109,20 @@ def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
     for each in flown:
         if each.injected is not Injected.GOLDEN:
             struck.setdefault(untreated(each.mission.labels), []).append(each)
-    if not struck:
-        return [_panel("", golden)]
-    return [_panel(_fault(those[0].mission.config), golden + those) for those in struck.values()]
-
-
-def _fault(config: MissionConfig) -> str:
-    asked = config.fault or config.instruction
-    return "" if asked is None else asked.words()
+    panels = []
+    for those in struck.values():
+        config = those[0].mission.config
+        asked = config.fault or config.instruction
+        panels.append(_panel("" if asked is None else asked.words(), golden + those))
+    return panels or [_panel("", golden)]
 
 
 def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
-    ordered = sorted(
-        flown,
-        key=lambda each: (
-            each.mission.config.detector is not None,
-            each.injected is not Injected.GOLDEN,
-            each.number,
-        ),
-    )
+    def order(each: MissionResult) -> tuple[bool, bool, int]:
+        watched = each.mission.config.detector is not None
+        return watched, each.injected is not Injected.GOLDEN, each.number
+
+    ordered = sorted(flown, key=order)
     short = [_setting(each) for each in ordered]
     often = Counter(short)
     return {

@@ -61,7 +61,7 @@ class Choices:
         Raises:
             ConfigError: neither the vehicle nor the choices give a needed value.
         """
-        return _setting(vehicle, self, _calibrate(vehicle) if vehicle.calibration else None)[0]
+        return _setting(vehicle, self)[0]
 
 
 def report(
@@ -97,9 +97,11 @@ def _unlike_sources(schemes: Mapping[str, Scheme]) -> list[str]:
 
 
 def _one(vehicle: ModelVehicle, choices: Choices, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
-    found = _calibrate(vehicle) if vehicle.calibration else None
-    setting, parameters = _setting(vehicle, choices, found)
+    setting, parameters, found = _setting(vehicle, choices)
     reference = setting.performance(schemes[REFERENCE])
+    calibrations = [found] if found else []
+    if found and found["board"] != OTHER_BOARD:
+        calibrations.append(_calibrate(vehicle, Board.load(OTHER_BOARD)))
     return {
         "vehicle": vehicle.name,
         "description": vehicle.description,
@@ -108,22 +110,24 @@ def _one(vehicle: ModelVehicle, choices: Choices, schemes: Mapping[str, Scheme])
         "parameters": parameters,
         "schemes": [_row(setting, scheme, reference) for scheme in schemes.values()],
         "sensitivity": _sensitivity(setting, schemes),
-        "calibrations": _calibrations(vehicle, found),
+        "calibrations": calibrations,
         "curves": _curves(setting, schemes),
     }
 
 
 def _setting(
-    vehicle: ModelVehicle, choices: Choices, found: _Calibrated | None
-) -> tuple[ModelInputs, list[dict[str, Any]]]:
-    """Collect the model's inputs, and list them with their sources."""
-    full = found.vehicle if found else vehicle
-    sources, free = dict(vehicle.sources), ""
-    if found is not None and vehicle.calibration is not None:
-        free = found.parameter
+    vehicle: ModelVehicle, choices: Choices
+) -> tuple[ModelInputs, list[dict[str, Any]], dict[str, Any]]:
+    """Collect the model's inputs, list them with their sources, and add the calibration or {}."""
+    full, sources, free = vehicle, dict(vehicle.sources), ""
+    found: dict[str, Any] = {}
+    if vehicle.calibration is not None:
+        found = _calibrate(vehicle)
+        free = found["parameter"]
+        full = replace(vehicle, calibration=None, **{free: found["value"]})
         sources[free] = (
-            f"calibrated: TMR takes {found.published_ratio:g} times the flight time of detection "
-            f"and recovery, with board {found.board.name} ({vehicle.calibration.source})"
+            f"calibrated: TMR takes {found['published_tmr_ratio']:g} times the flight time of "
+            f"detection and recovery, with board {found['board']} ({vehicle.calibration.source})"
         )
     board = _board(vehicle, choices)
     compute_s, given = full.response_s, ""
@@ -157,40 +161,36 @@ def _setting(
         compute_s=compute_s,
         distance_m=choices.distance_m,
     )
-    return setting, _parameters(setting, sources, free)
+    return setting, _parameters(setting, sources, free), found
 
 
 def _notes(
-    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: _Calibrated | None
+    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: Mapping[str, Any]
 ) -> list[str]:
-    notes, board = [], setting.board.name
+    """Name what did not change with the computer, although a user may think so."""
+    notes, board = [], setting.board
     own_time = choices.platform is None and choices.response_s is None
-    if own_time and board != vehicle.board:
+    fitted_time = found.get("parameter") == "response_s"
+    if own_time and board.name != vehicle.board:
         source = vehicle.sources.get("response_s", "not given")
-        if found is not None and found.parameter == "response_s":
-            source = f"calibrated with board {found.board.name}"
+        if fitted_time:
+            source = f"calibrated with board {found['board']}"
         notes.append(
-            f"the board is {board}, and the response time is still the vehicle's own ({source}): "
-            "give --response or --platform"
+            f"the board is {board.name}, and the response time is still the vehicle's own "
+            f"({source}): give --response or --platform"
         )
-    in_use = own_time or (found is not None and found.parameter != "response_s")
-    if found is not None and in_use and board != found.board.name:
-        notes.append(_other_calibration(vehicle, setting.board, found))
+    if found and (own_time or not fitted_time) and board.name != found["board"]:
+        told = "{parameter} = {value:.4g} {unit} is calibrated with board {board}".format(**found)
+        if board.total_kg <= 0.0:
+            other = f"board {board.name} has no mass, so nothing can be calibrated with it"
+        else:
+            try:
+                value = _calibrate(vehicle, board)["value"]
+                other = f"with board {board.name} it would be {value:.4g} {found['unit']}"
+            except ConfigError as error:
+                other = f"it cannot be with board {board.name}: {error}"
+        notes.append(f"{told}; {other}")
     return notes
-
-
-def _other_calibration(vehicle: ModelVehicle, board: Board, found: _Calibrated) -> str:
-    unit = _FREE_UNITS[found.parameter]
-    told = (
-        f"{found.parameter} = {found.value:.4g} {unit} is calibrated with board {found.board.name}"
-    )
-    if board.total_kg <= 0.0:
-        return f"{told}; board {board.name} has no mass, so nothing can be calibrated with it"
-    try:
-        other = _calibrate(vehicle, board)
-    except ConfigError as error:
-        return f"{told}; it cannot be with board {board.name}: {error}"
-    return f"{told}; with board {board.name} it would be {other.value:.4g} {unit}"
 
 
 def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
@@ -238,28 +238,6 @@ def _row(setting: ModelInputs, scheme: Scheme, reference: Mapping[str, Any]) -> 
         return {**told, **nothing, **weights, "problem": str(error)}
     ratios = {ratio: flown[of] / reference[of] for ratio, of in RATIOS.items()}
     return {**told, **flown, **ratios, "problem": None}
-
-
-def _calibrations(vehicle: ModelVehicle, found: _Calibrated | None) -> list[dict[str, Any]]:
-    """The paper's figure, with the calibration's board and with a heavier one."""
-    if found is None:
-        return []
-    both = [found]
-    if found.board.name != OTHER_BOARD:
-        both.append(_calibrate(vehicle, Board.load(OTHER_BOARD)))
-    return [
-        {
-            "board": each.board.name,
-            "board_kg": each.board.total_kg,
-            "parameter": each.parameter,
-            "value": each.value,
-            "unit": _FREE_UNITS[each.parameter],
-            "published_tmr_ratio": each.published_ratio,
-            "tmr_ratio": each.tmr_ratio,
-            "predicted_dmr_ratio": each.dmr_ratio,
-        }
-        for each in both
-    ]
 
 
 def _curves(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
@@ -311,7 +289,8 @@ def _sensitivity(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> list[di
         middle = attrgetter(field)(setting)
         if middle == 0.0:
             continue
-        below, above = (_answers(_scaled(setting, field, f), schemes) for f in (1.0 / _STEP, _STEP))
+        factors = (1.0 / _STEP, _STEP, *FACTORS)
+        below, above, *others = (_answers(_scaled(setting, field, f), schemes) for f in factors)
         slopes = [
             None if low is None or high is None else math.log(high / low) / (2 * math.log(_STEP))
             for low, high in zip(below, above, strict=True)
@@ -324,7 +303,8 @@ def _sensitivity(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> list[di
                 "velocity_elasticity_ratio": slopes[0],
                 "tmr_time_elasticity_ratio": slopes[1],
                 "points": [
-                    _point(_scaled(setting, field, f), schemes, f * middle) for f in FACTORS
+                    {"value": f * middle, "velocity_mps": fast, "tmr_flight_time_ratio": ratio}
+                    for f, (fast, ratio) in zip(FACTORS, others, strict=True)
                 ],
             }
         )
@@ -339,37 +319,23 @@ def _answers(
     return fast, None if fast is None or slow is None else fast / slow
 
 
-def _point(setting: ModelInputs, schemes: Mapping[str, Scheme], value: float) -> dict[str, Any]:
-    velocity, ratio = _answers(setting, schemes)
-    return {"value": value, "velocity_mps": velocity, "tmr_flight_time_ratio": ratio}
-
-
 # Calibration: the one free number of a vehicle from one published ratio of flight times --------
 
 _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; far below a float's resolution
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Calibrated:
-    """A vehicle with its calibrated number, and the resulting ratios of flight times."""
-
-    vehicle: ModelVehicle
-    board: Board
-    parameter: str
-    value: float  # in the unit of the parameter
-    published_ratio: float
-    tmr_ratio: float  # flight time with TMR over that with detection and recovery
-    dmr_ratio: float  # a prediction, not fitted
-
-
-def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated:
+def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> dict[str, Any]:
     """Find the vehicle's free number that gives its published ratio.
 
     The ratio falls as the free number grows, so bisection finds it.
 
     Args:
         board: the board of the redundant computers; None: the calibration's own.
+
+    Returns:
+        The free `parameter` with its `value`, and ratios of flight times with TMR and with DMR, of
+        which the last is predicted and not fitted, over that with detection and recovery.
 
     Raises:
         ConfigError: no value gives the ratio; says which ratios can be reached.
@@ -379,57 +345,43 @@ def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> _Calibrated
     assert plan is not None
     board = board or Board.load(plan.board)
 
-    def setting(value: float) -> ModelInputs:
-        """The vehicle with a trial value of the parameter."""
-        pull_n, compute_s = vehicle.rotor_pull_n, vehicle.response_s
-        if plan.parameter == "rotor_pull_n":
-            pull_n = value
-        else:
-            compute_s = value
-        full = replace(vehicle, calibration=None, rotor_pull_n=pull_n, response_s=compute_s)
-        assert pull_n is not None  # the vehicle has the number that is not calibrated
-        assert compute_s is not None
-        return ModelInputs(
-            vehicle=full, board=board, pull_n=pull_n, range_m=full.range_m,
-            compute_s=compute_s, distance_m=1.0,
-        )  # fmt: skip
-
     def ratio(value: float, scheme: str) -> float:
         """Flight time of a scheme over the reference's; infinite if one of them cannot fly."""
-        fast = setting(value).velocity_mps(SCHEMES[REFERENCE])
-        slow = setting(value).velocity_mps(SCHEMES[scheme])
+        free: dict[str, Any] = {plan.parameter: value}
+        full = replace(vehicle, calibration=None, **free)
+        assert full.rotor_pull_n is not None  # the vehicle has the number that is not calibrated
+        assert full.response_s is not None
+        setting = ModelInputs(
+            vehicle=full, board=board, pull_n=full.rotor_pull_n, range_m=full.range_m,
+            compute_s=full.response_s, distance_m=1.0,
+        )  # fmt: skip
+        fast, slow = (setting.velocity_mps(SCHEMES[name]) for name in (REFERENCE, scheme))
         return math.inf if fast is None or slow is None else fast / slow
 
     low = 1.0 / vehicle.sensor_hz
     if plan.parameter == "rotor_pull_n":
         three_kg = vehicle.mass_kg + SCHEMES["tmr"].copies * board.total_kg
         low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
-    value = _halving(lambda trial: ratio(trial, "tmr"), plan.tmr_time_ratio, low, low * _SPAN)
-    if value is None:
-        ends = f"{ratio(low * _SPAN, 'tmr'):.3f} to {ratio(low, 'tmr'):.3f}"
+    value = low * _SPAN
+    least, most = ratio(value, "tmr"), ratio(low, "tmr")
+    if not least <= plan.tmr_time_ratio <= most:
         raise ConfigError(
             f"no {plan.parameter} gives {vehicle.name!r} a ratio of {plan.tmr_time_ratio:g}; "
-            f"it can be {ends}",
+            f"it can be {least:.3f} to {most:.3f}",
             key="calibration.tmr_time_ratio",
         )
-    return _Calibrated(
-        vehicle=setting(value).vehicle,
-        board=board,
-        parameter=plan.parameter,
-        value=value,
-        published_ratio=plan.tmr_time_ratio,
-        tmr_ratio=ratio(value, "tmr"),
-        dmr_ratio=ratio(value, "dmr"),
-    )
-
-
-def _halving(
-    falling: Callable[[float], float], target: float, low: float, high: float
-) -> float | None:
-    """The argument at which a falling function equals `target`; None outside its range."""
-    if not falling(high) <= target <= falling(low):
-        return None
     for _ in range(_STEPS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if falling(middle) > target else (low, middle)
-    return high
+        middle = 0.5 * (low + value)
+        low, value = (
+            (middle, value) if ratio(middle, "tmr") > plan.tmr_time_ratio else (low, middle)
+        )
+    return {
+        "board": board.name,
+        "board_kg": board.total_kg,
+        "parameter": plan.parameter,
+        "value": value,
+        "unit": _FREE_UNITS[plan.parameter],
+        "published_tmr_ratio": plan.tmr_time_ratio,
+        "tmr_ratio": ratio(value, "tmr"),
+        "predicted_dmr_ratio": ratio(value, "dmr"),
+    }
