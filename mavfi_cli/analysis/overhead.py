@@ -211,21 +211,15 @@ def recorded_overheads(
     """
     of_each = ComputeOverhead.of(_records(path), platform)
     known = {name: each for name, each in of_each.items() if name in detectors}
-    if not known and platform is not None:
-        elsewhere = ComputeOverhead.of(_records(path))
-        flown = sorted({on for name in detectors if name in elsewhere
-                        for on in elsewhere[name].platforms})  # fmt: skip
-        if flown:
-            raise RecordError(
-                f"{path}: its flights with a detector flew on {' and '.join(flown)}, not on "
-                f"{platform} (--platform): its kernels would be those of another computer; "
-                f"mavfi fly --platform {platform} --detector {detectors[-1]} records one"
-            )
     if not known:
-        others = f", only with {', '.join(of_each)}" if of_each else ""
+        everywhere = ComputeOverhead.of(_records(path)).values()
+        there = [f"{each.detector} on {' and '.join(each.platforms)}" for each in everywhere]
+        only = f", only {', '.join(there)}" if there else ""
+        wanted = f" on {platform} (--platform)" if platform else ""
+        flags = f"--platform {platform} " if platform else ""
         raise RecordError(
-            f"{path}: no error-free flight with {' or '.join(detectors)} is recorded there{others}"
-            f"; mavfi fly --detector {detectors[-1]} records one"
+            f"{path}: no error-free flight with {' or '.join(detectors)}{wanted} is recorded "
+            f"there{only}; mavfi fly {flags}--detector {detectors[-1]} records one"
         )
     return known
 

@@ -56,18 +56,17 @@ class Progress:
     @property
     def success_rate(self) -> float | None:
         """Share of successes among the missions that this run flew; None before the first."""
-        return _share(sum(self.outcomes.values(), Counter()))
+        whole = sum(self.outcomes.values(), Counter())
+        return whole["success"] / whole.total() if whole else None
 
     @property
     def success_rates(self) -> dict[str, float]:
         """Success rate of each setting that has a finished mission."""
-        shares = {setting: _share(outcomes) for setting, outcomes in self.outcomes.items()}
-        return {setting: share for setting, share in shares.items() if share is not None}
-
-
-def _share(outcomes: Counter[str]) -> float | None:
-    flown = sum(outcomes.values())
-    return outcomes["success"] / flown if flown else None
+        return {
+            setting: outcomes["success"] / outcomes.total()
+            for setting, outcomes in self.outcomes.items()
+            if outcomes
+        }
 
 
 def duration(seconds: float) -> str:

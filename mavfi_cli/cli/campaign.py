@@ -19,7 +19,6 @@ from mavfi_cli.cli.grouped import (
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
-    from mavfi_cli.campaigns.specification import Spec
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _what = partial(click.option, cls=GroupedOption, group="Missions")
@@ -243,72 +242,60 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 
     Rejects whatever `run` would reject.
     """
-    from mavfi_cli.stats.shares import (
-        missions_for_margin,
-        pairs_for_difference,
-    )
+    from mavfi_cli.stats.shares import missions_for_margin, pairs_for_difference
 
     told: dict[str, Any] = {}
-    confidence = options["confidence"]
-    if options["margin"] is not None:
-        told["missions"] = missions_for_margin(
-            options["margin"], expected=options["expected"], confidence=confidence
+    lines: list[str] = []
+    names = ("margin", "expected", "difference", "discordant", "power", "confidence")
+    margin, expected, difference, discordant, power, confidence = (options[n] for n in names)
+    sure = f"{100 * confidence:g} % confidence"
+    if margin is not None:
+        count = missions_for_margin(margin, expected=expected, confidence=confidence)
+        told["missions"] = count
+        lines.append(
+            f"{count} missions a setting: Wilson interval of +-{margin:g} at a rate of "
+            f"{expected:g}, {sure}"
         )
-    if options["difference"] is not None:
-        told["pairs"] = pairs_for_difference(
-            options["difference"], options["discordant"], confidence=confidence,
-            power=options["power"],
-        )  # fmt: skip
+    if difference is not None:
+        count = pairs_for_difference(difference, discordant, confidence=confidence, power=power)
+        told["pairs"] = count
+        lines.append(
+            f"{count} pairs: a difference of {difference:g} found with {100 * power:g} % power, "
+            f"{sure}, where {100 * discordant:g} % of the pairs end differently "
+            f"(--discordant {discordant:g})"
+        )
     if what is not None:
-        told["campaign"] = _planned(what, scale, options["changes"])
+        told["campaign"], more = _planned(what, scale, options["changes"])
+        lines += more
     if not told:
         raise click.UsageError("name a campaign, --margin or --difference")
-    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(_plan_lines(told, options)))
+    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(lines))
 
 
-def _planned(what: str, scale: float | None, changes: Sequence[str]) -> dict[str, Any]:
+def _planned(
+    what: str, scale: float | None, changes: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """The missions of a campaign, as plain values and in lines."""
     from collections import Counter
 
     from mavfi_cli.campaigns.begin import chosen_spec, flyable
     from mavfi_cli.campaigns.missions import label_text
 
-    spec: Spec
     spec = chosen_spec(what, scale, changes)
     missions = flyable(spec)
-    cells = Counter(label_text(mission.labels) for mission in missions)
-    rule = spec.fixed_world
-    return {
-        "name": spec.name,
-        "about": spec.about,
-        "fixed_world": None if rule is None else rule.told(),
-        "missions": len(missions),
-        "pairs": len({mission.pair for mission in missions}),
-        "settings": dict(cells),
-    }
-
-
-def _plan_lines(told: dict[str, Any], options: dict[str, Any]) -> list[str]:
-    lines = []
-    sure = f"{100 * options['confidence']:g} % confidence"
-    if "missions" in told:
-        lines.append(
-            f"{told['missions']} missions a setting: Wilson interval of +-{options['margin']:g} "
-            f"at a rate of {options['expected']:g}, {sure}"
-        )
-    if "pairs" in told:
-        lines.append(
-            f"{told['pairs']} pairs: a difference of {options['difference']:g} found with "
-            f"{100 * options['power']:g} % power, {sure}, where {100 * options['discordant']:g} % "
-            f"of the pairs end differently (--discordant {options['discordant']:g})"
-        )
-    if "campaign" in told:
-        found = told["campaign"]
-        lines.append(f"{found['name']}: {found['about']}" if found["about"] else found["name"])
-        lines += [found["fixed_world"]] if found["fixed_world"] else []
-        lines += [f"{count:>7}  {labels}" for labels, count in found["settings"].items()]
-        pairs = f"{found['pairs']} pair{'s' if found['pairs'] != 1 else ''}"
-        lines.append(f"{found['missions']:>7}  missions of {pairs}")
-    return lines
+    settings = Counter(label_text(mission.labels) for mission in missions)
+    rule = None if spec.fixed_world is None else spec.fixed_world.told()
+    pairs = len({mission.pair for mission in missions})
+    told = {
+        "name": spec.name, "about": spec.about, "fixed_world": rule, "missions": len(missions),
+        "pairs": pairs, "settings": dict(settings),
+    }  # fmt: skip
+    return told, [
+        f"{spec.name}: {spec.about}" if spec.about else spec.name,
+        *([rule] if rule else []),
+        *(f"{count:>7}  {labels}" for labels, count in settings.items()),
+        f"{len(missions):>7}  missions of {pairs} pair{'s' if pairs != 1 else ''}",
+    ]
 
 
 def _show(
@@ -342,29 +329,20 @@ def _show(
 
 
 def _summary(
-    ledger: Ledger, by: Sequence[str], confidence: float, more: Mapping[str, Any]
+    ledger: Ledger, by: Sequence[str], confidence: float, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
+    """The summary with the results of --quality, --overhead and --failures, as plain values."""
     from dataclasses import asdict
 
-    from mavfi_cli.analysis.summary import summarise
+    from mavfi_cli.analysis.failures import failures
+    from mavfi_cli.analysis.overhead import flight_overheads
+    from mavfi_cli.analysis.summary import groups, qualities, summarise
     from mavfi_cli.campaigns.begin import stopped, stored_spec
 
     spec = stored_spec(ledger)
     told = {**summarise(ledger, by, confidence), "stopped": stopped(ledger)}
     if spec is not None and spec.fixed_world is not None:
         told["fixed_world"] = asdict(spec.fixed_world)
-    return told | _more(ledger, by, confidence, more)
-
-
-def _more(
-    ledger: Ledger, by: Sequence[str], confidence: float, asked: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The results of --quality, --overhead and --failures, as plain values."""
-    from mavfi_cli.analysis.failures import failures
-    from mavfi_cli.analysis.overhead import flight_overheads
-    from mavfi_cli.analysis.summary import groups, qualities
-
-    told: dict[str, Any] = {}
     found = groups(ledger, by) if any(map(asked.get, ("quality", "overhead", "failures"))) else []
     if asked.get("quality"):
         told["quality"] = qualities(found, confidence)

@@ -134,7 +134,9 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
     given = {row["scheme"]: (row["overhead_percent"], row["source"]) for row in told}
     assert given["aad"] == (0.5, "--overhead")
     assert given["gad"] == (pytest.approx(100.0 * found.share), found.told(str(guarded.path)))
-    with pytest.raises(RecordError, match="flew on x86, not on tx2"):
+    with pytest.raises(
+        RecordError, match=r"on tx2 \(--platform\) is recorded there, only gad on x86; "
+    ):
         measured(guarded.path, "tx2")
     with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
         measured(tmp_path)
