@@ -38,7 +38,6 @@ class _Size(click.ParamType[tuple[int, int]]):
     name = "COLSxROWS"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, int]:
-        """Return two positive numbers of pixels, or fail with a usage error."""
         if isinstance(value, tuple):
             return value
         columns, _, rows = str(value).partition("x")

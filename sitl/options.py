@@ -29,7 +29,6 @@ class _Link(click.ParamType[tuple[Preset, str]]):
     name = "[PRESET=]URL"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[Preset, str]:
-        """Return the preset and the URL, or fail with a usage error."""
         name, equals, url = str(value).partition("=")
         if not equals:
             is_gcs = value.endswith(":14550") or value.startswith("tcpin")

@@ -52,11 +52,6 @@ class Peers(Generic[P]):
 
     Args:
         signing: Vouches for unknown senders; None: everybody with a valid frame is welcome.
-
-    Attributes:
-        over: True once an inherited connection has closed.
-        lost: Error of the only peer of an endpoint that neither listens nor is inherited; None
-            without one.
     """
 
     def __init__(
@@ -70,8 +65,8 @@ class Peers(Generic[P]):
         self._endpoints: list[tuple[str, Listener, Callable[[Transport], P]]] = []
         self._peers: list[P] = []
         self._turns = 0
-        self.over = False
-        self.lost: LinkLost | None = None
+        self.over = False  # True once an inherited connection has closed
+        self.lost: LinkLost | None = None  # of the only peer of an endpoint that calls
 
     def __iter__(self) -> Iterator[P]:
         """Iterate over the present peers. They may leave meanwhile."""

@@ -237,10 +237,7 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
 class _EmbeddedVehicle:
     """The vehicle in the process of its companion, which waits while the vehicle flies.
 
-    Attributes:
-        link: The companion's end of the link. When the companion has answered a tick and waits for
-            more, the vehicle flies the next one.
-        error: Error that ended the vehicle before its companion.
+    When the companion has answered a tick and waits for more, the vehicle flies the next one.
     """
 
     def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
@@ -249,7 +246,7 @@ class _EmbeddedVehicle:
         self._client = Client(simulation, end, preset=Preset.LOCKSTEP)
         self._begun = self._ended = False
         self.truth_folder = truth_folder
-        self.error: Exception | None = None
+        self.error: Exception | None = None  # that ended the vehicle before its companion
         self.link.on_wait = self._fly_on
 
     def _fly_on(self) -> None:

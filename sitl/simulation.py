@@ -40,11 +40,6 @@ class Simulation:
         autopilot: Real firmware in the place of the autopilot; None for our own.
         trusted: MAVLink systems that may command; empty for all.
         logs: Keep the truth of every tick for `save_truth`.
-
-    Attributes:
-        stamp_us: Boot clock at the newest tick.
-        camera_due: Messages of the camera at the newest tick.
-        wall: Wall times of this machine by part.
     """
 
     awaits_setpoints = True  # in lockstep, every tick waits for the companion's setpoint
@@ -67,8 +62,8 @@ class Simulation:
         self.camera = camera or Camera(
             world.boxes_enu_m, mount_offset_flu_m=profile.camera_mount_flu_m, system=system_id
         )
-        self.wall = WallClock()
-        self.camera_due: list[Any] = []
+        self.wall = WallClock()  # times of this machine by part
+        self.camera_due: list[Any] = []  # messages of the camera at the newest tick
         self._set_up()
 
     def _set_up(self) -> None:
@@ -87,7 +82,7 @@ class Simulation:
             world, profile.body_box_m, vehicle=profile.name, physics=profile.physics,
             logs=self._logs,
         )  # fmt: skip
-        self.stamp_us = 0
+        self.stamp_us = 0  # boot clock at the newest tick
         self._wreck: Truth | None = None
         self._look()
 

@@ -119,7 +119,6 @@ class Signing:
         return length > 0 and self._is_new(data[:length], _V2_HEADER)
 
     def _is_new(self, frame: bytes, header: int) -> bool:
-        """Return True if the signature is right and newer than all of its stream."""
         if not hmac.compare_digest(self._digest(frame[:-6]), frame[-6:]):
             return False
         newest = self._streams.get(_stream(frame, header))
@@ -169,11 +168,6 @@ class _Kind:
 
     An array of bytes is packed and unpacked in one piece, which is faster than byte by byte.
     """
-
-    __slots__ = (
-        "_arrays", "_columns", "_texts", "crc_extra", "number", "pack", "receive", "size",
-        "unpack_from",
-    )  # fmt: skip
 
     def __init__(self, cls: Any) -> None:
         layout = struct.Struct(re.sub(r"(\d+)B", r"\1s", cls.unpacker.format))
@@ -257,17 +251,7 @@ def _kind(message_id: int) -> _Kind | None:
 
 
 class Codec:
-    """Codec of one end of a link. It numbers the frames that it encodes.
-
-    Attributes:
-        bad_bytes: Number of received bytes that belong to no frame.
-        unknown: Number of skipped frames with an id that the dialect lacks.
-        refused: Number of frames that signing rejected.
-    """
-
-    __slots__ = (
-        "_rest", "_sequence", "_signing", "bad_bytes", "component", "refused", "system", "unknown",
-    )  # fmt: skip
+    """Codec of one end of a link. It numbers the frames that it encodes."""
 
     def __init__(self, system: int, component: int, *, signing: Signing | None = None) -> None:
         self.system = system
@@ -275,9 +259,9 @@ class Codec:
         self._signing = signing
         self._sequence = 0
         self._rest = b""
-        self.bad_bytes = 0
-        self.unknown = 0
-        self.refused = 0
+        self.bad_bytes = 0  # received bytes that belong to no frame
+        self.unknown = 0  # skipped frames with an id that the dialect lacks
+        self.refused = 0  # frames that signing rejected
 
     def encode(self, message: Message) -> bytes:
         """Encode a message as a MAVLink 2 frame. The message itself does not change.

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from mavfi_cli.core.errors import LinkError
-from mavfi_cli.link.codec import Message, dialect
 
 _CONNECT_TIMEOUT_S = 5.0
 
@@ -159,28 +158,19 @@ SILENCE_S = 5.0  # time after which another sender may take a silent one's place
 TWO_AUTOPILOTS = "two autopilots send here"
 
 
-def is_of_autopilot(message: Message) -> bool:
-    """Return True if an autopilot has sent the message, by its component id."""
-    return bool(message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1)
-
-
 def two_autopilots(address: str, rival_address: str) -> str:
     """Return the text that tells the senders, also as a STATUSTEXT of a camera."""
     return f"{TWO_AUTOPILOTS}, {address} and {rival_address}"
 
 
 class SenderSlot(Generic[Sender]):
-    """The place of one sender. Another one may take it after 5 s of silence.
-
-    Attributes:
-        holder: The sender that counts; None before the first.
-        rival: A sender that spoke although the place was taken, and whom the holder has outlived;
-            None without one. An autopilot that restarts at another port has no rival.
-    """
+    """The place of one sender. Another one may take it after 5 s of silence."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self.holder: Sender | None = None
+        self.holder: Sender | None = None  # the sender that counts
+        # A sender that spoke although the place was taken, and whom the holder has outlived: not an
+        # autopilot that restarts at another port.
         self.rival: Sender | None = None
         self._challenger: Sender | None = None
         self._silent_from_s = 0.0  # then the holder has been silent for too long

@@ -101,15 +101,11 @@ class ImageReceiver:
     announced frame. The first takes for each place the packet nearest to its due time after the
     announcement, which is right if neighbouring frames interleave slightly. The second takes the
     newest packet of each place, which is right if one frame is reordered in any way.
-
-    Attributes:
-        hfov_rad: Horizontal field of view of the camera; None until the camera reports it.
-        received: Number of complete frames.
     """
 
     def __init__(self) -> None:
-        self.hfov_rad: float | None = None
-        self.received = 0
+        self.hfov_rad: float | None = None  # None until the camera reports it
+        self.received = 0  # complete frames
         self._shape: _Shape | None = None
         self._places = _FIRST_PLACES  # packets in a frame of this shape
         self._packets: dict[int, deque[_Packet]] = {}  # by place; the newest that no frame took

@@ -96,11 +96,6 @@ class OffboardSession:
     Args:
         url: URL of the link, for error messages.
         telemetry: Newest telemetry of the autopilot, if this session is not the first on its link.
-
-    Attributes:
-        failure: Cause of the phase FAILED; None before that.
-        failsafe_text: Reason why the autopilot no longer follows (it changed its mode or disarmed);
-            None while it follows. Never reset.
     """
 
     def __init__(
@@ -114,7 +109,8 @@ class OffboardSession:
         self._url = url
         self.telemetry = telemetry or Telemetry()
         self.phase, self._step = Phase.CONNECTING, _STEPS[Phase.CONNECTING]
-        self.failure: LinkError | None = None
+        self.failure: LinkError | None = None  # cause of the phase FAILED
+        # Why the autopilot no longer follows: it changed its mode or disarmed. Never reset.
         self.failsafe_text: str | None = None
         own = self._settings.system, self._settings.component
         self._commands = Commands(*own, self.telemetry)

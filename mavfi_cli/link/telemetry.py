@@ -73,7 +73,6 @@ class _StateHistory:
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
-        """Append a state. Return False if it is not newer than the newest."""
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -154,7 +153,6 @@ class _TextCollector:
         self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[_Text]:
-        """Return the texts received since `total` had this value."""
         if total == self.total:
             return []
         fresh = min(self.total - total, len(self.texts))
@@ -200,42 +198,25 @@ class Telemetry:
     """Newest telemetry of one autopilot.
 
     The first autopilot that sends (component 1 of any system) is used. Others are ignored.
-
-    Attributes:
-        now_s: Time at which handled messages count as received. The owner sets it.
-        system: System id of the autopilot; 0 before its first message.
-        unfit: Why an autopilot on the link cannot be flown; "" without a reason.
-        state: Position, velocity and attitude in ENU; None before both are known.
-        origin_enu_m: Origin of the autopilot's positions in the world (3,); None for the world's.
-        armed: Armed flag in HEARTBEAT.
-        mode: Name of the flight mode; "" before the first HEARTBEAT.
-        landed_state: Landed state in EXTENDED_SYS_STATE, a known MAV_LANDED_STATE.
-        ready: True if SYS_STATUS reports that the pre-arm checks pass.
-        amsl_m: Altitude of the vehicle above sea level, m; None if unknown.
-        home_amsl_m: Altitude of home above sea level, m; None if unknown.
-        battery_remaining: Remaining charge, 0..1; None if unknown.
-        battery_voltage_v: Battery voltage, V; None if unknown.
-        texts: Received STATUSTEXTs.
-        collision_text: Text in which the referee reports a collision; None without one.
     """
 
     def __init__(self) -> None:
-        self.now_s = 0.0
-        self.system = 0
-        self.unfit = ""
+        self.now_s = 0.0  # when handled messages count as received; the owner sets it
+        self.system = 0  # id of the autopilot; 0 before its first message
+        self.unfit = ""  # why an autopilot on the link cannot be flown
         self.autopilot: _AutopilotProfile = PX4
-        self.state: VehicleState | None = None
-        self.origin_enu_m: FloatArray | None = None
+        self.state: VehicleState | None = None  # None before position and attitude are known
+        self.origin_enu_m: FloatArray | None = None  # of its positions (3,); None for the world's
         self.armed = False
-        self.mode = ""
-        self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED
-        self.ready = False
-        self.amsl_m: float | None = None
+        self.mode = ""  # name of the flight mode; "" before the first HEARTBEAT
+        self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED  # a known one
+        self.ready = False  # the pre-arm checks pass
+        self.amsl_m: float | None = None  # altitude above sea level, here and at home
         self.home_amsl_m: float | None = None
-        self.battery_remaining: float | None = None
+        self.battery_remaining: float | None = None  # charge, 0..1
         self.battery_voltage_v: float | None = None
         self.texts = _TextCollector()
-        self.collision_text: str | None = None
+        self.collision_text: str | None = None  # in which the referee reports a collision
         self.history = _StateHistory()
         self._quaternion: FloatArray | None = None  # body FLU -> ENU
 

@@ -97,7 +97,6 @@ class _TlogWriter:
         self._whole += written
 
     def close(self) -> None:
-        """Flush and close. May be called repeatedly."""
         self.flush()
         if self._descriptor is not None:
             os.close(self._descriptor)

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol
 
 from mavfi_cli.core.errors import LinkError, LinkLost
-from mavfi_cli.link.codec import Codec, begins_with_frame, frame_length
-from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, is_of_autopilot, parse_endpoint
+from mavfi_cli.link.codec import Codec, begins_with_frame, dialect, frame_length
+from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, parse_endpoint
 
 MAX_PEERS = 16  # of one listener
 _CHUNK = 1 << 16  # bytes that are received at once
@@ -407,7 +407,8 @@ class _Udp(_SocketOwner, Transport):
             self._slot.take(sender)
             self.address = _text_of(sender)
             return True
-        if any(map(is_of_autopilot, Codec(0, 0).decode(data, datagram=True))):
+        messages = Codec(0, 0).decode(data, datagram=True)
+        if any(each.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1 for each in messages):
             self._slot.challenge(sender)
         return False
 

@@ -96,26 +96,18 @@ _OBL_TERMINATE = 6
 
 
 class Commander:
-    """State machine of mode and arming.
-
-    Attributes:
-        mode: Active mode: the user's choice, or the failsafe's.
-        armed: True while armed.
-        landed: True if the vehicle stands on the ground.
-        terminated: True once flight termination has stopped the motors permanently.
-        texts: Pending status texts with their severities; the owner removes them.
-    """
+    """State machine of mode and arming."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self.stamp_us = 0
         self.user_mode = FlightMode.LOITER
-        self.failsafe: FlightMode | None = None
+        self.failsafe: FlightMode | None = None  # the mode of a failsafe, instead of the user's
         self.armed = False
-        self.landed = True
+        self.landed = True  # it stands on the ground
         self._settled_us: int | None = None  # since when it has stood still on the ground
-        self.terminated = False
-        self.texts: list[tuple[Severity, str]] = []
+        self.terminated = False  # True once flight termination has stopped the motors for good
+        self.texts: list[tuple[Severity, str]] = []  # pending; the owner removes them
         self._armed_us = 0
         self._landed_us = 0
         self._flown_since_arming = False

@@ -44,6 +44,10 @@ class _Parameter(NamedTuple):
         """Return a value's four bytes on the wire."""
         return struct.pack("<i" if self.is_integer else "<f", value)
 
+    def stored(self, value: float) -> float | int:
+        """Return the value rounded to the wire's precision."""
+        return int(value) if self.is_integer else struct.unpack("<f", self.packed(value))[0]
+
 
 @cache
 def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
@@ -68,7 +72,7 @@ class Parameters:
     def __init__(self, system_id: int) -> None:
         self._table = _parameter_table(system_id)
         self._index = {row.name: number for number, row in enumerate(self._table)}
-        self._values: list[float | int] = [_stored(row, row.default) for row in self._table]
+        self._values: list[float | int] = [row.stored(row.default) for row in self._table]
 
     def restore(self, other: Parameters) -> None:
         """Take all values of the same system's parameters."""
@@ -107,33 +111,22 @@ class Parameters:
             (value,) = struct.unpack("<i", struct.pack("<f", wire_value))
         if row.read_only or not math.isfinite(value) or value == self._values[number]:
             return False
-        self._values[number] = _stored(row, value)
+        self._values[number] = row.stored(value)
         return True
 
     def message(self, index: int) -> Any:
         """Return the PARAM_VALUE of a valid index."""
         row = self._table[index]
-        wire = _float_of_bytes(row.packed(self._values[index]))
-        return _value_message(row.name, wire, row.wire_type, len(self), index)
+        return self._message(row.name, row.packed(self._values[index]), row.wire_type, index)
 
     def hash_message(self) -> Any:
         """Return the PARAM_VALUE of the hash, with which a client validates its cache."""
         digest = 0
         for row, value in zip(self._table, self._values, strict=True):
             digest = zlib.crc32(row.name.encode() + row.packed(value), digest)
-        wire = _float_of_bytes(struct.pack("<I", digest))
-        return _value_message(HASH_NAME, wire, dialect.MAV_PARAM_TYPE_UINT32, len(self), 65535)
+        packed = struct.pack("<I", digest)
+        return self._message(HASH_NAME, packed, dialect.MAV_PARAM_TYPE_UINT32, 65535)
 
-
-def _value_message(name: str, wire: float, kind: int, count: int, index: int) -> Any:
-    return dialect.MAVLink_param_value_message(name.encode(), wire, kind, count, index)
-
-
-def _stored(row: _Parameter, value: float) -> float | int:
-    """Return the value rounded to the wire's precision."""
-    return int(value) if row.is_integer else _float_of_bytes(row.packed(value))
-
-
-def _float_of_bytes(data: bytes) -> float:
-    value: float = struct.unpack("<f", data)[0]
-    return value
+    def _message(self, name: str, packed: bytes, kind: int, index: int) -> Any:
+        (wire,) = struct.unpack("<f", packed)
+        return dialect.MAVLink_param_value_message(name.encode(), wire, kind, len(self), index)

@@ -187,7 +187,6 @@ def _request_message(autopilot: Autopilot, message: Any, link: Link) -> Result:
 
 
 def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
-    """Send a requested message before the acknowledgement."""
     build = BUILDERS.get(number)
     message = None if build is None else build(autopilot.snapshot)
     if message is None:
@@ -397,7 +396,6 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer that there are no mission items."""
     link.send(dialect.MAVLink_mission_count_message(*_sender(message), 0, message.mission_type))
 
 
@@ -422,7 +420,6 @@ def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
-    """Answer that there are no logs."""
     link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
 
 

@@ -261,7 +261,6 @@ def _altitude(s: Snapshot) -> Any:
 
 
 def _battery_status(s: Snapshot) -> Any:
-    """Cell voltages are equal."""
     truth = s.truth
     cells = min(max(int(s.parameters.value("BAT1_N_CELLS")), 1), 10)
     each = _uint16(truth.battery_voltage_v / cells * 1e3)
@@ -431,18 +430,12 @@ class _Stream:
 
 
 class Link:
-    """The autopilot's end of one connection, without a socket, and its telemetry streams.
-
-    Attributes:
-        in_lockstep: Simulated time stands still while the client thinks.
-        outbox: Pending messages, oldest first.
-        parameters_left: Indices of parameters still to be listed.
-    """
+    """The autopilot's end of one connection, without a socket, and its telemetry streams."""
 
     def __init__(self, preset: Preset) -> None:
-        self.in_lockstep = preset is Preset.LOCKSTEP
-        self.outbox: list[Any] = []
-        self.parameters_left: deque[int] = deque()
+        self.in_lockstep = preset is Preset.LOCKSTEP  # time stands still while the client thinks
+        self.outbox: list[Any] = []  # pending messages, oldest first
+        self.parameters_left: deque[int] = deque()  # indices of those still to be listed
         self._rates_hz: Mapping[str, float] = _RATES_HZ[preset.value]
         self._streams = {
             number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()

@@ -16,7 +16,7 @@ import numpy as np
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Signing, key_from_file
 from sitl.camera.component import Camera
-from sitl.camera.station import PoseTracker, Router, Station, Witness
+from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.command_line import (
     CONTEXT,
     Place,
@@ -91,19 +91,14 @@ def _camera(
     if truth is not None:
         world.write_briefing((forward, left, up), truth)
     stopped = stop_on_signals()
-    with contextlib.closing(
-        Router(links, signing=signing, allow_unsigned=allow_unsigned)
-    ) as router:
-        station = Station(
-            camera,
-            PoseTracker(world.start_enu_m if origin is None else np.array(origin)),
-            router,
-            witness=witness,
-            origin_given=origin is not None,
-        )
-        click.echo(
-            f"depth camera in {world.name}, seed {world.seed}, on {', '.join(links)}", err=True
-        )
+    tracker = PoseTracker(world.start_enu_m if origin is None else np.array(origin))
+    station = Station(
+        camera, tracker, links, witness=witness, origin_given=origin is not None, signing=signing,
+        allow_unsigned=allow_unsigned,
+    )  # fmt: skip
+    place = f"depth camera in {world.name}, seed {world.seed}, on {', '.join(links)}"
+    with contextlib.closing(station):
+        click.echo(place, err=True)
         try:
             station.run(lambda: not stopped())
         except LinkLost:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, quaternion_from_euler
 from mavfi_cli.link.codec import Codec, Signing, dialect, text_messages
-from mavfi_cli.link.endpoint import SenderSlot, is_of_autopilot, parse_endpoint, two_autopilots
+from mavfi_cli.link.endpoint import SenderSlot, parse_endpoint, two_autopilots
 from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID, Camera
 from sitl.firmware.autopilot import follows_companion
@@ -40,19 +40,19 @@ class _Linked(Peer):
         self,
         transport: Transport,
         *,
-        router: Router,
+        station: Station,
         slots: dict[int, SenderSlot[_Linked]],
         awaits_frames: bool,
     ) -> None:
         super().__init__(transport)
-        self.slots, self.awaits_frames, self._router = slots, awaits_frames, router
-        self._codec = Codec(0, 0, signing=router.signing)
+        self.slots, self.awaits_frames, self._station = slots, awaits_frames, station
+        self._codec = Codec(0, 0, signing=station.signing)
 
     def take(self, data: bytes) -> list[Any]:
         messages = self._codec.decode(data, datagram=self.transport.datagram)
         self.awaits_frames = self.awaits_frames or bool(messages)
         for message in messages:
-            self._router.hear(message, self)
+            self._station.hear(message, self)
         return messages
 
     def forward(self, *, frame: bytes, of: Peer) -> None:
@@ -63,87 +63,6 @@ class _Linked(Peer):
         super().close()
         for slot in self.slots.values():
             slot.leave(self)
-
-
-class Router:
-    """Joins the peers of several endpoints, and is the camera component among them.
-
-    Two autopilots of the same system id at one endpoint would be one vehicle that jumps. The frames
-    of the second are dropped, and a STATUSTEXT tells both senders. Frames of others keep their own
-    signatures. An endpoint that cannot be opened raises LinkError.
-
-    Attributes:
-        codec: Encoder of the camera's messages.
-        peers: Everybody on the links.
-        take: Handles a message. Returns True if it goes to the other peers, too.
-    """
-
-    def __init__(
-        self,
-        urls: Sequence[str],
-        *,
-        signing: Signing | None = None,
-        allow_unsigned: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.signing, self._clock = signing, clock
-        self.codec = Codec(1, COMPONENT_ID, signing=signing)
-        self.take: Callable[[Any], bool] = lambda _message: True
-        self.peers: Peers[_Linked] = Peers(
-            signing=signing, allow_unsigned=allow_unsigned, clock=clock
-        )
-        for url in urls:
-            waits = parse_endpoint(url).scheme != "fd"
-            self.peers.open(url, partial(_Linked, router=self, slots={}, awaits_frames=waits))
-
-    def serve(self) -> None:
-        """Handle waiting messages, for a bounded time.
-
-        Raises:
-            LinkLost: The peer of an endpoint that does not listen closed it.
-        """
-        self.peers.serve(self._clock() + _TURN_S)
-        if self.peers.lost is not None:
-            raise self.peers.lost
-
-    def hear(self, message: Any, source: _Linked) -> None:
-        """Handle a message of a peer, and pass it on."""
-        if self._is_of_holder(message, source) and self.take(message):
-            frame = bytes(message.get_msgbuf())
-            self.peers.each(partial(_Linked.forward, frame=frame, of=source))
-
-    def _is_of_holder(self, message: Any, source: _Linked) -> bool:
-        """Return False for the frame of a second autopilot."""
-        if not is_of_autopilot(message):
-            return True
-        slot = source.slots.setdefault(message.get_srcSystem(), SenderSlot(self._clock))
-        if slot.hears(source):
-            self._tell_rival(slot)
-        elif slot.is_free:
-            slot.take(source)
-        else:
-            if isinstance(message, dialect.MAVLink_heartbeat_message):  # once a second
-                slot.challenge(source)
-            return False
-        return True
-
-    def _tell_rival(self, slot: SenderSlot[_Linked]) -> None:
-        """Send the addresses of two autopilots, if both speak."""
-        if slot.holder is None or slot.rival is None:
-            return
-        text = two_autopilots(slot.holder.transport.address, slot.rival.transport.address)
-        slot.rival = None
-        severity = dialect.MAV_SEVERITY_CRITICAL
-        self.send(list(text_messages(severity, text.encode(), _TEXT_ID)))
-
-    def send(self, messages: Sequence[Any]) -> None:
-        """Send messages of the camera to all peers."""
-        if data := b"".join(self.codec.encode(message) for message in messages):
-            self.peers.each(lambda peer: peer.transport.send(data))
-
-    def close(self) -> None:
-        """Close every link."""
-        self.peers.close()
 
 
 _REBOOT_S = 1.0
@@ -303,7 +222,12 @@ class Witness:
 class Station:
     """Camera, referee and links of one autopilot.
 
+    It joins the peers of several endpoints, and is the camera component among them. Two autopilots
+    of the same system id at one endpoint would be one vehicle that jumps. The frames of the second
+    are dropped, and a STATUSTEXT tells both senders. Frames of others keep their own signatures.
+
     Args:
+        urls: Endpoints to open. One that cannot be opened raises LinkError.
         witness: Judges the poses; None without a referee.
         origin_given: The tracker's origin holds. Otherwise another camera of ours on the link,
             whose vehicle is simulated, knows a better one.
@@ -314,17 +238,25 @@ class Station:
         self,
         camera: Camera,
         tracker: PoseTracker,
-        router: Router,
+        urls: Sequence[str],
         *,
         witness: Witness | None = None,
         origin_given: bool = True,
+        signing: Signing | None = None,
+        allow_unsigned: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.camera = camera
         self.frames_sent = 0
-        self._tracker, self._router, self._witness = tracker, router, witness
-        self._clock = clock
-        router.take = self._take
+        self._tracker, self._witness = tracker, witness
+        self.signing, self._clock = signing, clock
+        self._codec = Codec(1, COMPONENT_ID, signing=signing)
+        self.peers: Peers[_Linked] = Peers(
+            signing=signing, allow_unsigned=allow_unsigned, clock=clock
+        )
+        for url in urls:
+            waits = parse_endpoint(url).scheme != "fd"
+            self.peers.open(url, partial(_Linked, station=self, slots={}, awaits_frames=waits))
         self._autopilot: int | None = None  # system id; None before its first heartbeat
         self._placed = False
         self._unplaced_since_s: float | None = None  # by the autopilot's clock
@@ -340,18 +272,49 @@ class Station:
         Raises:
             LinkLost: The peer of a link closed it.
         """
-        while keep_on() and not self._router.peers.over:
-            self._router.peers.wait(_WAIT_S)
+        while keep_on() and not self.peers.over:
+            self.peers.wait(_WAIT_S)
             self.serve()
 
     def serve(self) -> None:
-        """Handle all waiting messages and send the due ones."""
-        self._router.serve()
+        """Handle waiting messages, for a bounded time, and send the due ones."""
+        self.peers.serve(self._clock() + _TURN_S)
+        if self.peers.lost is not None:
+            raise self.peers.lost
         self._announce()
         self._place()
         self._ask()
 
-    def _take(self, message: Any) -> bool:
+    def hear(self, message: Any, source: _Linked) -> None:
+        """Handle a message of a peer, and pass it on."""
+        if self._is_of_holder(message, source) and self.take(message):
+            frame = bytes(message.get_msgbuf())
+            self.peers.each(partial(_Linked.forward, frame=frame, of=source))
+
+    def _is_of_holder(self, message: Any, source: _Linked) -> bool:
+        if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return True
+        slot = source.slots.setdefault(message.get_srcSystem(), SenderSlot(self._clock))
+        if slot.hears(source):
+            self._tell_rival(slot)
+        elif slot.is_free:
+            slot.take(source)
+        else:
+            if isinstance(message, dialect.MAVLink_heartbeat_message):  # once a second
+                slot.challenge(source)
+            return False
+        return True
+
+    def _tell_rival(self, slot: SenderSlot[_Linked]) -> None:
+        """Send the addresses of two autopilots, if both speak."""
+        if slot.holder is None or slot.rival is None:
+            return
+        text = two_autopilots(slot.holder.transport.address, slot.rival.transport.address)
+        slot.rival = None
+        severity = dialect.MAV_SEVERITY_CRITICAL
+        self._send(list(text_messages(severity, text.encode(), _TEXT_ID)))
+
+    def take(self, message: Any) -> bool:
         """Handle a message. Return True if the other peers get it, too.
 
         What is for the camera or of another one stays here, so that there is one camera.
@@ -374,7 +337,6 @@ class Station:
         return not for_camera
 
     def _hold(self, command: Any) -> None:
-        """Keep a command of a client until the origin is known."""
         self._held[command.get_srcSystem(), command.get_srcComponent(), command.command] = command
         progress = dialect.MAV_RESULT_IN_PROGRESS
         sender = command.get_srcSystem(), command.get_srcComponent()
@@ -401,7 +363,7 @@ class Station:
             ):
                 return False
             self._autopilot = self.camera.system = message.get_srcSystem()
-            self._router.codec.system = self.camera.system
+            self._codec.system = self.camera.system
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:
@@ -461,4 +423,9 @@ class Station:
 
     def _send(self, messages: Sequence[Any]) -> None:
         self.frames_sent += sum(m.get_type() == "CAMERA_IMAGE_CAPTURED" for m in messages)
-        self._router.send(messages)
+        if data := b"".join(self._codec.encode(message) for message in messages):
+            self.peers.each(lambda peer: peer.transport.send(data))
+
+    def close(self) -> None:
+        """Close every link."""
+        self.peers.close()

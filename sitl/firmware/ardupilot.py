@@ -19,7 +19,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from mavfi_cli.core.frames import Vector
-from sitl.firmware.autopilot import FirmwareProcess, require_program
+from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.geodesy import Origin
 from sitl.vehicle.gains import RateLoops
@@ -96,7 +96,7 @@ class ArduPilotLink:
         heading_deg: float,
     ) -> FirmwareProcess:
         """Start ArduCopter's SITL binary, which calls this link. See `Px4Link.start`."""
-        program, origin = require_program(binary), Origin()
+        program, origin = FirmwareProcess.program(binary), Origin()
         folder = Path(tempfile.mkdtemp(prefix="mavfi-ardupilot-"))
         lines = [f"{name} {value:.6g}\n" for name, value in parameters.items()]
         (folder / "vehicle.parm").write_text("".join(lines))

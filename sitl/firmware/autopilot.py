@@ -53,19 +53,15 @@ class FirmwareAutopilot:
     Args:
         echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
             has been read before simulated time goes on.
-
-    Attributes:
-        state_stamp_us: Stamp of the newest LOCAL_POSITION_NED; -1 without one.
-        armed: True while the motors may turn. The owner sets it.
-        terminated: True after a collision.
     """
 
     restart_asked = False  # a reboot is the firmware's own
 
     def __init__(self, transport: Transport, *, system_id: int = 1, echoes: bool = True) -> None:
         self.system_id = system_id
-        self.state_stamp_us = -1
-        self.armed = self.terminated = False
+        self.state_stamp_us = -1  # of the newest LOCAL_POSITION_NED; -1 without one
+        self.armed = False  # the motors may turn; the owner sets it
+        self.terminated = False  # after a collision
         self._transport = transport
         self._echoes = echoes
         self._codec = Codec(system_id, CAMERA)
@@ -212,19 +208,6 @@ class FirmwareAutopilot:
 _OUTPUT = "output.txt"
 
 
-def require_program(path: Path) -> Path:
-    """Return the absolute path of a program.
-
-    Raises:
-        VehicleProcessError: It does not exist or must not be executed.
-    """
-    if not path.is_file():
-        raise VehicleProcessError(f"no firmware at {path}")
-    if not os.access(path, os.X_OK):
-        raise VehicleProcessError(f"no permission to execute {path}")
-    return path.resolve()
-
-
 class FirmwareProcess:
     """A running firmware. Its folder and everything that it started end with it.
 
@@ -255,6 +238,19 @@ class FirmwareProcess:
         except OSError as error:
             self._remove_folder()
             raise VehicleProcessError(f"{binary} is not a firmware: {error.strerror}") from None
+
+    @staticmethod
+    def program(path: Path) -> Path:
+        """Return the absolute path of a program.
+
+        Raises:
+            VehicleProcessError: It does not exist or must not be executed.
+        """
+        if not path.is_file():
+            raise VehicleProcessError(f"no firmware at {path}")
+        if not os.access(path, os.X_OK):
+            raise VehicleProcessError(f"no permission to execute {path}")
+        return path.resolve()
 
     def require_running(self) -> None:
         """Check that it still runs.

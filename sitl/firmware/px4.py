@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import LinkError, LinkLost, VehicleProcessError
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
-from sitl.firmware.autopilot import FirmwareProcess, require_program
+from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile
@@ -136,7 +136,7 @@ class Px4Link:
         Raises:
             VehicleProcessError: It cannot be started.
         """
-        program = require_program(binary)
+        program = FirmwareProcess.program(binary)
         startup = program.parent.parent / "etc"
         if not (startup / "init.d-posix" / "rcS").is_file():
             raise VehicleProcessError(f"{binary} is not PX4: it has no startup files in {startup}")

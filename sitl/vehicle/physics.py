@@ -37,7 +37,6 @@ def write_model(profile: VehicleProfile, root: Path) -> None:
 
 
 def _values(profile: VehicleProfile) -> dict[str, float | str]:
-    """Return what the files of `model/` name with a dollar sign."""
     rotor, gear, drag = profile.rotor, profile.gear, profile.drag
     radius_ft, ratio = PLANET_RADIUS_M / FOOT_M, rotor.zero_thrust_advance_ratio
     damping = 2.0 * gear.damping_ratio * gear.natural_frequency_radps * profile.total_mass_kg / 4.0

@@ -14,7 +14,7 @@ import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
 from sitl.command_line import CONTEXT, Triple, exit_code, places
-from sitl.world.plan import DEFAULT_CLEARANCE_M, WorldCheck, check_world, world_svg
+from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg
 from sitl.world.world import World, load_world, named_worlds, show
 
 _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
@@ -92,9 +92,21 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
     """
     found = check_world(made, clearance_m=clearance)
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "check": _check_json(found)}, indent=1))
+        click.echo(json.dumps({**made.as_json(), "check": found.as_json()}, indent=1))
     else:
-        click.echo(_check_text(made, found))
+        near_start, near_goal = (
+            f"{m:.1f} m away" if math.isfinite(m) else "none"
+            for m in (found.start_clearance_m, found.goal_clearance_m)
+        )
+        start, goal = map(show, (made.start_enu_m, made.goal_enu_m))
+        path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
+        click.echo(
+            f"{_boxes(made)}\n"
+            f"start  {start}, nearest obstacle {near_start}\n"
+            f"goal   {goal}, nearest obstacle {near_goal}\n"
+            f"path   {path} with {found.clearance_m:g} m clearance; straight "
+            f"{found.straight_m:.1f} m"
+        )
     if expect == "path" and not found.path_exists:
         sys.exit(1)
 
@@ -123,26 +135,6 @@ def _name(path: Path | None) -> str | None:
 def _boxes(made: World) -> str:
     count = len(made.boxes_enu_m)
     return f"{made.name}, seed {made.seed}, {count} box{'' if count == 1 else 'es'}"
-
-
-def _check_text(made: World, found: WorldCheck) -> str:
-    def metres(value: float) -> str:
-        return f"{value:.1f} m away" if math.isfinite(value) else "none"
-
-    path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
-    return (
-        f"{_boxes(made)}\n"
-        f"start  {show(made.start_enu_m)}, nearest obstacle {metres(found.start_clearance_m)}\n"
-        f"goal   {show(made.goal_enu_m)}, nearest obstacle {metres(found.goal_clearance_m)}\n"
-        f"path   {path} with {found.clearance_m:g} m clearance; straight {found.straight_m:.1f} m"
-    )
-
-
-def _check_json(found: WorldCheck) -> dict[str, Any]:
-    keys = ("clearance_m", "path_exists", "path_m", "straight_m")
-    gaps = {f"{at}_clearance_m": getattr(found, f"{at}_clearance_m") for at in ("start", "goal")}
-    finite = {key: value if math.isfinite(value) else None for key, value in gaps.items()}
-    return {**{key: getattr(found, key) for key in keys}, **finite}  # JSON lacks infinity
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

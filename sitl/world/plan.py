@@ -11,7 +11,7 @@ import heapq
 import io
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorldCheck:
+class _WorldCheck:
     """Result of `check_world`, lengths in m."""
 
     clearance_m: float  # requested clearance
@@ -50,8 +50,15 @@ class WorldCheck:
         """True if there is a path with the clearance."""
         return self.path_m is not None
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the result without corners; a distance is None without boxes."""
+        keys = ("clearance_m", "path_exists", "path_m", "straight_m")
+        gaps = {"start": self.start_clearance_m, "goal": self.goal_clearance_m}
+        finite = {f"{at}_clearance_m": m if math.isfinite(m) else None for at, m in gaps.items()}
+        return {**{key: getattr(self, key) for key in keys}, **finite}
 
-def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> WorldCheck:
+
+def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _WorldCheck:
     """Search a path from start to goal with `clearance_m` to every box.
 
     Raises:
@@ -68,7 +75,7 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> Wo
         path = np.column_stack([corners, np.full(len(corners), height)])
     start_gaps = distance_to_boxes(world.boxes_enu_m, world.start_enu_m, plan=True)
     goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
-    return WorldCheck(
+    return _WorldCheck(
         clearance_m=clearance_m,
         start_clearance_m=float(start_gaps.min(initial=math.inf)),
         goal_clearance_m=float(goal_gaps.min(initial=math.inf)),

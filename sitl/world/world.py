@@ -256,7 +256,6 @@ _GENERATED = {
 
 
 def _pair_of_spec(text: str) -> _Pair | None:
-    """Parse `gen:density,size`. Return None if the text is not such a spec."""
     if not text.startswith("gen:"):
         return None
     try:

@@ -18,7 +18,7 @@ from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import Transport, open_transport
 from sitl.camera.__main__ import main
 from sitl.camera.component import Camera
-from sitl.camera.station import PoseTracker, Router, Station, Witness
+from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.vehicle.profile import load_profile
 from sitl.vehicle.vehicle import regression_power
 from sitl.world import load_world
@@ -60,14 +60,15 @@ def start_capture(system: int) -> Any:
     return dialect.MAVLink_command_long_message(system, 100, 2000, 0, 0, 0.1, 0, 0, 0, 0, 0)
 
 
-@pytest.fixture
-def scene() -> Iterator[tuple[Station, Peer, Peer, list[float]]]:
+@contextlib.contextmanager
+def on_links(
+    origin_enu_m: tuple[float, float, float], **settings: Any
+) -> Iterator[tuple[Station, Peer, Peer, list[float]]]:
     autopilot, client = Peer(7, 1), Peer(255, 190)
     now = [-5.0]
-    router = Router([autopilot.station_url, client.station_url], clock=lambda: now[0])
     station = Station(
-        Camera(WORLD.boxes_enu_m), PoseTracker(np.zeros(3)), router,
-        witness=Witness(WORLD, load_profile("solo"), logs=False), clock=lambda: now[0],
+        Camera(WORLD.boxes_enu_m), PoseTracker(np.array(origin_enu_m)),
+        [autopilot.station_url, client.station_url], clock=lambda: now[0], **settings,
     )  # fmt: skip
     client.send(heartbeat(dialect.MAV_AUTOPILOT_INVALID))
     station.serve()
@@ -75,9 +76,16 @@ def scene() -> Iterator[tuple[Station, Peer, Peer, list[float]]]:
         peer.received()
     now[0] = 0.0
     yield station, autopilot, client, now
-    router.close()
+    station.close()
     for peer in (autopilot, client):
         peer.link.close()
+
+
+@pytest.fixture
+def scene() -> Iterator[Any]:
+    witness = Witness(WORLD, load_profile("solo"), logs=False)
+    with on_links((0.0, 0.0, 0.0), witness=witness) as made:
+        yield made
 
 
 def test_it_asks_a_silent_autopilot_for_its_pose_until_it_comes(scene: Any) -> None:
@@ -152,12 +160,9 @@ def test_its_heartbeat_is_the_cameras_with_and_without_a_pose(
     heartbeat_hz: float, beats: int
 ) -> None:
     autopilot, now = Peer(7, 1), [0.0]
-    with (
-        contextlib.closing(autopilot.link),
-        contextlib.closing(Router([autopilot.station_url], clock=lambda: now[0])) as router,
-    ):
-        camera = Camera(WORLD.boxes_enu_m, heartbeat_hz=heartbeat_hz)
-        station = Station(camera, PoseTracker(np.zeros(3)), router, clock=lambda: now[0])
+    camera = Camera(WORLD.boxes_enu_m, heartbeat_hz=heartbeat_hz)
+    made = Station(camera, PoseTracker(np.zeros(3)), [autopilot.station_url], clock=lambda: now[0])
+    with contextlib.closing(autopilot.link), contextlib.closing(made) as station:
 
         def heard(*messages: Any) -> int:
             count = 0
@@ -257,14 +262,10 @@ def told_offsets(client: Peer) -> list[tuple[float, float, float]]:
 
 
 @pytest.fixture
-def unplaced(scene: Any) -> Any:
+def unplaced() -> Iterator[Any]:
     """A station that does not know the origin of the autopilot. Its guess is the start."""
-    station, autopilot, client, now = scene
-    placeless = Station(
-        station.camera, PoseTracker(np.array([3.0, 4.0, 0.0])), station._router,
-        origin_given=False, clock=lambda: now[0],
-    )  # fmt: skip
-    return placeless, autopilot, client, now
+    with on_links((3.0, 4.0, 0.0), origin_given=False) as made:
+        yield made
 
 
 def test_the_origin_is_the_start_if_nobody_knows_a_better_one(unplaced: Any) -> None:
@@ -345,39 +346,43 @@ def test_nothing_is_saved_of_a_vehicle_that_was_never_seen(tmp_path: Path) -> No
 # Peers of a listening link ---------------------------------------------------------------------
 
 
+def listening(**settings: Any) -> Station:
+    camera = Camera(WORLD.boxes_enu_m, heartbeat_hz=0.0)
+    return Station(camera, PoseTracker(np.zeros(3)), ["udpin:127.0.0.1:0"], **settings)
+
+
 def test_a_second_companion_joins_where_the_first_was(tmp_path: Path) -> None:
     """Neither takes the other's place, and a stranger's bytes are no peer."""
-    with contextlib.closing(Router(["udpin:127.0.0.1:0"])) as router:
-        port = router.peers._endpoints[0][1].port  # type: ignore[attr-defined]
+    with contextlib.closing(listening()) as station:
+        port = station.peers._endpoints[0][1].port  # type: ignore[attr-defined]
         heard: list[Any] = []
-        router.take = lambda message: bool(heard.append(message.get_srcSystem()))
+        station.take = lambda message: bool(heard.append(message.get_srcSystem()))
         for name in (1, 2):
             far = open_transport(f"udpout:127.0.0.1:{port}")
             far.send(b"\xfd no frame")
             far.send(Codec(name, 191).encode(heartbeat(8)))
-            router.peers.wait(1.0)
-            router.serve()
+            station.peers.wait(1.0)
+            station.serve()
             far.close()
         assert heard == [1, 2]
-        assert len(list(router.peers)) == 2
+        assert len(list(station.peers)) == 2
 
 
 def test_a_second_autopilot_of_an_endpoint_is_told_and_not_followed() -> None:
     """Until the first has been silent for 5 s."""
     now_s, heard = [0.0], []
     with contextlib.ExitStack() as stack:
-        router = Router(["udpin:127.0.0.1:0"], clock=lambda: now_s[0])
-        stack.enter_context(contextlib.closing(router))
-        router.take = lambda message: bool(heard.append(message.custom_mode))
-        port = router.peers._endpoints[0][1].port  # type: ignore[attr-defined]
+        station = stack.enter_context(contextlib.closing(listening(clock=lambda: now_s[0])))
+        station.take = lambda message: bool(heard.append(message.custom_mode))
+        port = station.peers._endpoints[0][1].port  # type: ignore[attr-defined]
         first, second = (
             stack.enter_context(contextlib.closing(open_transport(f"udpout:127.0.0.1:{port}")))
             for _ in range(2)
         )
         for far, mode in ((first, 1), (second, 2), (first, 1)):
             far.send(Codec(7, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, mode, 4, 3)))
-            router.peers.wait(1.0)
-            router.serve()
+            station.peers.wait(1.0)
+            station.serve()
         assert heard == [1, 1]
         told, codec = "", Codec(255, 190)
         while data := first.receive(0.1):
@@ -386,6 +391,6 @@ def test_a_second_autopilot_of_an_endpoint_is_told_and_not_followed() -> None:
         assert told == "two autopilots send here, 127.0.0.1:{} and 127.0.0.1:{}".format(*ports)
         now_s[0] = 5.0
         second.send(Codec(7, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 2, 4, 3)))
-        router.peers.wait(1.0)
-        router.serve()
+        station.peers.wait(1.0)
+        station.serve()
         assert heard == [1, 1, 2]
