@@ -145,14 +145,21 @@ def measures_of(record: Record) -> dict[str, Any]:
     `first_bits`, when the fault was applied, and to what; `alarms`, those that are listed, oldest
     first; `episodes`, alarms in a row counted once; and STRUCK.
     """
-    nodes: Record = record.get("nodes") or {}
+    nodes, detection, fault = (record.get(name) or {} for name in ("nodes", "detection", "fault"))
+    hit = _instruction(fault, nodes) if fault.get("level") == "instruction" else _source(fault)
     return {
         **fields_of(record),
         "straight_m": _straight_m(record),
         "crashed": any(node.get("crashes") for node in nodes.values()),
-        **_alarms(record.get("detection") or {}),
-        **_applied(record.get("fault") or {}),
-        **_struck(record),
+        "alarms": [
+            {"stamp_s": alarm["stamp_s"], "stage": alarm["stage"]}
+            for alarm in detection.get("alarms", ())
+        ],
+        "episodes": sum(each["count"] for each in detection.get("recoveries", {}).values()),
+        "struck_s": hit.get("struck_s"),
+        "struck_sites": hit["struck_sites"],
+        "first_bits": hit.get("first_bits", []),
+        **{name: hit.get(name) for name in STRUCK},
     }
 
 
@@ -178,34 +185,6 @@ def _straight_m(record: Record) -> float | None:
     return math.dist(takeoff, record[goal]) - float(config["goal_tolerance_m"])
 
 
-def _alarms(detection: Record) -> dict[str, Any]:
-    return {
-        "alarms": [
-            {"stamp_s": alarm["stamp_s"], "stage": alarm["stage"]}
-            for alarm in detection.get("alarms", ())
-        ],
-        "episodes": sum(each["count"] for each in detection.get("recoveries", {}).values()),
-    }
-
-
-def _applied(fault: Record) -> dict[str, Any]:
-    """The first time of the fault, and the states or the node that it was applied to."""
-    applied = fault.get("state") == "applied"
-    if fault.get("level") == "source":
-        strikes = fault.get("strikes") or []
-        changes = strikes[0]["changes"] if strikes else []  # none where a process was killed
-        return {
-            "struck_s": strikes[0]["stamp_s"] if applied and strikes else None,
-            "struck_sites": list(fault.get("states", ())),
-            "first_bits": list(changes[0]["bits"]) if changes else [],
-        }
-    return {
-        "struck_s": fault.get("stamp_s") if applied else None,
-        "struck_sites": [fault["node"]] if "node" in fault else [],
-        "first_bits": list((fault.get("corruption") or {}).get("bits", ())),
-    }
-
-
 # What a fault did -----------------------------------------------------------------------------
 
 STRUCK = (
@@ -221,32 +200,29 @@ STRUCK = (
 _FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
 
 
-def _struck(record: Record) -> dict[str, Any]:
-    fault: Record = record.get("fault") or {}
-    found = _instruction(fault, record) if fault.get("level") == "instruction" else _source(fault)
-    return {name: found.get(name) for name in STRUCK}
-
-
 def _source(fault: Record) -> dict[str, Any]:
+    found = {"strikes": fault.get("strike_count"), "struck_sites": list(fault.get("states", ()))}
     strikes: Sequence[Record] = fault.get("strikes") or ()
     if not strikes:
-        return {"strikes": fault.get("strike_count")}
+        return found
     first = strikes[0]
-    changes: Sequence[Record] = first["changes"]
+    changes: Sequence[Record] = first["changes"]  # none where a process was killed
     reader: Record = _at(fault, "activation", "first_reader") or {}
     return {
-        "strikes": fault.get("strike_count"),
+        **found,
+        "struck_s": first["stamp_s"] if fault.get("state") == "applied" else None,
+        "first_bits": list(changes[0]["bits"]) if changes else [],
         "strike_s": first["stamp_s"],
-        "strike_phase": first["phase"],
-        "strike_tick": first["tick"],
-        "strike_invocation": first["invocation"],
-        "struck_state": _joined(change["state"] for change in changes),
-        "struck_index": _joined(change["index"] for change in changes),
+        **{f"strike_{name}": first[name] for name in ("phase", "tick", "invocation")},
+        **{
+            f"struck_{name}": _joined(change[name] for change in changes)
+            for name in ("state", "index", "before_hex", "after_hex")
+        },
+        **{
+            f"struck_{when}": _joined(_value(change, when) for change in changes)
+            for when in ("before", "after")
+        },
         "struck_bits": _joined(_bits(change["bits"]) for change in changes),
-        "struck_before": _joined(_value(change, "before") for change in changes),
-        "struck_after": _joined(_value(change, "after") for change in changes),
-        "struck_before_hex": _joined(change["before_hex"] for change in changes),
-        "struck_after_hex": _joined(change["after_hex"] for change in changes),
         "activation": _at(fault, "activation", "activation"),
         "first_reader": reader.get("name"),
         "first_read_state": reader.get("state"),
@@ -254,10 +230,13 @@ def _source(fault: Record) -> dict[str, Any]:
     }
 
 
-def _instruction(fault: Record, record: Record) -> dict[str, Any]:
+def _instruction(fault: Record, nodes: Record) -> dict[str, Any]:
     corruption: Record = fault.get("corruption") or {}
     injection: Record = fault.get("injection") or {}
     drawn = {
+        "struck_s": fault.get("stamp_s") if fault.get("state") == "applied" else None,
+        "struck_sites": [fault["node"]] if "node" in fault else [],
+        "first_bits": list(corruption.get("bits", ())),
         "struck_node": fault.get("node"),
         "struck_kernel": fault.get("kernel"),
         "struck_function": fault.get("symbol"),
@@ -272,7 +251,7 @@ def _instruction(fault: Record, record: Record) -> dict[str, Any]:
     }
     if not injection.get("applied"):
         return drawn
-    node: Record = (record.get("nodes") or {}).get(fault.get("node")) or {}
+    node: Record = nodes.get(fault.get("node", "")) or {}
     ends = [crash["how"] for crash in node.get("crashes", ())] + ["hang"] * node.get("hangs", 0)
     return {
         **drawn,
@@ -379,7 +358,10 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
     flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
     if not checks or not flight_s:
         return None
-    again = _recomputations(detection)
+    # Alarms that are not listed are distributed over the stages like those that are.
+    listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
+    total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
+    again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 
     def mean_s(kernel: Mapping[str, Any] | None) -> float:
         """Return the mean latency of an invocation, s."""
@@ -402,12 +384,3 @@ def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
         platform=str(flight.config.get("platform", "an unknown platform")),
         faulty=bool(flight.fault),
     )
-
-
-def _recomputations(detection: Record) -> dict[str, float]:
-    """Return the recomputations per stage; unlisted alarms are distributed in the same ratio."""
-    listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
-    total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
-    return {
-        stage: listed.count(stage) * total / len(listed) if listed else 0.0 for stage in RECOMPUTED
-    }

@@ -114,9 +114,10 @@ def _injection(
     if config.instruction is None:
         yield NoInjection()
         return
-    from mavfi_cli.mission.instruction.injection import injection_of  # loads the debugger
+    from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the debugger
 
-    with contextlib.closing(injection_of(config, out, repeat, for_debugger)) as injection:
+    injection = InstructionInjection(config, out, repeat, for_debugger)
+    with contextlib.closing(injection):
         yield injection
 
 

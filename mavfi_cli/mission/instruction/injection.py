@@ -59,17 +59,10 @@ _WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `pro
 _INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _PlannedFault:
-    """One exact instruction-level fault of a mission."""
-
-    fault: InstructionFault
-    context: Mapping[str, Any]  # further entries of the record, by the names of _CONTEXT
-    recorded: Mapping[str, Any] | None = None  # the repeated record; None for a drawn fault
-
-
-def _plan_fault(config: MissionConfig, asked: InstructionConfig, out: Path) -> _PlannedFault:
-    """Draw the fault of a mission; what it is drawn from is kept below the folder `out`."""
+def _plan_fault(
+    config: MissionConfig, asked: InstructionConfig, out: Path
+) -> tuple[InstructionFault, dict[str, Any]]:
+    """Draw the fault of a mission, and the entries of _CONTEXT."""
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
@@ -114,8 +107,7 @@ def _plan_fault(config: MissionConfig, asked: InstructionConfig, out: Path) -> _
         "seed": asked.seed,
         "request": asdict(asked),
     }
-    struck = replace(fault, corruption=None) if asked.null else fault
-    return _PlannedFault(fault=struck, context=context)
+    return replace(fault, corruption=None) if asked.null else fault, context
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,16 +144,6 @@ def draw_invocation(
     return _KernelInvocation(
         number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
     )
-
-
-def _planned_of(recorded: Mapping[str, Any]) -> _PlannedFault:
-    """Read the fault of a record, to repeat it."""
-    fault = record.fault_of(recorded)
-    try:
-        context = {name: recorded[name] for name in _CONTEXT}
-    except KeyError as error:
-        raise RecordError(f"the fault record is damaged: it has no {error}") from None
-    return _PlannedFault(fault=fault, context=context, recorded=recorded)
 
 
 def _kept(path: Path, make: Callable[[], T]) -> T:
@@ -326,31 +308,51 @@ def _count_entries(setup: Setup, orders: Sequence[_Order]) -> list[int]:
 # Flight -------------------------------------------------------------------------------------------
 
 
-class _InstructionInjection(NoInjection):
+class InstructionInjection(NoInjection):
     """One instruction-level fault in one mission; messages pass unchanged.
 
     Args:
+        out: the folder below which golden runs and profiles are kept.
+        repeat: the record of a fault to repeat; None draws one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
+
+    Raises:
+        FaultError: the flight is not repeatable, or nothing can be hit in it.
+        RecordError: the record to repeat is damaged.
     """
 
     def __init__(
         self,
-        planned: _PlannedFault,
-        spawned: ServedProcess,
-        for_debugger: Callable[[int], None] | None = None,
+        config: MissionConfig,
+        out: Path,
+        repeat: Mapping[str, Any] | None,
+        for_debugger: Callable[[int], None] | None,
     ) -> None:
         super().__init__()
-        self._planned = planned
-        self._spawned = spawned
-        self._for_debugger = for_debugger
+        assert config.instruction is not None
+        if config.link is not None:
+            raise FaultError(
+                "an instruction-level fault needs flights that repeat, and those of a foreign "
+                "autopilot do not: leave out --link"
+            )
+        self._repeat, self._for_debugger = repeat, for_debugger
+        if repeat is None:
+            self._fault, self._context = _plan_fault(config, config.instruction, out)
+        else:
+            self._fault = record.fault_of(repeat)
+            if missing := [name for name in _CONTEXT if name not in repeat]:
+                raise RecordError(f"the fault record is damaged: it has no {missing[0]!r}")
+            self._context = {name: repeat[name] for name in _CONTEXT}
+        self.node = str(self._context["node"])
+        self._spawned = ServedProcess.of(PROGRAM)
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
         self._reached = threading.Event()  # the trigger, or the end of the attack without it
         self._struck = False  # in an invocation whose answer is there
         self._told = False
-        self.node = str(planned.context["node"])
 
     def begin(self, path: Path) -> None:
+        """Note where the tracer writes the record."""
         self._path = path
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
@@ -362,8 +364,8 @@ class _InstructionInjection(NoInjection):
         """
         scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")
         pid = self._spawned.pid
-        if self._planned.recorded is not None:
-            record.require_same_build(self._planned.recorded, Image(pid, scope.regions))
+        if self._repeat is not None:
+            record.require_same_build(self._repeat, Image(pid, scope.regions))
         self._tracer = TracerThread(lambda armed: self._attack(pid, scope, armed))
         self._tracer.await_armed()
         process = NodeProcess(
@@ -381,7 +383,7 @@ class _InstructionInjection(NoInjection):
         try:
             done = attack_live(
                 pid,
-                self._planned.fault,
+                self._fault,
                 path=self._path,
                 regions=scope.regions,
                 window=0 if debugging else 64,
@@ -389,7 +391,7 @@ class _InstructionInjection(NoInjection):
                 reached=self._reached.set,
                 leave_stopped=debugging,
                 scope=list(scope.objects),
-                **self._planned.context,
+                **self._context,
             )
         finally:
             self._reached.set()
@@ -399,9 +401,7 @@ class _InstructionInjection(NoInjection):
 
     def _ending(self) -> str | None:
         """How the node ended, if the tracer was told."""
-        if self._tracer is None:
-            return None
-        ended = self._tracer.result().ended
+        ended = None if self._tracer is None else self._tracer.result().ended
         if ended is None:
             return None
         if ended.signal is not None:
@@ -422,31 +422,24 @@ class _InstructionInjection(NoInjection):
             return []
         self._told = True
         done = self._tracer.result()
-        if self._planned.fault.corruption is None:
-            return []
-        return [_attack_text(done.record)]
+        return [] if self._fault.corruption is None else [_attack_text(done.record)]
 
-    def finish(self) -> dict[str, Any] | None:
-        """The record at the end of the mission, without measured times."""
-        if self._tracer is None:
-            self._spawned.kill()
-            return None
-        return _in_result(self._tracer.result().record)
+    def finish(self) -> dict[str, Any]:
+        """The record at the end of the mission: the same in every repetition."""
+        assert self._tracer is not None
+        written = self._tracer.result().record
+        injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
+        reason = written.get("not_injected_reason", "")
+        state = "applied" if injection["applied"] else "not_injected"
+        if written["corruption"] is None and not reason:
+            state = "null"
+        told = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
+        return {**written, **told}
 
     def close(self) -> None:
         """End the node's process if no executor owns it."""
         if self._tracer is None:
             self._spawned.kill()
-
-
-def _in_result(written: Mapping[str, Any]) -> dict[str, Any]:
-    """A fault record as result.json carries it: the same in every repetition."""
-    injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
-    state = "applied" if injection["applied"] else "not_injected"
-    if written["corruption"] is None and not written.get("not_injected_reason"):
-        state = "null"
-    reason = written.get("not_injected_reason", "")
-    return {**written, "schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
 
 
 def _attack_text(written: Mapping[str, Any]) -> str:
@@ -459,29 +452,3 @@ def _attack_text(written: Mapping[str, Any]) -> str:
     what = corruption["register"] or corruption["site"]
     activation = written["activation"]["activation"].replace("_", " ")
     return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
-
-
-def injection_of(
-    config: MissionConfig,
-    out: Path,
-    repeat: Mapping[str, Any] | None,
-    for_debugger: Callable[[int], None] | None,
-) -> _InstructionInjection:
-    """Plan the instruction-level fault of a mission, and start its node's process.
-
-    Args:
-        out: the folder below which golden runs and profiles are kept.
-        repeat: the record of a fault to repeat; None draws one.
-        for_debugger: called when the node waits for a debugger at the injected instruction.
-
-    Raises:
-        FaultError: the flight is not repeatable, or nothing can be hit in it.
-    """
-    assert config.instruction is not None
-    if config.link is not None:
-        raise FaultError(
-            "an instruction-level fault needs flights that repeat, and those of a foreign "
-            "autopilot do not: leave out --link"
-        )
-    planned = _planned_of(repeat) if repeat else _plan_fault(config, config.instruction, out)
-    return _InstructionInjection(planned, ServedProcess.of(PROGRAM), for_debugger)
