@@ -65,8 +65,7 @@ class _Killer(Injector):
 
     def __init__(self, config: FaultConfig, shortest_flight_s: float, listener: Listener) -> None:
         rng = Stream.FAULT.generator(config.seed, "process")
-        trigger, corruption = config.trigger(), config.corruption()
-        super().__init__(rng, trigger, corruption, shortest_flight_s, listener)
+        super().__init__(rng, config.trigger(), config.corruption(), shortest_flight_s, listener)
 
     def strike(self, moment: Moment) -> None:
         if self._schedule.due(moment):
@@ -98,6 +97,11 @@ class SourceInjection(NoInjection):
         self.in_queue = config.strikes_queue
         self._reader = ""  # who reads at once what is corrupted; empty: the follower finds out
         self.injector: Injector
+        common: Any = {
+            "seed": config.seed,
+            "shortest_flight_s": shortest_flight_s,
+            "listener": self._on_strike,
+        }
         if config.killed_node is not None:
             self.injector = _Killer(config, shortest_flight_s, self._on_strike)
             self._reader = config.killed_node
@@ -111,20 +115,13 @@ class SourceInjection(NoInjection):
                 trigger=config.trigger(),
                 corruption=config.corruption(),
                 bits=config.exact_bits,
-                seed=config.seed,
-                shortest_flight_s=shortest_flight_s,
-                listener=self._on_strike,
+                **common,
             )
             self.injector, self._stage, self._reader = memory, DETECTOR, DETECTOR
             self._units = {memory.array: "1"}
         else:
             fault = config.draw()
-            self.injector = SourceInjector(
-                fault,
-                seed=config.seed,
-                shortest_flight_s=shortest_flight_s,
-                listener=self._on_strike,
-            )
+            self.injector = SourceInjector(fault, **common)
             self._stage = fault.states[0].stage.value
             self._units = {state.name: state.unit for state in fault.states}
 
@@ -137,7 +134,7 @@ class SourceInjection(NoInjection):
     def begin(self, path: Path) -> None:
         """Write the planned fault."""
         self._path = path
-        write_json(path, self.record())
+        self._write()
 
     def news(self) -> list[str]:
         """Return the first strike as text, once."""
@@ -149,8 +146,7 @@ class SourceInjection(NoInjection):
         if self._state == "planned":
             self._news.append(_strike_text(strike))
             self._state = "applied"
-            if self._path is not None:
-                write_json(self._path, self.record())
+            self._write()
         if self._executor is not None:
             self._executor.kill(self._reader)
 
@@ -158,15 +154,13 @@ class SourceInjection(NoInjection):
         """Write and return the record."""
         if self._state == "planned":
             self._state = "not_injected"
-        if self._path is not None:
-            write_json(self._path, self.record())
-        return self.record()
+        return self._write()
 
-    def record(self) -> dict[str, Any]:
-        """Return the requested fault, the drawn values and the strikes."""
+    def _write(self) -> dict[str, Any]:
+        """Write and return the requested fault, the drawn values and the strikes."""
         activation, reader = self._activation()
         trigger, injector = self._config.trigger(), self.injector
-        return {
+        written = {
             "schema": SCHEMA,
             "level": "source",
             "state": self._state,
@@ -188,6 +182,9 @@ class SourceInjection(NoInjection):
                 "first_reader": asdict(reader) if reader else None,
             },
         }
+        assert self._path is not None
+        write_json(self._path, written)
+        return written
 
     def _activation(self) -> tuple[str, Reader | None]:
         if not self._reader:
@@ -199,7 +196,6 @@ class SourceInjection(NoInjection):
 
 
 def _strike_text(strike: Strike) -> str:
-    """Describe the changes of a strike in one line."""
     if not strike.changes:
         return "fault: the process is killed"
     changes = [

@@ -92,22 +92,18 @@ def _spread(of: Sequence[_Any], number: int = INPUTS_A_KERNEL) -> list[_Any]:
 
 def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
     """Return checked trajectories, some of them with a collision if there are any."""
-    checks = [
-        replace(check, stamp_s=stamp_s, front_enu_m=None)
-        for check, stamp_s in recorder.orders.get("collision_check", [])
-        if check.trajectory is not None
-    ]
-    foreseen = [check for check in checks if _foresees(check)]
-    free = [check for check in checks if not _foresees(check)]
+    free: list[CollisionInputs] = []
+    foreseen: list[CollisionInputs] = []
+    for check, stamp_s in recorder.orders.get("collision_check", []):
+        if check.trajectory is not None:
+            alone = replace(check, stamp_s=stamp_s, front_enu_m=None)
+            state, params = collision.CollisionState(), collision.CollisionParams()
+            _, report = collision.step(state, alone, params)
+            (foreseen if report.collision else free).append(alone)
     some = min(_FORESEEN, len(foreseen))
     if len(free) < INPUTS_A_KERNEL - some:
         raise TargetError(name, "checked too few trajectories")
     return _spread(free, INPUTS_A_KERNEL - some) + _spread(foreseen, some)
-
-
-def _foresees(check: CollisionInputs) -> bool:
-    _, report = collision.step(collision.CollisionState(), check, collision.CollisionParams())
-    return report.collision
 
 
 def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
@@ -137,9 +133,9 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
         grid = PlanningProblem.pose(
             snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
         ).grid
-        if grid.point_free(task.goal_enu_m) and grid.point_free(task.start_enu_m):
-            if grid.segment_free(task.start_enu_m, task.goal_enu_m):
-                continue
+        start, goal = task.start_enu_m, task.goal_enu_m
+        ends_free = grid.point_free(goal) and grid.point_free(start)
+        if ends_free and not grid.segment_free(start, goal):
             hard.append(task)
     return hard
 
@@ -170,16 +166,15 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
         ConfigError: The folder contains the inputs of another flight.
     """
     path = folder / INPUTS
-    if path.is_file():
-        (known, *_), sha256 = load_inputs(path)
-        if known.flight != _flight_name(config):
-            raise ConfigError(f"holds inputs of a {known.flight}", path=path)
-        return {"inputs": path, "inputs_sha256": sha256, "flight": known.flight}
-    inputs = record_inputs(config)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    sha256 = save_inputs(path, inputs)
-    return {"inputs": path, "inputs_sha256": sha256, "flight": _flight_name(config)}
+    if not path.is_file():
+        inputs = record_inputs(config)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        save_inputs(path, inputs)
+    (known, *_), sha256 = load_inputs(path)
+    if known.flight != _flight_name(config):
+        raise ConfigError(f"holds inputs of a {known.flight}", path=path)
+    return {"inputs": path, "inputs_sha256": sha256, "flight": known.flight}
 
 
 def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:

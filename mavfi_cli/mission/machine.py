@@ -21,7 +21,6 @@ from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.processes import PYTHON
 
 if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.registers import Registers
     from mavfi_cli.fi.tracer.tracee import Mechanism
 
 OK = "ok"
@@ -92,7 +91,14 @@ def check_machine() -> Iterator[Check]:
     yield _check("Disk", f"{free:.1f} GB free here", remedy=remedy)
     yield _loopback()
     yield _physics()
-    yield from _injection()
+    from mavfi_cli.fi.tracer.linux import SUPPORTED
+
+    if SUPPORTED:
+        yield check_tracing()
+        yield _counting()
+    else:
+        remedy = "instruction-level injection is not available here"
+        yield _check("Tracing", "not Linux on x86-64", remedy=remedy)
 
 
 def _processor() -> Check:
@@ -146,38 +152,29 @@ def _physics() -> Check:
     return _check("Vehicle", last, remedy=_INSTALL, failed=True)
 
 
-def _injection() -> Iterator[Check]:
-    """Test tracing and counted breakpoints on a real program."""
-    from mavfi_cli.fi.tracer.linux import SUPPORTED
-
-    if not SUPPORTED:
-        remedy = "instruction-level injection is not available here"
-        yield _check("Tracing", "not Linux on x86-64", remedy=remedy)
-        return
-    yield check_tracing()
-    yield _counting()
-
-
 def check_tracing(mechanism: Mechanism | None = None) -> Check:
     """Start a program, stop it at its entry point, flip a register there and back, let it go.
 
     Args:
         mechanism: How executions are counted; by default the best that is allowed.
     """
+    from mavfi_cli.fi.tracer.registers import widest_vector
     from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 
-    problem = ""
     with tempfile.TemporaryDirectory(prefix="mavfi-doctor-") as folder:
         output = Path(folder) / "output"
         try:
             command = Program.of(["true"], environment=dict(os.environ))
             tracee = spawn(command, stdout=output, stderr=output, mechanism=mechanism)
             try:
-                problem = (
-                    _flip_and_back(tracee.registers)
-                    if run_to_entry(tracee)
-                    else "a hardware breakpoint never hit"
-                )
+                hit = run_to_entry(tracee)
+                problem = "" if hit else "a hardware breakpoint never hit"
+                for register in ("rbx", f"{widest_vector()}15") if hit else ():
+                    before = tracee.registers.read(register)
+                    tracee.registers.write(register, before ^ 1)
+                    if tracee.registers.read(register) != before ^ 1:
+                        problem = f"a flip of {register} did not stick"
+                    tracee.registers.write(register, before)
             finally:
                 tracee.kill()
         except (MavfiError, OSError) as error:
@@ -185,19 +182,6 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
     if problem:
         return _check("ptrace", problem, remedy=_ALLOW_PTRACE)
     return _check("ptrace", "a program was stopped, a register flipped and read back")
-
-
-def _flip_and_back(registers: Registers) -> str:
-    """Flip a bit of two registers and restore them; return the problem, if there is one."""
-    from mavfi_cli.fi.tracer.registers import widest_vector
-
-    for register in ("rbx", f"{widest_vector()}15"):
-        before = registers.read(register)
-        registers.write(register, before ^ 1)
-        if registers.read(register) != before ^ 1:
-            return f"a flip of {register} did not stick"
-        registers.write(register, before)
-    return ""
 
 
 def _counting() -> Check:
