@@ -17,6 +17,8 @@ SOURCES = {
 }
 LONGEST_STUDY = 150  # lines of a module
 LONGEST_CHAIN = 16  # modules, each of which imports the next when it is loaded
+MOST_FILES = 260
+MOST_NAMES = 800  # public classes and functions at the top level of modules
 # Functions that nothing in the product calls by name, with the reason to keep them.
 UNCALLED = {
     "__getattr__": "Python calls it: names of the library are imported when they are first used",
@@ -78,6 +80,18 @@ def test_a_public_class_name_exists_once():
         if isinstance(statement, ast.ClassDef) and not statement.name.startswith("_")
     )
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_the_house_stays_small():
+    names = [
+        statement.name
+        for module in SOURCES
+        for statement in tree(module).body
+        if isinstance(statement, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and not statement.name.startswith("_")
+    ]
+    assert len(names) <= MOST_NAMES
+    assert len(SOURCES) <= MOST_FILES
 
 
 def test_a_chain_of_imports_is_short():
