@@ -42,10 +42,7 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     from mavfi_cli.paper.status import tables
 
     plan = FlightsPlan(
-        items=items_named(names),
-        stack=options["stack"],
-        scale=options["scale"],
-        out=options["out"],
+        items=items_named(names), stack=options["stack"], scale=options["scale"], out=options["out"]
     )
     with missions_view(quiet=quiet) as view:
         run(

@@ -11,11 +11,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.paper.flights import PERCENT, STAGES, Flights
 from mavfi_cli.paper.items import printed
-from mavfi_cli.paper.layouts import (
-    KERNELS_FLOWN,
-    PROTECTED,
-    values_and_deltas,
-)
+from mavfi_cli.paper.layouts import KERNELS_FLOWN, PROTECTED, values_and_deltas
 from mavfi_cli.report.paper import (
     DETECTOR_TITLES,
     SMALLEST,

@@ -321,8 +321,7 @@ def write_flights(table: pa.Table, path: Path) -> int:
     """
     if path.suffix not in _FORMATS:
         raise ConfigError(
-            f"the name must end in {' or '.join(_FORMATS)}, or - for CSV on stdout",
-            path=path,
+            f"the name must end in {' or '.join(_FORMATS)}, or - for CSV on stdout", path=path
         )
 
     def write(file: Any) -> None:

@@ -13,7 +13,6 @@ import importlib.util
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,30 +78,20 @@ _OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not 
 _FONT = re.compile(r"font: (?:[a-z0-9]+ )*?([0-9.]+px)[^;\"]*")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Chart:
-    """A picture in the page.
+def _chart(name: str, title: str, figure: Figure, csv: str) -> dict[str, str]:
+    """A picture in the page, as an SVG element in the page's font and colours.
 
-    Attributes:
+    Args:
         name: of its CSV file, without suffix.
         title: what it shows, in words, also for those who cannot see it.
         csv: its numbers.
     """
-
-    name: str
-    title: str
-    figure: Figure
-    csv: str
-
-    @property
-    def markup(self) -> str:
-        """An SVG element in the page's font and colours."""
-        text = svg(self.figure)
-        markup = _OWN_ID.sub("", text[text.index("<svg") :])
-        markup = _FONT.sub(r"font-size: \1", markup)
-        for colour, variable in _THEME.items():
-            markup = markup.replace(colour, variable)
-        return markup.strip()
+    text = svg(figure)
+    markup = _OWN_ID.sub("", text[text.index("<svg") :])
+    markup = _FONT.sub(r"font-size: \1", markup)
+    for colour, variable in _THEME.items():
+        markup = markup.replace(colour, variable)
+    return {"name": name, "title": title, "markup": markup.strip(), "csv": csv}
 
 
 def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,13 +104,8 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
             if part["figure"] is not None
         },
         "states": [
-            _Chart(
-                name=f"states-{stack}",
-                title=f"Faults in states, {stack}",
-                figure=each["figure"],
-                csv=csv_text(each["rows"]),
-            )
-            for stack, each in told["spreads"].items()
+            _chart(f"states-{x}", f"Faults in states, {x}", each["figure"], csv_text(each["rows"]))
+            for x, each in told["spreads"].items()
             if each
         ],
         "arms": [_arm_chart(each["campaign"], each["arms"]) for each in told["arms"]],
@@ -129,18 +113,14 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _item_chart(item: Any, shown: Mapping[str, Any]) -> _Chart:
+def _item_chart(item: Any, shown: Mapping[str, Any]) -> dict[str, str]:
     name = f"{item.name}-{shown['stack']}".replace(" ", "-")
-    flights = shown["flights"]
-    return _Chart(
-        name=f"{name}-flights" if flights else name,
-        title=f"{item.paper}, {shown['stack']}",
-        figure=shown["figure"],
-        csv=csv_text(flights) if flights else shown["table"].csv(),
-    )
+    flights, title = shown["flights"], f"{item.paper}, {shown['stack']}"
+    csv = csv_text(flights) if flights else shown["table"].csv()
+    return _chart(f"{name}-flights" if flights else name, title, shown["figure"], csv)
 
 
-def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
+def _arm_chart(campaign: str, arms: Sequence[Any]) -> dict[str, str]:
     figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()
     print_axes(axes)
@@ -157,14 +137,14 @@ def _arm_chart(campaign: str, arms: Sequence[Any]) -> _Chart:
     axes.set_xlim(left=0.0)
     axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
     title = f"Lost missions of each arm of {campaign}"
-    return _Chart(name=f"arms-{campaign}", title=title, figure=figure, csv=csv_text(rows))
+    return _chart(f"arms-{campaign}", title, figure, csv_text(rows))
 
 
 _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
           "crashed": "#e4572e", "hung": "#f2b134"}  # fmt: skip
 
 
-def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
+def _flow_chart(stack: str, flows: Sequence[Any]) -> dict[str, str]:
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)
@@ -186,7 +166,7 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> _Chart:
     look = {"handlelength": 1.0, "columnspacing": 1.0, "labelcolor": INK}
     legend_above(figure, ncols=3, fontsize=SMALLEST, **look)
     title = f"What struck kernels did, {stack}"
-    return _Chart(name=f"kernels-{stack}", title=title, figure=figure, csv=csv_text(rows))
+    return _chart(f"kernels-{stack}", title, figure, csv_text(rows))
 
 
 # Numbers as words ---------------------------------------------------------------------------------

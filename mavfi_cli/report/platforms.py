@@ -8,15 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
-from mavfi_cli.report.columns import (
-    columns,
-    csv_text,
-    number,
-    p_value,
-    percent,
-    rate,
-    spread,
-)
+from mavfi_cli.report.columns import columns, csv_text, number, p_value, percent, rate, spread
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.stats.bootstrap import FEW
 
@@ -111,10 +103,7 @@ def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: An
     title, *names = head
     told_rows = [[_setting_title(row["setting"]), *cells(row)] for row in rows]
     reference = _titles_of(told)[rows[0]["reference"]]
-    return [
-        title.format(platform["title"], reference),
-        *columns([["", *names], *told_rows], 1),
-    ]
+    return [title.format(platform["title"], reference), *columns([["", *names], *told_rows], 1)]
 
 
 _FLIGHTS = ("flights", "success", "flight time, s", "distance, m")

@@ -49,12 +49,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     if config["link"] is not None:
         where = f" in {config['world']}" if config["world"] else ""
         flown = f"foreign autopilot at {config['link']}{where}, seed {config['seed']}"
-    lines = [
-        outcome_line(result),
-        "",
-        f"Mission     {flown}; {with_what}",
-        *_flight_lines(flight),
-    ]
+    lines = [outcome_line(result), "", f"Mission     {flown}; {with_what}", *_flight_lines(flight)]
     if pose := (flight.referee or {}).get("pose"):
         lines.append(f"Referee     on {pose}")
     lines += _fault_lines(flight.fault)

@@ -34,19 +34,14 @@ if TYPE_CHECKING:
 
 _OBSTACLE_EDGE = "#8b93a1"
 _LOW = "#e3ead9"  # boxes that end below the flight, such as hedges
-_MARKS: dict[str, dict[str, Any]] = {
-    "replan": {"marker": "o", "s": 14, "facecolors": "white", "edgecolors": "#222831"},
-    "slow": {"marker": "v", "s": 30, "facecolors": "#f2b134", "edgecolors": "#222831"},
-    "stop": {"marker": "s", "s": 26, "facecolors": "#e4572e", "edgecolors": "#222831"},
-}
-_MARKS["fault"] = {"marker": "*", "s": 130, "facecolors": FAULT, "edgecolors": "white"}
-_MARKS["alarm"] = {"marker": "D", "s": 34, "facecolors": ALARM, "edgecolors": "white"}
-_LABELS = {
-    "fault": "fault",
-    "alarm": "alarm",
-    "replan": "new plan",
-    "slow": "slows down",
-    "stop": "stops",
+# Events: label, marker and style.
+_EVENT: dict[str, Any] = {"linewidths": 0.9, "zorder": 6, "edgecolors": "#222831"}
+_MARKS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "replan": ("new plan", "o", {"s": 14, "facecolors": "white"}),
+    "slow": ("slows down", "v", {"s": 30, "facecolors": "#f2b134"}),
+    "stop": ("stops", "s", {"s": 26, "facecolors": "#e4572e"}),
+    "fault": ("fault", "*", {"s": 130, "facecolors": FAULT, "edgecolors": "white"}),
+    "alarm": ("alarm", "D", {"s": 34, "facecolors": ALARM, "edgecolors": "white"}),
 }
 _WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points, so that equal paths stay visible
 _COLUMNS = 3
@@ -65,11 +60,11 @@ def draw_top_view(run: Run) -> Figure:
     figure = new_figure(5.6, 7.0)
     figure.get_layout_engine().set(h_pad=0.1, w_pad=0.08)  # type: ignore[union-attr, call-arg]
     axes, beside = figure.subplots(2, height_ratios=[4.2, 1.0])
-    flight, path = run.record, _path_of(run)
-    _draw_obstacles(axes, flight.world, path.positions_enu_m)
+    flight, (path, speeds_mps) = run.record, _path_of(run)
+    _draw_obstacles(axes, flight.world, path[:, 1:])
     _draw_plans(axes, flight.plans)
     for each, columns in ((axes, _FROM_ABOVE), (beside, _OVER_TIME)):
-        lines = _draw_path(each, path, columns, flight.config["v_max_mps"])
+        lines = _draw_path(each, path, speeds_mps, columns, flight.config["v_max_mps"])
         if lines is not None and each is axes:
             _explain_speed(figure, axes, lines)
         _draw_start(each, path, columns)
@@ -77,27 +72,20 @@ def draw_top_view(run: Run) -> Figure:
         for kind in _MARKS:
             _draw_marks(each, flight.events, kind, columns)
     _draw_goal(axes, flight)
-    _frame(axes, flight.world, path.positions_enu_m)
+    _frame(axes, flight.world, path[:, 1:])
     _frame_heights(beside, flight, path)
     _caption(figure, axes, flight)
     return figure
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Path:
-    places: np.ndarray  # (n, 4) stamp in s, and position in m
-    speeds_mps: np.ndarray  # (n,)
-
-    @property
-    def positions_enu_m(self) -> np.ndarray:
-        """Positions (n, 3)."""
-        return self.places[:, 1:]
+_Path = tuple[np.ndarray, np.ndarray]  # (n, 4) stamp in s and position in m; speeds in m/s, (n,)
 
 
 def _path_of(run: Run) -> _Path:
+    """The path of a flight, from the truth if it is known."""
     trace = run.trace
     if trace is None or trace.num_rows == 0:
-        return _Path(places=np.empty((0, 4)), speeds_mps=np.empty(0))
+        return np.empty((0, 4)), np.empty(0)
     prefix = "truth_" if "truth_x_m" in trace.column_names else ""
 
     def columns(*names: str) -> np.ndarray:
@@ -106,7 +94,7 @@ def _path_of(run: Run) -> _Path:
     places = columns("stamp_s", *(f"{prefix}{axis}_m" for axis in "xyz"))
     speeds = np.linalg.norm(columns(*(f"{prefix}v{axis}_mps" for axis in "xyz")), axis=1)
     known = np.isfinite(places).all(axis=1)
-    return _Path(places=places[known], speeds_mps=speeds[known])
+    return places[known], speeds[known]
 
 
 def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
@@ -136,12 +124,14 @@ def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
         )  # fmt: skip
 
 
-def _draw_path(axes: Axes, path: _Path, columns: list[int], v_max_mps: float) -> Any:
+def _draw_path(
+    axes: Axes, path: np.ndarray, speeds_mps: np.ndarray, columns: list[int], v_max_mps: float
+) -> Any:
     """Draw the path coloured by speed. Return its lines; None without a path."""
     from matplotlib.collections import LineCollection
 
-    step = max(1, len(path.places) // 400)
-    points, shown = path.places[::step, columns], path.speeds_mps[::step]
+    step = max(1, len(path) // 400)
+    points, shown = path[::step, columns], speeds_mps[::step]
     if len(points) < 2:
         return None
     segments = np.stack([points[:-1], points[1:]], axis=1)
@@ -172,30 +162,32 @@ def _draw_goal(axes: Axes, flight: FlightRecord) -> None:
         axes.scatter([goal[0]], [goal[1]], marker="*", s=120, color=GOAL, zorder=5, label="goal")
 
 
-def _draw_start(axes: Axes, path: _Path, columns: list[int] = _FROM_ABOVE) -> None:
-    if len(path.places):
-        across, up = path.places[0, columns]
-        axes.scatter(
-            across, up, marker="^", s=55, color="#222831",
-            edgecolors="white", linewidths=0.8, zorder=6.5,  # above the mark of a fault
-            label="start" if columns is _FROM_ABOVE else None,
-        )  # fmt: skip
-
-
 def _draw_end(
     axes: Axes,
     flight: FlightRecord,
-    path: _Path,
+    path: np.ndarray,
     columns: list[int] = _FROM_ABOVE,
     colour: str = FAULT,
 ) -> None:
-    if len(path.places) and not flight.succeeded:
-        across, up = path.places[-1, columns]
-        axes.scatter(
-            across, up, marker="X", s=90, color=colour,
-            edgecolors="white", linewidths=0.8, zorder=7,
-            label=flight.outcome if columns is _FROM_ABOVE else None,
-        )  # fmt: skip
+    """Mark the end of a failed flight."""
+    if not flight.succeeded:
+        _mark(axes, path[-1:], columns, flight.outcome, "X", s=90, color=colour, zorder=7)
+
+
+def _draw_start(axes: Axes, path: np.ndarray, columns: list[int] = _FROM_ABOVE) -> None:
+    above = 6.5  # the mark of a fault
+    _mark(axes, path[:1], columns, "start", "^", s=55, color="#222831", zorder=above)
+
+
+def _mark(
+    axes: Axes, places: np.ndarray, columns: list[int], label: str, marker: str, **look: Any
+) -> np.ndarray:
+    """Mark places (n, 4), and return what the axes shows of them, (n, 2)."""
+    shown: np.ndarray = places[:, columns]
+    if len(places):
+        style = {"edgecolors": "white", "linewidths": 0.8, "marker": marker, **look}
+        axes.scatter(*shown.T, label=label if columns is _FROM_ABOVE else None, **style)
+    return shown
 
 
 def _draw_marks(
@@ -211,12 +203,9 @@ def _draw_marks(
         for e in events
         if e["kind"] == kind and e["position_enu_m"]
     ]
-    places = np.array(found, dtype=float).reshape(-1, 4)[:, columns]
-    if found:
-        label = _LABELS[kind] if columns is _FROM_ABOVE else None
-        look = {"linewidths": 0.9, "zorder": 6, "label": label, **_MARKS[kind], **style}
-        axes.scatter(places[:, 0], places[:, 1], **look)
-    return places
+    places = np.array(found, dtype=float).reshape(-1, 4)
+    label, marker, look = _MARKS[kind]
+    return _mark(axes, places, columns, label, marker, **{**_EVENT, **look, **style})
 
 
 def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
@@ -235,9 +224,9 @@ def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
     _plain(axes)
 
 
-def _frame_heights(axes: Axes, flight: FlightRecord, path: _Path) -> None:
+def _frame_heights(axes: Axes, flight: FlightRecord, path: np.ndarray) -> None:
     goal = flight.goal_enu_m or flight.world.get("goal")
-    heights_m = [0.0, *path.places[:, 3], *(goal[2:] if goal else ())]
+    heights_m = [0.0, *path[:, 3], *(goal[2:] if goal else ())]
     if goal:
         axes.axhline(goal[2], color=GOAL, linewidth=0.9, linestyle=(0, (2, 2)), zorder=3)
     axes.margins(x=0.02)
@@ -382,14 +371,14 @@ def _colours(flights: Iterable[tuple[str, Run]]) -> dict[str, str]:
 def _draw_panel(
     figure: Figure, axes: Axes, flights: _Flights, number: int, colours: Mapping[str, str]
 ) -> None:
-    paths = [_path_of(run) for _, run in flights]
-    everywhere = np.concatenate([path.positions_enu_m for path in paths])
+    paths = [_path_of(run)[0] for _, run in flights]
+    everywhere = np.concatenate([path[:, 1:] for path in paths])
     first, golden_s = flights[0][1].record, _golden_s(flights)
     _draw_obstacles(axes, first.world, everywhere)
     handles = []
     for place, ((name, run), path) in enumerate(zip(flights, paths, strict=True)):
         handles += axes.plot(
-            *path.places[:, _FROM_ABOVE].T, color=colours[name], zorder=4.0 + 0.01 * place,
+            *path[:, _FROM_ABOVE].T, color=colours[name], zorder=4.0 + 0.01 * place,
             linewidth=max(_LEAST, _WIDEST - _STEP * place), alpha=0.5 if place == 0 else 1.0,
             solid_capstyle="round", solid_joinstyle="round", gid=f"flight-{number}-{place}",
             label=_legend_entry(name, run.record, golden_s),

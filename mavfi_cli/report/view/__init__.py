@@ -95,13 +95,7 @@ class ViewedFlight:
         return FLIGHTS[1 if self.run.record.fault else 0]
 
     def entry(
-        self,
-        name: str,
-        stamp_s: float,
-        kind: str,
-        data: Any,
-        colour: str = "",
-        size_m: Any = None,
+        self, name: str, stamp_s: float, kind: str, data: Any, colour: str = "", size_m: Any = None
     ) -> Entry:
         """An entry of this name below the flight's."""
         return Entry(
@@ -230,11 +224,7 @@ def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
 # Writing ------------------------------------------------------------------------------------------
 
 # Suffix of a file, or None for rerun's window -> what it needs, and the extra that installs it.
-_NEEDED = {
-    None: ("rerun", "view"),
-    ".rrd": ("rerun", "view"),
-    ".mcap": ("mcap_protobuf", "mcap"),
-}
+_NEEDED = {None: ("rerun", "view"), ".rrd": ("rerun", "view"), ".mcap": ("mcap_protobuf", "mcap")}
 
 
 def require_viewer(path: Path | None) -> None:
