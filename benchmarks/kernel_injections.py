@@ -83,8 +83,8 @@ def measure(plan: Plan, target: KernelTarget, folder: Path, replays: int) -> tup
         f"  stop: median {np.median(stop_ms):.3f} ms, 99th percentile "
         f"{np.percentile(stop_ms, 99):.3f} ms; CPU time of the call {1e3 * call_s:.2f} ms"
     )
-    for number, each in enumerate(runs.inputs):
-        print(f"  input {number}: {each.profile.in_words()}")
+    for number, profile in enumerate(runs.profiles):
+        print(f"  input {number}: {profile.in_words()}")
     found = list(replay_runs(folder, (name,), replays)) if replays else []
     equal = sum(not replay.differs for replay in found)
     for replay in found:

@@ -67,7 +67,7 @@ def finish_alone(tracee: Tracee) -> None:
 def run(place: KernelPlace, way: str, detour: Detour | None) -> float:
     """CPU time of one call, s."""
     tracee = place.start()
-    entry = place.layout.image.address(place.layout.scope.entry)
+    entry = place.image(tracee).address(place.kernel_scope.entry)
     if way in ("armed", "counted"):
         counter = ExecutionCounter(tracee.tid, NOWHERE if way == "armed" else entry, NEVER)
         finish(tracee)
@@ -99,8 +99,8 @@ def measure(name: str, inputs: Path, rounds: int) -> None:
     target = KernelTarget(kernel=name, inputs=inputs)
     with one_processor(), closing(target.open()) as place:
         tracee = place.start()
-        entries = tracee.count_to_end(place.layout.image.address(place.layout.scope.entry))
-        detour = detour_of(place, place.layout.scope.entry)
+        entries = tracee.count_to_end(place.image(tracee).address(place.kernel_scope.entry))
+        detour = detour_of(place, place.kernel_scope.entry)
         spent: dict[str, list[float]] = {way: [] for way in WAYS}
         for number in range(rounds):
             for way in WAYS if number % 2 else reversed(WAYS):

@@ -71,20 +71,13 @@ Stage = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _PreparedInput:
-    """One input of a target before its first fault."""
-
-    golden: Golden
-    profile: TargetProfile | None  # None for time rules
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRuns:
     """All runs of one target, in order of their numbers, with the profiles they were drawn from."""
 
     target: AttackTarget
     context: Mapping[str, Any]  # entries of every record about the target
-    inputs: tuple[_PreparedInput, ...]
+    goldens: tuple[Golden, ...]  # of each input
+    profiles: tuple[TargetProfile | None, ...]  # of each input; None for time rules
     records: tuple[Record, ...] = ()
     prepare_s: float
     wall_s: float = 0.0
@@ -92,20 +85,20 @@ class TargetRuns:
     @property
     def golden(self) -> Golden:
         """The golden run of the first input."""
-        return self.inputs[0].golden
+        return self.goldens[0]
 
     @property
     def profile(self) -> TargetProfile | None:
         """The profile of the first input."""
-        return self.inputs[0].profile
+        return self.profiles[0]
 
     def input_of(self, run: int) -> int:
         """The input that the fault of this number strikes."""
-        return run % len(self.inputs)
+        return run % len(self.goldens)
 
     def records_of(self, number: int) -> tuple[Record, ...]:
         """The runs on one input."""
-        return self.records[number :: len(self.inputs)]
+        return self.records[number :: len(self.goldens)]
 
 
 def run_campaign(
@@ -155,15 +148,19 @@ def _attack(
     with one_processor():
         prepared, place = _prepare(plan, target, stage, notice)
     stage(f"drawing {plan.runs} faults")
-    golden = tuple(each.golden for each in prepared.inputs)
-    bench = _Bench(plan=plan, target=target, golden=golden)
+    bench = _Bench(plan=plan, target=target, golden=prepared.goldens)
     workers.take(bench, place)
     planned = _draw(plan, bench, prepared)
     done: dict[int, Record] = {}
     if journal is not None:
         done = journal.runs_of(planned)
         journal.flush_plan("-".join(("faults", *target.stream)) + ".jsonl", planned)
-    for index, result in workers.run(bench, _tasks(planned, done)):
+    tasks = [
+        (index, record.fault_of(entry) if entry["trigger"] else None)
+        for index, entry in enumerate(planned)
+        if index not in done
+    ]
+    for index, result in workers.run(bench, tasks):
         done[index] = result.completed(planned[index])
         if journal is not None:
             journal.append(done[index])
@@ -198,10 +195,8 @@ def _prepare(
     prepared = TargetRuns(
         target=target,
         context=stream | place.context(),
-        inputs=tuple(
-            _PreparedInput(golden=run, profile=profile)
-            for run, profile in zip(golden, profiles, strict=True)
-        ),
+        goldens=golden,
+        profiles=tuple(profiles),
         prepare_s=time.perf_counter() - begun,
     )
     return prepared, place
@@ -226,9 +221,9 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
     chosen, records = plan.strategy(), []
     for index in range(plan.runs):
         number = prepared.input_of(index)
-        profile = prepared.inputs[number].profile
+        profile = prepared.profiles[number]
         what = {"run": index, "seed": plan.seed, "sampling": chosen.name, **prepared.context}
-        if len(prepared.inputs) > 1:
+        if len(prepared.goldens) > 1:
             what["input"] = number
         if profile is None:
             records.append({"version": record.VERSION, "state": "planned", "trigger": []} | what)
@@ -237,14 +232,6 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
         struck = replace(fault, corruption=None) if plan.null else fault
         records.append(record.planned(struck, profile.image, **what))
     return records
-
-
-def _tasks(planned: Sequence[Record], done: Mapping[int, Record]) -> list[Any]:
-    return [
-        (index, record.fault_of(entry) if entry["trigger"] else None)
-        for index, entry in enumerate(planned)
-        if index not in done
-    ]
 
 
 # -- worker processes
@@ -308,35 +295,24 @@ class _Bench:
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
 
-class _Open:
-    """The one target that a worker process keeps open between chunks."""
+_opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the one target of this process
 
-    stream: tuple[str, ...] | None = None
-    attackers: tuple[Attacker, ...] = ()
 
-    @classmethod
-    def of(cls, bench: _Bench) -> tuple[Attacker, ...]:
-        """The attackers of a bench: the open ones, or new ones in their place."""
-        if not cls.attackers or cls.stream != bench.target.stream:
-            cls.keep(bench, bench.target.open())
-        return cls.attackers
+def _keep_open(bench: _Bench, place: JudgedPlace) -> tuple[Attacker, ...]:
+    """Keep a place open for later chunks, and close the previous one."""
+    _close()
+    return _opened.setdefault(bench.target.stream, bench.attackers(place))
 
-    @classmethod
-    def keep(cls, bench: _Bench, place: JudgedPlace) -> None:
-        """Keep a place open for later chunks, and close the previous one."""
-        cls.close()
-        cls.attackers, cls.stream = bench.attackers(place), bench.target.stream
 
-    @classmethod
-    def close(cls) -> None:
-        if cls.attackers:
-            cls.attackers[0].place.close()
-            cls.attackers = ()
+def _close() -> None:
+    while _opened:
+        _opened.popitem()[1][0].place.close()
 
 
 def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     bench, tasks = job
-    attackers, results = _Open.of(bench), []
+    attackers = _opened.get(bench.target.stream) or _keep_open(bench, bench.target.open())
+    results = []
     for index, fault in tasks:
         attacker = attackers[index % len(attackers)]
         if fault is not None:
@@ -365,7 +341,7 @@ class _AttackWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        _Open.close()
+        _close()
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
         _give_up_processor()
@@ -373,7 +349,7 @@ class _AttackWorkers:
     def take(self, bench: _Bench, place: JudgedPlace) -> None:
         """Keep a place that was opened in this process, or close it if no worker here needs it."""
         if self._pool is None:
-            _Open.keep(bench, place)
+            _keep_open(bench, place)
         else:
             place.close()
             _give_up_processor()

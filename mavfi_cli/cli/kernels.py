@@ -8,7 +8,7 @@ import math
 import os
 import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, 
 from mavfi_cli.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mavfi_cli.attack.campaign import Plan, TargetRuns
+    from mavfi_cli.attack.campaign import Plan
     from mavfi_cli.attack.target import AttackTarget
 
 
@@ -107,11 +107,11 @@ def kernels(**options: Any) -> None:
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
         refuse_given(("kernel", "world", "world_seed"), "goes without --program")
-        _attack_program(options)
+        _attack(options)
     else:
         programs = "args compare ignore_lines stdin_file folder env memory scope function"
         refuse_given(programs.split(), "needs --program")
-        _attack_kernels(options)
+        _attack(options)
 
 
 def _plan(options: dict[str, Any]) -> Plan:
@@ -135,79 +135,56 @@ def _plan(options: dict[str, Any]) -> Plan:
     return plan
 
 
-def _attacked(
-    plan: Plan, targets: Sequence[AttackTarget], options: dict[str, Any], folder: Path | None
-) -> list[TargetRuns]:
+def _attack(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.campaign import run_campaign
     from mavfi_cli.cli.progress import runs_view
-
-    with runs_view([target.name for target in targets], plan.runs) as view:
-        return run_campaign(
-            plan,
-            targets,
-            jobs=options["jobs"],
-            folder=folder,
-            progress=view.show,
-            stage=view.stage,
-            notice=lambda text: view.note(f"warning: {text}"),
-        )
-
-
-def _attack_kernels(options: dict[str, Any]) -> None:
-    from mavfi_cli.attack.kernels.catalogue import select
-    from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets
-    from mavfi_cli.report.attacks import (
-        KERNEL_COLUMNS,
-        draw_kernel_plot,
-        save_runs,
-        summarise,
-        table,
-    )
-    from mavfi_cli.report.drawing import write_figure
-
-    plan, kernels, out = _plan(options), select(options["kernel"]), options["out"]
-    config = kernel_flight(options["world"], options["world_seed"])
-    with _folder(out) as folder:
-        click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
-        targets = kernel_targets(kernels, config, folder, options["tolerance"])
-        campaign = _attacked(plan, targets, options, folder)
-        summary = summarise(plan, campaign)
-        if out is not None:
-            save_runs(out, summary, campaign, KERNEL_COLUMNS)
-            write_figure(draw_kernel_plot(summary), out / "kernels.svg")
-    _tell(summary, table(summary), "kernels.json, kernels.csv, kernels.svg, runs.jsonl", options)
-
-
-@contextlib.contextmanager
-def _folder(out: Path | None) -> Iterator[Path]:
-    if out is not None:
-        yield out
-        return
-    with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
-        yield Path(scratch)
-
-
-def _attack_program(options: dict[str, Any]) -> None:
-    from mavfi_cli.report.attacks import (
-        PROGRAM_COLUMNS,
-        program_table,
-        save_runs,
-        summarise_program,
-    )
+    from mavfi_cli.report.attacks import save_runs, summarise, table
 
     plan, out = _plan(options), options["out"]
-    campaign = _attacked(plan, [_program(options)], options, out)
-    told = summarise_program(plan, campaign[0])
+    targets: Sequence[AttackTarget]
+    with contextlib.ExitStack() as leaving:
+        if options["program"] is not None:
+            folder, targets = out, [_program(options)]
+        else:
+            folder = out or Path(leaving.enter_context(tempfile.TemporaryDirectory()))
+            targets = _kernels(options, folder)
+        with runs_view([target.name for target in targets], plan.runs) as view:
+            campaign = run_campaign(
+                plan,
+                targets,
+                jobs=options["jobs"],
+                folder=folder,
+                progress=view.show,
+                stage=view.stage,
+                notice=lambda text: view.note(f"warning: {text}"),
+            )
+        summary = summarise(plan, campaign)
+        if out is not None:
+            files = ", ".join((*save_runs(out, summary, campaign), "runs.jsonl"))
+    if options["as_json"]:
+        click.echo(json.dumps(summary, indent=2))
+        return
+    click.echo(f"{table(summary)}\n")
     if out is not None:
-        save_runs(out, told, campaign, PROGRAM_COLUMNS)
-    summary = told["summary"]
-    _tell(summary, program_table(summary), "kernels.json, kernels.csv, runs.jsonl", options)
+        click.echo(f"Files  {out}: {files}")
+    else:
+        click.echo("Nothing is saved; --out FOLDER keeps records, tables and plots.")
+
+
+def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
+    from mavfi_cli.attack.kernels.catalogue import select
+    from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets
+
+    kernels = select(options["kernel"])
+    config = kernel_flight(options["world"], options["world_seed"])
+    click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
+    return kernel_targets(kernels, config, folder, options["tolerance"])
 
 
 def _program(options: dict[str, Any]) -> AttackTarget:
     from mavfi_cli.attack.comparison import OutputComparison
     from mavfi_cli.attack.program import ProgramTarget, absolute_arguments
-    from mavfi_cli.fi.tracer.spawn import Program, kept_environment
+    from mavfi_cli.fi.tracer.spawn import Program
 
     comparison = OutputComparison.of(
         options["compare"], tolerance=options["tolerance"], ignored=options["ignore_lines"]
@@ -218,7 +195,7 @@ def _program(options: dict[str, Any]) -> AttackTarget:
         raise ConfigError(str(error), key="args") from None
     command = Program.of(
         [options["program"], *absolute_arguments(arguments, Path.cwd(), comparison.files)],
-        environment=kept_environment() | dict(map(_variable, options["env"])),
+        variables=dict(map(_variable, options["env"])),
         stdin=(options["stdin_file"] or Path(os.devnull)).resolve(),
         memory_bytes=round(options["memory"] * (1 << 30)),
     )
@@ -236,17 +213,6 @@ def _variable(text: str) -> tuple[str, str]:
     if not name or not equals:
         raise ConfigError(f"{text!r} is not NAME=VALUE", key="env")
     return name, value
-
-
-def _tell(summary: dict[str, Any], table: str, files: str, options: dict[str, Any]) -> None:
-    if options["as_json"]:
-        click.echo(json.dumps(summary, indent=2))
-        return
-    click.echo(table)
-    if options["out"] is not None:
-        click.echo(f"\nFiles  {options['out']}: {files}")
-    else:
-        click.echo("\nNothing is saved; --out FOLDER keeps records, tables and plots.")
 
 
 def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:

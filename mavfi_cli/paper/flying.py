@@ -19,8 +19,7 @@ from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
-from mavfi_cli.report.attacks import KERNEL_COLUMNS, draw_kernel_plot, save_runs, summarise
-from mavfi_cli.report.drawing import write_figure
+from mavfi_cli.report.attacks import save_runs, summarise
 
 _TELLING = 0.05  # share of the missions that must be over for a forecast
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
@@ -273,6 +272,4 @@ class _KernelRuns:
             progress=show,
             notice=lambda text: spectator.on_note(f"warning: {text}"),
         )
-        summary = summarise(plan, campaign)
-        save_runs(self.folder, summary, campaign, KERNEL_COLUMNS)
-        write_figure(draw_kernel_plot(summary), self.folder / "kernels.svg")
+        save_runs(self.folder, summarise(plan, campaign), campaign)

@@ -15,7 +15,7 @@ from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.report.columns import blocks, csv_text
-from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame
+from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
 from mavfi_cli.stats.shares import Cluster, clustered_share
 
 if TYPE_CHECKING:
@@ -66,15 +66,15 @@ def _share(runs: TargetRuns, hits: Sequence[bool], *, of_all: bool = False) -> d
     for run, (hit, entry) in enumerate(zip(hits, runs.records, strict=True)):
         if of_all or entry["outcome"] != RunOutcome.NOT_INJECTED.value:
             number = runs.input_of(run)
-            profile = runs.inputs[number].profile
+            profile = runs.profiles[number]
             window = None if profile is None else profile.window_of(entry)
             windows.append(window and ((number, window[0]), window[1]))
             chosen.append(hit)
     sampled = {
         (number, stratum): count
-        for number, each in enumerate(runs.inputs)
-        if each.profile is not None
-        for stratum, count in each.profile.sampled.items()
+        for number, profile in enumerate(runs.profiles)
+        if profile is not None
+        for stratum, count in profile.sampled.items()
     }
     share = clustered_share(chosen, windows, sampled)
     return {
@@ -110,11 +110,22 @@ def _count_lines(counts: Mapping[str, Any], indent: str) -> Iterator[str]:
             yield f"{indent}{title.replace('_', ' ')}: {parts}"
 
 
+def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
+    """Summarise a campaign on kernels or on a program as plain values."""
+    if isinstance(campaign[0].target, KernelTarget):
+        return _kernels(plan, campaign)
+    return _program(plan, campaign[0])
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """Format a summary: one row a kernel, or one row an outcome of a program."""
+    return _kernel_table(summary) if "kernels" in summary else _program_table(summary)
+
+
 # -- kernels
 
 
-def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
-    """Summarise a campaign on kernels as plain values."""
+def _kernels(plan: Plan, campaign: Sequence[TargetRuns]) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "plan": plan.to_json(campaign[0].target),
@@ -135,7 +146,7 @@ def _kernel(runs: TargetRuns) -> dict[str, Any]:
         "title": kernel.title,
         "runs": len(records),
         "scope": runs.context["scope"],
-        "inputs": [_input(runs, number) for number in range(len(runs.inputs))],
+        "inputs": [_input(runs, number) for number in range(len(runs.goldens))],
         **_counts(runs),
         "sdc_relative": {
             "median": finite[len(finite) // 2] if finite else None,
@@ -153,8 +164,8 @@ def _kernel(runs: TargetRuns) -> dict[str, Any]:
 
 def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
     """One input of a kernel: how much of its run was profiled, and what became of its runs."""
-    records, profile = runs.records_of(number), runs.inputs[number].profile
-    golden = runs.inputs[number].golden
+    records, profile = runs.records_of(number), runs.profiles[number]
+    golden = runs.goldens[number]
     length = None if profile is None else profile.instructions
     return {
         "population": "moments of one call" if profile is None else profile.in_words(),
@@ -195,8 +206,7 @@ def _parts(records: Sequence[Record]) -> dict[str, Any]:
     }
 
 
-def table(summary: Mapping[str, Any]) -> str:
-    """Format the summary: one row a kernel, shares of injected runs with 95 % intervals."""
+def _kernel_table(summary: Mapping[str, Any]) -> str:
     head = ["kernel", "runs", *(outcome.title for outcome in _SHOWN)]
     rows = [
         [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
@@ -247,19 +257,6 @@ def _notes(kernel: Mapping[str, Any]) -> list[str]:
 # -- a program
 
 
-def summarise_program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
-    """Summarise a campaign on one program as plain values, with golden run and all records."""
-    return {
-        "summary": _program(plan, runs),
-        "golden": {
-            "exit_code": runs.golden.exit_code,
-            "cpu_s": runs.golden.cpu_s,
-            "wall_s": runs.golden.wall_s,
-        },
-        "runs": list(runs.records),
-    }
-
-
 def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
     profile = runs.profile
     return {
@@ -279,8 +276,7 @@ def _program(plan: Plan, runs: TargetRuns) -> dict[str, Any]:
     }
 
 
-def program_table(summary: Mapping[str, Any]) -> str:
-    """Format the summary of a program: one row an outcome."""
+def _program_table(summary: Mapping[str, Any]) -> str:
     lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
     for name, row in summary["outcomes"].items():
         share = "-" if row["share"] is None else f"{100 * row['share']:.1f} %"
@@ -307,18 +303,31 @@ def _how(summary: Mapping[str, Any]) -> str:
 
 
 def save_runs(
-    folder: Path, told: Mapping[str, Any], campaign: Iterable[TargetRuns], columns: Sequence[str]
-) -> None:
-    """Write kernels.csv, a line a run, and kernels.json, the summary.
+    folder: Path, summary: Mapping[str, Any], campaign: Sequence[TargetRuns]
+) -> Sequence[str]:
+    """Write kernels.csv, a line a run, and kernels.json, the summary; of kernels a picture too.
 
-    Entries without a value are empty.
+    Entries without a value are empty. The JSON of a program has its golden run and all runs.
+
+    Returns:
+        The names of the files.
 
     Raises:
         RecordError: a file cannot be written.
     """
+    told, columns = summary, KERNEL_COLUMNS
+    if "kernels" not in summary:
+        (runs,) = campaign
+        golden = {name: getattr(runs.golden, name) for name in ("exit_code", "cpu_s", "wall_s")}
+        told = {"summary": summary, "golden": golden, "runs": list(runs.records)}
+        columns = PROGRAM_COLUMNS
     rows = (_cells(entry, columns) for runs in campaign for entry in runs.records)
     write_text(folder / "kernels.csv", csv_text(rows, columns))
     write_json(folder / KERNELS, told)
+    if "kernels" not in summary:
+        return KERNELS, "kernels.csv"
+    write_figure(_kernel_figure(summary), folder / "kernels.svg")
+    return KERNELS, "kernels.csv", "kernels.svg"
 
 
 def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:
@@ -341,7 +350,7 @@ _VISIBLE = 0.5  # per cent; minimum width of a drawn interval
 _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
-def draw_kernel_plot(summary: Mapping[str, Any]) -> Figure:
+def _kernel_figure(summary: Mapping[str, Any]) -> Figure:
     """Draw a figure with one bar per kernel and the shares of its injected runs in per cent."""
     kernels = summary["kernels"]
     figure = new_figure(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4)

@@ -15,7 +15,7 @@ from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program
-from mavfi_cli.report.attacks import program_table, summarise_program
+from mavfi_cli.report.attacks import summarise, table
 
 pytestmark = pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is missing")
 
@@ -59,10 +59,10 @@ def test_a_long_program_is_attacked_whole(native_program):
     assert [fault.trigger[-1].location.offset for fault in again] == [
         entry["offset"] for entry in runs.records
     ]
-    summary = summarise_program(plan, runs)["summary"]
+    summary = summarise(plan, [runs])
     assert summary["counted"]
     assert summary["not_reached"] < 0.02
-    assert "counted by callgrind; 0 % of the executions are not reached" in program_table(summary)
+    assert "counted by callgrind; 0 % of the executions are not reached" in table(summary)
 
 
 def test_it_tells_how_long_callgrind_counts_and_may_count(native_program, monkeypatch):

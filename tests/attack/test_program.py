@@ -28,7 +28,7 @@ from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.inject import BitActivation
 from mavfi_cli.fi.tracer.spawn import Program
 from mavfi_cli.fi.tracer.tracee import Mechanism
-from mavfi_cli.report.attacks import PROGRAM_COLUMNS, summarise_program
+from mavfi_cli.report.attacks import PROGRAM_COLUMNS, summarise
 
 QUICK = RunLimits(cpu_grace_s=0.1, wall_grace_s=3.0)
 
@@ -250,7 +250,7 @@ def test_debug_registers_give_the_same_faults_and_outcomes(target):
 @pytest.mark.parametrize("options", [{"rule": "cpu-time"}, {"compat": "rosfi-2021"}])
 def test_time_rules_name_themselves_and_count_what_they_miss(target, options):
     campaign = attacked(target("counting", "400000"), runs=8, seed=6, **options)
-    summary = summarise_program(Plan(runs=8, seed=6, **options), campaign)["summary"]
+    summary = summarise(Plan(runs=8, seed=6, **options), [campaign])
     assert summary["sampling"].startswith(next(iter(options.values())))
     assert sum(row["count"] for row in summary["outcomes"].values()) == 8
     for entry in campaign.records:

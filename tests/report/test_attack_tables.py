@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from mavfi_cli.attack.campaign import Plan
-from mavfi_cli.report.attacks import summarise_program
+from mavfi_cli.report.attacks import summarise
 
 
 def outcomes(told, *, windows=None):
@@ -23,10 +23,10 @@ def outcomes(told, *, windows=None):
         )  # fmt: skip
     golden = SimpleNamespace(exit_code=0, cpu_s=0.0, wall_s=0.0)
     runs = SimpleNamespace(
-        records=records, context={}, golden=golden, profile=profile, wall_s=0.0,
-        inputs=[SimpleNamespace(profile=profile)], input_of=lambda _run: 0,
+        target=None, records=records, context={}, golden=golden, profile=profile, wall_s=0.0,
+        profiles=[profile], input_of=lambda _run: 0,
     )  # fmt: skip
-    return summarise_program(Plan(runs=len(told), seed=1), runs)["summary"]["outcomes"]
+    return summarise(Plan(runs=len(told), seed=1), [runs])["outcomes"]
 
 
 def test_not_injected_runs_are_no_part_of_the_other_shares():

@@ -35,14 +35,6 @@ _PROGRAM = "mavfi_cli.attack.kernels.template"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Layout:
-    """Memory layout of a kernel's runs, the same in every template."""
-
-    scope: KernelScope
-    image: Image
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class KernelTarget:
     """A kernel and its inputs.
 
@@ -84,15 +76,6 @@ class KernelTarget:
         return KernelPlace(self)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _CallOutput:
-    """The result of a run: the times of its call, and its packed output or its error."""
-
-    cpu_s: float
-    wall_s: float
-    data: bytes
-
-
 class KernelPlace:
     """Runs one kernel in forks of one template; use it only in the thread that made it.
 
@@ -118,7 +101,8 @@ class KernelPlace:
             self._template = ServedProcess(_PROGRAM, output=self._output)
             undo.callback(self._template.kill)
             count = self._template.begin((target.kernel, inputs), self.name)
-            self.layout = self._look_up()
+            self.kernel_scope = self._find_scope()
+            self._image = Image(self._template.pid, self.kernel_scope.regions)
             self._closing = undo.pop_all()
         self._target, self._number = target, 0
         self.inputs = [self]
@@ -126,15 +110,14 @@ class KernelPlace:
             self.inputs.append(copy.copy(self))
             self.inputs[-1]._number = len(self.inputs) - 1
 
-    def _look_up(self) -> _Layout:
-        """Find the memory layout."""
-        process = self._template
-        process.connection.send(ASK_SCOPE)
+    def _find_scope(self) -> KernelScope:
+        self._template.connection.send(ASK_SCOPE)
         try:
-            scope: KernelScope = receive(process.connection)
+            scope: KernelScope = receive(self._template.connection)
         except (OSError, EOFError):
-            raise TargetError(self.name, f"cannot be attacked: {process.last_words()}") from None
-        return _Layout(scope=scope, image=Image(process.pid, scope.regions))
+            said = self._template.last_words()
+            raise TargetError(self.name, f"cannot be attacked: {said}") from None
+        return scope
 
     def start(self) -> Tracee:
         """Start a run, attached and stopped, that has not called the kernel yet.
@@ -155,15 +138,15 @@ class KernelPlace:
 
     def image(self, _: Tracee) -> Image:
         """The memory image of a run, the same for all runs."""
-        return self.layout.image
+        return self._image
 
     def scope(self, image: Image) -> Scope:
         """The code that may be hit."""
-        return image.scope(self.layout.scope.objects)
+        return image.scope(self.kernel_scope.objects)
 
     def context(self) -> dict[str, Any]:
         """Entries of every record about the kernel."""
-        objects = list(self.layout.scope.objects)
+        objects = list(self.kernel_scope.objects)
         return {"scope": objects, "inputs_sha256": self._target.inputs_sha256}
 
     def profile(
@@ -177,7 +160,7 @@ class KernelPlace:
             TargetError: the kernel never enters its native code.
             WindowTooLong: too many instructions.
         """
-        scope = self.layout.scope
+        scope = self.kernel_scope
         return profile_run(
             self,
             rng,
@@ -198,26 +181,26 @@ class KernelPlace:
         output = self.left()
         if output is None or ended.exit_code != 0:
             how = f"signal {ended.signal}" if ended.signal else f"exit code {ended.exit_code}"
-            text = output.data.decode(errors="replace") if output else how
+            text = output.output.decode(errors="replace") if output else how
             raise TargetError(self.name, f"fails without a fault: {text}")
-        return Golden(output=output.data, cpu_s=output.cpu_s, wall_s=output.wall_s)
+        return output
 
     def unlike(self, golden: Golden, again: Golden) -> str:
         """How two fault-free runs differ; empty if they are equal."""
         return "" if golden.output == again.output else "their outputs differ"
 
-    def left(self) -> _CallOutput | None:
-        """The result of the ended run; None if it is not complete."""
+    def left(self) -> Golden | None:
+        """Times and output, or error, of the ended run; None if it is not complete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None
         cpu_s, wall_s = TIMES.unpack_from(data)
-        return _CallOutput(cpu_s=cpu_s, wall_s=wall_s, data=data[TIMES.size :])
+        return Golden(output=data[TIMES.size :], cpu_s=cpu_s, wall_s=wall_s)
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None if it exceeded its limit."""
-        output = self.left()
-        left = None if output is None or ended is None else output.data
+        run = None if ended is None else self.left()
+        left = None if run is None else run.output
         tolerance = self._target.tolerance or None
         outcome, difference = judged(golden, ended, left, self._compare, tolerance=tolerance)
         raised = left is not None and ended is not None and ended.exit_code == RAISED

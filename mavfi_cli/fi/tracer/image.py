@@ -72,14 +72,6 @@ class _ElfFacts:
         last = self.functions[end - 1]
         return None if last.size and address >= last.start + last.size else last
 
-    def function(self, name: str) -> Function | None:
-        """The first function of exactly this name."""
-        return next((each for each in self.functions if each.name == name), None)
-
-    def functions_with(self, *parts: str) -> list[Function]:
-        """The functions whose names contain one of the texts, ascending."""
-        return [each for each in self.functions if any(part in each.name for part in parts)]
-
 
 @functools.lru_cache(maxsize=256)
 def _elf_facts(path: str, _modified_ns: int) -> _ElfFacts:
@@ -156,14 +148,14 @@ class Location:
         return f"{self.object}+{self.offset:#x}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _FileMapping:
-    """One line of /proc/PID/maps that belongs to a file."""
+class _Mapping(NamedTuple):
+    """One line of /proc/PID/maps."""
 
     start: int
     end: int
-    file_offset: int
-    path: str
+    access: str
+    offset: int  # in the file
+    path: str  # empty for memory without a name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,8 +165,6 @@ class _LoadedObject:
     name: str
     facts: _ElfFacts | None  # None for a region
     bias: int  # address = bias + offset
-    start: int
-    end: int
     build_id: str
     text: tuple[range, ...]  # offsets
 
@@ -182,6 +172,11 @@ class _LoadedObject:
     def path(self) -> str | None:
         """Path of its file; None for a region."""
         return None if self.facts is None else self.facts.path
+
+    @property
+    def functions(self) -> tuple[Function, ...]:
+        """All functions, ascending; a region has none."""
+        return () if self.facts is None else self.facts.functions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,7 +218,10 @@ class Image:
             regions: by name, the addresses of compiled code without a file, and the parts of loaded
                 objects that count as their text.
         """
-        self._files = _files(pid)
+        self._files: dict[str, list[_Mapping]] = {}
+        for mapping in _mappings(pid):
+            if mapping.path.startswith("/"):
+                self._files.setdefault(mapping.path, []).append(mapping)
         self._paths: dict[str, str] = {}
         for path in self._files:
             self._paths.setdefault(Path(path).name, path)
@@ -234,7 +232,11 @@ class Image:
             else:
                 region = what if isinstance(what, Region) else Region(span=what)
                 self._loaded[name] = _region(pid, name, region)
-        regions_of_code = [(o.start, o.end, name) for name, o in self._loaded.items() if o]
+        regions_of_code = [
+            (region.bias, region.bias + region.text[0].stop, region.name)
+            for region in self._loaded.values()
+            if region is not None and region.facts is None
+        ]
         spans = [
             (min(m.start for m in mappings), max(m.end for m in mappings), Path(path).name)
             for path, mappings in self._files.items()
@@ -310,12 +312,10 @@ class Image:
         """
         known: list[str] = []
         for loaded in map(self.named, objects):
-            if loaded.facts is None:
-                continue
-            found = loaded.facts.function(name)
+            found = next((each for each in loaded.functions if each.name == name), None)
             if found is not None:
                 return Location(loaded.name, found.start)
-            known += [function.name for function in loaded.facts.functions]
+            known += [function.name for function in loaded.functions]
         raise UnknownName("function", name, known[:200])
 
     def scope(self, objects: Iterable[str]) -> Scope:
@@ -333,49 +333,38 @@ class Image:
         return Scope(objects=names, spans=tuple(sorted(spans, key=lambda span: span.start)))
 
 
+def _mappings(pid: int) -> Iterator[_Mapping]:
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        edges, access, offset, _, _, *path = line.split(maxsplit=5)
+        start, end = (int(edge, 16) for edge in edges.split("-"))
+        yield _Mapping(start, end, access, int(offset, 16), path[0] if path else "")
+
+
 def executable_mapping(pid: int, address: int) -> range:
     """The executable mapping that holds an address: the region of a just-in-time compiled kernel.
 
     Raises:
         FaultError: nothing executable is mapped there.
     """
-    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
-        edges, access = line.split(maxsplit=2)[:2]
-        low, high = (int(edge, 16) for edge in edges.split("-"))
-        if low <= address < high and "x" in access:
-            return range(low, high)
+    for mapping in _mappings(pid):
+        if mapping.start <= address < mapping.end and "x" in mapping.access:
+            return range(mapping.start, mapping.end)
     raise FaultError(f"no executable code at {address:#x} in process {pid}")
 
 
-def _files(pid: int) -> dict[str, list[_FileMapping]]:
-    found: dict[str, list[_FileMapping]] = {}
-    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
-        parts = line.split(maxsplit=5)
-        if len(parts) < 6 or not parts[5].startswith("/"):
-            continue
-        low, high = (int(edge, 16) for edge in parts[0].split("-"))
-        mapping = _FileMapping(start=low, end=high, file_offset=int(parts[2], 16), path=parts[5])
-        found.setdefault(parts[5], []).append(mapping)
-    return found
-
-
-def _load(path: str, mappings: list[_FileMapping]) -> _LoadedObject | None:
+def _load(path: str, mappings: list[_Mapping]) -> _LoadedObject | None:
+    """The object of a mapped file; None if it is not an ELF file."""
     if not Path(path).is_file():
         return None
-    with open(path, "rb") as stream:
-        if stream.read(4) != b"\x7fELF":
-            return None
     try:
         facts = _elf_facts(path, Path(path).stat().st_mtime_ns)
     except FaultError:
         return None
-    first = min(mappings, key=lambda mapping: mapping.file_offset)
+    first = min(mappings, key=lambda mapping: mapping.offset)
     return _LoadedObject(
         name=Path(path).name,
         facts=facts,
-        bias=first.start - first.file_offset - facts.first_segment,
-        start=min(mapping.start for mapping in mappings),
-        end=max(mapping.end for mapping in mappings),
+        bias=first.start - first.offset - facts.first_segment,
         build_id=facts.build_id,
         text=facts.text,
     )
@@ -392,8 +381,6 @@ def _region(pid: int, name: str, region: Region) -> _LoadedObject:
         name=name,
         facts=None,
         bias=span.start,
-        start=span.start,
-        end=span.stop,
         build_id=build_id,
         text=(range(len(span)),),
     )

@@ -55,6 +55,7 @@ class Program:
         *,
         directory: Path | None = None,
         environment: Mapping[str, str] | None = None,
+        variables: Mapping[str, str] | None = None,
         stdin: Path = Path(os.devnull),
         memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
@@ -63,6 +64,7 @@ class Program:
         Args:
             environment: by default those of our own variables that say where things are, in which
                 language to speak, and how many threads to start.
+            variables: more variables, or other values.
 
         Raises:
             TargetError: no such program, or it cannot be executed.
@@ -70,17 +72,17 @@ class Program:
         found = shutil.which(argv[0])
         if found is None:
             raise TargetError(argv[0], "no such program, or it is not executable")
-        chosen = kept_environment() if environment is None else environment
+        chosen = _kept_environment() if environment is None else environment
         return cls(
             argv=(str(Path(found).resolve()), *argv[1:]),
             directory=(directory or Path.cwd()).resolve(),
-            environment=tuple(sorted(chosen.items())),
+            environment=tuple(sorted({**chosen, **(variables or {})}.items())),
             stdin=stdin,
             memory_bytes=memory_bytes,
         )
 
 
-def kept_environment() -> dict[str, str]:
+def _kept_environment() -> dict[str, str]:
     """Our own environment without what changes from shell to shell: it lies in memory."""
     return {
         name: value

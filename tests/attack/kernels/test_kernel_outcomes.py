@@ -87,7 +87,7 @@ def fault_in_r10(place, profile, bit):
         instruction = decode(profile.code_at(address), address)
         if instruction.text.startswith("mov r10,"):
             return InstructionFault(
-                trigger=(CountedStop(place.layout.image.locate(address), 1),),
+                trigger=(CountedStop(place.image(None).locate(address), 1),),
                 execution=1,
                 instruction=instruction.text,
                 instruction_bytes=instruction.raw,

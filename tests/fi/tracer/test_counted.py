@@ -55,8 +55,11 @@ def seen(tracee, loaded):
     """All registers but the resume flag, what is mapped, and code and data of the program."""
     general = dict(enumerate(tracee.registers.general()))
     general[18] &= ~RESUME_FLAG
-    maps = [line.split()[0] for line in Path(f"/proc/{tracee.pid}/maps").read_text().splitlines()]
-    memory = tracee.memory.read(loaded.start, loaded.end - loaded.start)
+    lines = Path(f"/proc/{tracee.pid}/maps").read_text().splitlines()
+    maps = [line.split()[0] for line in lines]
+    own = [line.split()[0].split("-") for line in lines if line.endswith(loaded.path)]
+    start, end = int(own[0][0], 16), int(own[-1][1], 16)
+    memory = tracee.memory.read(start, end - start)
     return general, tracee.registers.extended(), maps, memory
 
 
