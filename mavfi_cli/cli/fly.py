@@ -226,7 +226,6 @@ def _mission_of(path: Path | None) -> MissionConfig:
 
 
 def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
-    """The mission with the given options in place."""
     from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
 
     fault, instruction = _faults(base, given)
@@ -279,7 +278,6 @@ def _faults(
 
 
 def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig | None:
-    """The mission's detector."""
     from mavfi_cli.spec.detector import DetectorConfig
 
     name = given.get("detector", None if base.detector is None else base.detector.name)

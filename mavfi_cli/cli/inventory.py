@@ -181,7 +181,6 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
 
 
 def _explained(stack: Stack) -> Iterator[str]:
-    """All keys with value and source."""
     base = f"; the other values from {stack.base}" if stack.base else ""
     yield from textwrap.wrap(_title(stack) + base, WIDTH)
     start = 2 + _KEY + _VALUE

@@ -378,7 +378,6 @@ class Companion:
         follower.settle(lambda m: m is self.report or m is copy or self.pilot.holds(m))
 
     def _check_starts(self, inputs: CollisionInputs, start_s: float) -> None:
-        """Note that the collision check has read its trajectory."""
         self._follower.read(inputs.trajectory, "collision_check", start_s, CHECKED_STATES)
 
     # Restarts of nodes

@@ -410,7 +410,6 @@ class Flight:
     # Outcome --------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Set the outcome if the mission has ended."""
         if self.outcome is not None:
             return
         session, companion = self._session, self.companion

@@ -194,5 +194,4 @@ def kernel_targets(
 
 
 def _flight_name(config: MissionConfig) -> str:
-    """Describe a golden run in words."""
     return f"golden flight: world {config.world}, seed {config.seed}"

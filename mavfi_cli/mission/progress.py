@@ -127,7 +127,6 @@ class FlightLogger:
             )
 
     def _tell_of(self, companion: Companion, stamp_s: float, session: OffboardSession) -> None:
-        """Log alarms, losses of nodes, and a new mode of the pilot."""
         for text in companion.protection.news():
             self.note(stamp_s, "alarm", text, session.state)
             session.announce(text)

@@ -93,7 +93,6 @@ def fly_mission(
 
 
 def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
-    """Load and compile everything that the companion will run."""
     detector = config.detector
     known = detector is None or protection.is_compiled(detector, config.stack)
     if not (warm.is_compiled() and known):
@@ -110,7 +109,6 @@ def _injection(
     repeat: Mapping[str, Any] | None,
     for_debugger: Callable[[int], None] | None,
 ) -> Iterator[NoInjection]:
-    """Create the instruction-level fault of a mission and start its node's process."""
     if config.instruction is None:
         yield NoInjection()
         return
@@ -233,7 +231,6 @@ def _write(
 
 
 def _nodes(companion: Companion) -> dict[str, Any]:
-    """Return the counters of the kernels, and the ends of their processes."""
     nodes, losses = companion.executor.nodes, companion.executor.losses
     return {
         "kernels": {
@@ -276,10 +273,7 @@ def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
 
 
 def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
-    """Fly a mission that is of no use unless it is flown to its end.
-
-    Args:
-        options: As for `fly_mission`.
+    """Fly a mission that is of no use unless it is flown to its end. Options as for `fly_mission`.
 
     Raises:
         Interrupted: The user ended it. Nothing of it is kept.
@@ -293,10 +287,9 @@ def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
 
 
 def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
-    """Fly a golden run, from which faults or inputs are drawn.
+    """Fly a golden run, from which faults or inputs are drawn. Raises as `fly_to_end`.
 
     Raises:
-        Interrupted, MavfiError: As for `fly_to_end`.
         VehicleProcessError: The vehicle died, so there is nothing to draw from.
     """
     flown = fly_to_end(config, out, recorder=recorder)
@@ -306,15 +299,10 @@ def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
 
 
 def fly_again(run: Run, out: Path, *, with_fault: bool = True, **options: Any) -> Run:
-    """Repeat a run, or fly its golden run if `with_fault` is False.
-
-    Args:
-        out: Parent of the new run folder.
-        options: As for `fly_mission`.
+    """Repeat a run, or fly its golden run. Arguments as for `fly_mission`, raises as `fly_to_end`.
 
     Raises:
         RecordError: The run is not repeatable.
-        Interrupted, MavfiError: As for `fly_to_end`.
     """
     from mavfi_cli.fi.tracer.record import read
 
@@ -324,14 +312,11 @@ def fly_again(run: Run, out: Path, *, with_fault: bool = True, **options: Any) -
 
 
 def watch_again(run: Run) -> tuple[Recorder, bool]:
-    """Repeat a run to see what its nodes received. Nothing of the repetition is kept.
+    """Repeat a run to see what its nodes received. Nothing of it is kept. Raises as `fly_again`.
 
     Returns:
         Inputs of all nodes, and whether the repetition has the same trace, as it has unless the
         software or the machine differs.
-
-    Raises:
-        RecordError, Interrupted, MavfiError: As for `fly_again`.
     """
     recorder = Recorder()
     with tempfile.TemporaryDirectory(prefix="mavfi-again-") as scratch:

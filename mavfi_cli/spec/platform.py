@@ -152,12 +152,12 @@ def load_platform(name_or_path: str) -> PlatformProfile:
     path = PLATFORMS.path(name_or_path)
     file = load_toml(path, _PlatformFile)
     base = load_platform(PLATFORMS.base(file.base, path)) if file.base else None
-    about = {
-        "kernels": _kernels(file, base, path),
-        "sources": {**_given(file, path), **file.sources},
-    }
     values = {each.name: getattr(file, each.name) for each in fields(file) if each.name != "scale"}
-    given = {key: value for key, value in {**values, **about}.items() if value is not None}
+    given = {key: value for key, value in values.items() if value is not None}
+    own = () if path.parent == PLATFORMS.folder else ("cores", *HARDWARE)
+    set_here = {key: f"set in {path.name}" for key in own if key in given}
+    given["sources"] = {**set_here, **file.sources}
+    given["kernels"] = _kernels(file, base, path)
     try:
         return PlatformProfile(**given)
     except ValueError as error:
@@ -199,34 +199,25 @@ def _measured(factor: float) -> PlatformProfile:
     )
 
 
-def _given(file: _PlatformFile, path: Path) -> dict[str, str]:
-    """Return a source for each number that a file gives without one."""
-    named = [key for key in ("cores", *HARDWARE) if getattr(file, key) is not None]
-    if path.parent == PLATFORMS.folder:
-        return {}
-    return dict.fromkeys(named, f"set in {path.name}")
-
-
 def _kernels(
     file: _PlatformFile, base: PlatformProfile | None, path: Path
 ) -> dict[str, _KernelLatency]:
     """Return the latency of each kernel: its own entry, or the base's times the file's factor."""
     based = {} if base is None else base.kernels
-    entries = {name: _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
-               for name in based}  # fmt: skip
+    scaled = _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
     kernels = {}
-    for name, entry in {**entries, **file.kernels}.items():
-        under = based.get(name, _KernelLatency(latency_s=0.0))
-        latency_s, source = entry.latency_s, entry.source or f"set in {path.name}"
+    for name, entry in {**dict.fromkeys(based, scaled), **file.kernels}.items():
+        latency_s, spread = entry.latency_s, entry.spread
+        source = entry.source or f"set in {path.name}"
         if entry.scale is not None:
             if base is None:
                 raise ConfigError("scale needs a base", path=path, key=f"kernels.{name}")
-            latency_s = entry.scale * under.latency_s
-            source = f"{file.base} x {entry.scale:g}" + (
-                f": {entry.source}" if entry.source else ""
-            )
+            latency_s = entry.scale * based[name].latency_s
+            why = f": {entry.source}" if entry.source else ""
+            source = f"{file.base} x {entry.scale:g}{why}"
+        if spread is None:
+            spread = based[name].spread if name in based else 0.0
         assert latency_s is not None
-        spread = under.spread if entry.spread is None else entry.spread
         try:
             kernels[name] = _KernelLatency(latency_s=latency_s, spread=spread, source=source)
         except ValueError as error:

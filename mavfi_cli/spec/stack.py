@@ -11,7 +11,6 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -167,9 +166,8 @@ def load_stack(text: str) -> Stack:
 
     Raises:
         UnknownName: No shipped stack has this name, and it is not a path to a TOML file.
-        ConfigError: No stack has this key. Suggests the nearest.
-        ConfigError: The file or a value cannot be used, a key is missing, or the stack is
-            inconsistent.
+        ConfigError: No stack has this key, the file or a value cannot be used, a key is missing, or
+            the stack is inconsistent.
     """
     name, colon, changes = text.partition(":")
     path = STACKS.path(name)
@@ -177,7 +175,12 @@ def load_stack(text: str) -> Stack:
     stack = structure(values, Stack, path=path, text=source)
     if not colon:
         return stack
-    changed = _changes(changes)
+    try:
+        changed = tomllib.loads("\n".join(_PAIR.split(changes)))
+    except tomllib.TOMLDecodeError:
+        raise ConfigError(
+            f"expected KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}", key="stack"
+        ) from None
     sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
     about = {"name": text, "base": name, "description": "", "sources": sources}
     return structure({**values, **changed, **about}, Stack)  # its errors are not the file's
@@ -186,14 +189,13 @@ def load_stack(text: str) -> Stack:
 def _values(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a file and its base, and the file's text."""
     values, text = read_toml(path)
-    _require_known(values, path)
     own = {} if path.parent == STACKS.folder else dict.fromkeys(KEYS, f"set in {path.name}")
     about = {"name": path.stem, "description": ""}
     inherited: dict[str, Any] = {}
     if values.get("base", ""):
         base = STACKS.base(values["base"], path)
         inherited, _ = _values(STACKS.folder / f"{base}.toml")
-    elif missing := [key for key in KEYS if key not in values]:
+    elif values.keys() <= {*KEYS, *_ABOUT} and (missing := [k for k in KEYS if k not in values]):
         raise ConfigError(
             f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}: missing; "
             f"base = NAME takes missing values from a stack: {', '.join(STACKS.names)}",
@@ -203,21 +205,3 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
     given = {key: why for key, why in own.items() if key in values}
     sources = {**kept, **given, **values.get("sources", {})}
     return {**inherited, **about, **values, "sources": sources}, text
-
-
-def _changes(text: str) -> dict[str, Any]:
-    """Parse `KEY=VALUE,KEY=VALUE`."""
-    try:
-        values = tomllib.loads("\n".join(_PAIR.split(text)))
-    except tomllib.TOMLDecodeError:
-        raise ConfigError(
-            f"expected KEY=VALUE,KEY=VALUE after the stack's name, got {text!r}", key="stack"
-        ) from None
-    _require_known(values, None)
-    return values
-
-
-def _require_known(values: Mapping[str, Any], path: Path | None) -> None:
-    for key in values:
-        if key not in (*KEYS, *_ABOUT):
-            raise ConfigError.unknown_key(key, (*KEYS, *_ABOUT), path=path)

@@ -78,7 +78,12 @@ def _plan_fault(
     briefing, all_orders = _kept(folder / "orders.pickle", fly)
     setup = Setup.of(config, briefing, node)
     orders = all_orders.get(node, [])
-    counts = _kept(folder / f"entries-{kernel}.pickle", lambda: _count_entries(setup, orders))
+
+    def count() -> list[int]:
+        with contextlib.closing(Rehearsal(setup)) as place:
+            return place.count_entries(orders)
+
+    counts = _kept(folder / f"entries-{kernel}.pickle", count)
     if not counts or not counts[-1]:
         raise FaultError(
             f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
@@ -182,18 +187,34 @@ class Rehearsal:
 
     kind = "node"
 
-    def __init__(self, setup: Setup, orders: Sequence[_Order], entry: int = 1) -> None:
+    def __init__(self, setup: Setup, orders: Sequence[_Order] = (), entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
-        self._last = orders[-1]
+        self._last = orders[-1:]
         self._spawned = ServedProcess.of(PROGRAM)
         with contextlib.ExitStack() as undo:
             undo.callback(self.close)
             self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
             self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
-            for value, start_s in orders[:-1]:
-                self._process.take(self._process.order(setup.node, value, start_s))
+            for order in orders[:-1]:
+                self._work(order)
             self._image = Image(self._spawned.pid, self.scope_of_node.regions)
             undo.pop_all()
+
+    def _work(self, order: _Order) -> None:
+        self._process.take(self._process.order(self._setup.node, *order))
+
+    def count_entries(self, orders: Sequence[_Order]) -> list[int]:
+        """Count the kernel's entries up to the end of each order.
+
+        Raises:
+            TracingForbidden: the operating system neither counts nor lets us trace.
+        """
+        counts, address = [], self._image.address(self.scope_of_node.entry)
+        with contextlib.closing(EntryCounter(self._spawned.pid, address)) as counter:
+            for order in orders:
+                self._work(order)
+                counts.append(counter.read())
+        return counts
 
     @property
     def name(self) -> str:
@@ -203,7 +224,7 @@ class Rehearsal:
     def start(self) -> Tracee:
         """Start a fork of the node, stopped where it begins the invocation."""
         tracee = Tracee.attach(self._process.rehearse())
-        self._process.order(self._setup.node, *self._last)
+        self._process.order(self._setup.node, *self._last[0])
         if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
             raise TargetError(f"node {self._setup.node}", "does not begin its invocation again")
         return tracee
@@ -223,39 +244,23 @@ class Rehearsal:
         """
         linux.share_processor(self._spawned.pid)
         node, inner = self._setup.node, self.scope_of_node.inner
-        if node == "planner":
-            return self._profile_request(rng)
         if node in _INNER_CALLS:
             return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
-        return profile_call(self, limit=_WHOLE_LIMIT)
-
-    def _profile_request(self, rng: np.random.Generator) -> TargetProfile:
-        """Step a whole request if it needs no search, else a sample of it.
-
-        No native function encloses a request: Python calls several compiled functions, with or
-        without a search. So the request ends with the run.
-        """
-        if not self._searches():
-            try:
-                return profile_run(self, rng, limit=_WHOLE_LIMIT)
-            except WindowTooLong:  # smoothing repeats its attempts
-                pass
-        return profile_run(
-            self,
-            rng,
-            markers=self.scope_of_node.inner,
-            windows=_WINDOWS,
-            enough=_ENOUGH,
-            limit=_WHOLE_LIMIT,
-        )
-
-    def _searches(self) -> bool:
+        if node != "planner":
+            return profile_call(self, limit=_WHOLE_LIMIT)
+        # No native function encloses a request: Python calls several compiled functions, with or
+        # without a search, which begins with the first of `inner`. So the request ends with the
+        # run. It is stepped whole if it needs no search.
         tracee = self.start()
         try:
-            search = self.scope_of_node.inner[0]
-            return tracee.count_to_end(self._image.address(search)) > 0
+            searches = tracee.count_to_end(self._image.address(inner[0])) > 0
         finally:
             tracee.kill()
+        if not searches:
+            with contextlib.suppress(WindowTooLong):  # smoothing repeats its attempts
+                return profile_run(self, rng, limit=_WHOLE_LIMIT)
+        several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
+        return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
 
     def close(self) -> None:
         """End the node."""
@@ -278,31 +283,9 @@ def profile_invocation(
         WindowTooLong: the invocation is too long to be stepped.
         TargetError: nothing in scope executes.
     """
-    place = Rehearsal(setup, orders, entry - earlier)
-    try:
+    with contextlib.closing(Rehearsal(setup, orders, entry - earlier)) as place:
         found = TracerThread(lambda _armed: place.profile(rng)).result()
-    finally:
-        place.close()
     return found.after(CountedStop(place.scope_of_node.entry, entry))
-
-
-def _count_entries(setup: Setup, orders: Sequence[_Order]) -> list[int]:
-    """Count the kernel's entries up to the end of each order.
-
-    Raises:
-        TracingForbidden: the operating system neither counts nor lets us trace.
-    """
-    spawned, counts = ServedProcess.of(PROGRAM), []
-    with contextlib.ExitStack() as leaving:
-        leaving.callback(spawned.kill)
-        scope = spawned.begin(setup, f"node {setup.node}")
-        address = Image(spawned.pid, scope.regions).address(scope.entry)
-        counter = leaving.enter_context(contextlib.closing(EntryCounter(spawned.pid, address)))
-        process = NodeProcess(spawned.connection, spawned.pid)
-        for value, start_s in orders:
-            process.take(process.order(setup.node, value, start_s))
-            counts.append(counter.read())
-    return counts
 
 
 # Flight -------------------------------------------------------------------------------------------
