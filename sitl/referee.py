@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,57 +32,11 @@ _TILT_RAD = math.radians(35.0)
 _AIRBORNE_M = 0.3  # height of the lowest corner above which the vehicle is in the air
 
 
-@dataclass(slots=True, kw_only=True)
-class _GroundRule:
-    """Classifies ground contacts from take-off to landing.
-
-    A vehicle in contact before its first take-off stands on the ground. A later contact is a crash
-    unless the flight controller was landing, taking off or disarmed, and the contact is within the
-    limits of a landing. The limits apply to the speed just before the contact.
-    """
-
-    half_m: tuple[float, float, float]  # half sides of the body box
-    _airborne: bool = False
-    _velocity_before_mps: Vector | None = None  # (3,) ENU
-
-    def crashed(
-        self,
-        position_enu_m: Vector,
-        quaternion_flu_enu: Vector,
-        velocity_enu_mps: Vector,
-        *,
-        on_ground: bool,
-        may_land: bool,
-    ) -> bool:
-        """Return True if the newest pose is a crash. Call it once per observation."""
-        lowest_m, tilt_rad = self._attitude(position_enu_m, quaternion_flu_enu)
-        before = self._velocity_before_mps
-        velocity = velocity_enu_mps if before is None else before
-        self._velocity_before_mps = velocity_enu_mps.copy()
-        if lowest_m > _AIRBORNE_M and not on_ground:
-            self._airborne = True
-            return False
-        if not self._airborne or not (on_ground or lowest_m <= 0.0):
-            return False
-        self._airborne = False
-        return not (may_land and _is_gentle(velocity, tilt_rad))
-
-    def _attitude(self, position: Vector, quaternion: Vector) -> tuple[float, float]:
-        """Return the height of the body's lowest corner, m, and the tilt of its up axis, rad."""
-        w, x, y, z = quaternion.tolist()
-        up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
-        parts = [abs(u) * half for u, half in zip(up, self.half_m, strict=True)]
-        reach = parts[0] + parts[1] + parts[2]  # `sum` rounds otherwise from Python 3.12 on
-        return float(position[2]) - reach, math.acos(max(-1.0, min(1.0, up[2])))
-
-
-def _is_gentle(velocity_mps: Vector, tilt_rad: float) -> bool:
-    horizontal_mps = math.hypot(velocity_mps[0], velocity_mps[1])
-    return (
-        -velocity_mps[2] <= _SINK_MPS
-        and horizontal_mps <= _HORIZONTAL_MPS
-        and tilt_rad <= _TILT_RAD
-    )
+class _Pose(NamedTuple):
+    stamp_s: float
+    position: Vector  # (3,) ENU
+    quaternion: Vector  # (4,) FLU -> ENU
+    velocity: Vector  # (3,) ENU
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,14 +88,12 @@ class Referee:
         self.collision: Collision | None = None
         self.distance_m = 0.0
         self.min_clearance_m = math.inf
-        length, width, height = body_box_m
         self._rows: list[tuple[float | Vector, ...]] = []
-        self._half = np.array([length, width, height]) / 2.0
+        self._half = np.array(body_box_m, dtype=np.float64) / 2.0
         self._boxes = np.array(world.boxes_enu_m)  # writable: one compiled signature
-        self._ground = _GroundRule(half_m=(length / 2.0, width / 2.0, height / 2.0))
-        self._stamp_s = 0.0
-        self._position: Vector | None = None
-        self._quaternion = level = np.array([1.0, 0.0, 0.0, 0.0])
+        self._airborne = False
+        self._last: _Pose | None = None
+        level = np.array([1.0, 0.0, 0.0, 0.0])
         # Load the compiled geometry now, so that the first tick does not stall in real time.
         clearance(np.zeros(3), level, self._half, self._boxes)
         sweep(np.zeros(3), level, np.zeros(3), level, self._half, self._boxes, 0.0)
@@ -182,11 +134,13 @@ class Referee:
         velocity = np.array(velocity_enu_mps, dtype=np.float64)
         if not math.isfinite(float(position.sum() + quaternion.sum())):
             raise VehicleProcessError(f"at {stamp_s:.3f} s the vehicle's state is not finite")
+        pose = _Pose(stamp_s, position, quaternion, velocity)
+        before, self._last = self._last or pose, pose
+        if armed:
+            self.distance_m += math.dist(before.position, position)
         may_land = may_land or not armed
-        crashed = self._ground.crashed(
-            position, quaternion, velocity, on_ground=on_ground, may_land=may_land
-        )
-        found = self._judge(stamp_s, position, quaternion, velocity, armed=armed, crashed=crashed)
+        crashed = self._crashes(before.velocity, pose, on_ground=on_ground, may_land=may_land)
+        found = None if self.collision is not None else self._hit(before, pose, crashed=crashed)
         if self._logs:
             gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
             powers = (power_regression_w, power_propeller_w)
@@ -195,36 +149,46 @@ class Referee:
             )
         return found
 
-    def _judge(
-        self,
-        stamp_s: float,
-        position: Vector,
-        quaternion: Vector,
-        velocity: Vector,
-        *,
-        armed: bool,
-        crashed: bool,
-    ) -> Collision | None:
-        before, attitude_before, since = self._position, self._quaternion, self._stamp_s
-        if before is None:
-            before, attitude_before, since = position, quaternion, stamp_s
-        self._position, self._quaternion, self._stamp_s = position, quaternion, stamp_s
-        if armed:
-            self.distance_m += math.dist(before, position)
-        if self.collision is not None:
-            return None
-        poses = (before, attitude_before, position, quaternion)
+    def _crashes(
+        self, velocity_before: Vector, pose: _Pose, *, on_ground: bool, may_land: bool
+    ) -> bool:
+        """Return True if the newest pose is a crash on the ground.
+
+        A vehicle in contact before its first take-off stands on the ground. A later contact is a
+        crash unless the flight controller was landing, taking off or disarmed, and the contact is
+        within the limits of a landing. The limits apply to the speed just before the contact.
+        """
+        w, x, y, z = pose.quaternion.tolist()
+        up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+        parts = [abs(u) * half for u, half in zip(up, self._half.tolist(), strict=True)]
+        reach = parts[0] + parts[1] + parts[2]  # `sum` rounds otherwise from Python 3.12 on
+        lowest_m = float(pose.position[2]) - reach
+        if lowest_m > _AIRBORNE_M and not on_ground:
+            self._airborne = True
+            return False
+        if not self._airborne or not (on_ground or lowest_m <= 0.0):
+            return False
+        self._airborne = False
+        is_gentle = (
+            -velocity_before[2] <= _SINK_MPS
+            and math.hypot(velocity_before[0], velocity_before[1]) <= _HORIZONTAL_MPS
+            and math.acos(max(-1.0, min(1.0, up[2]))) <= _TILT_RAD
+        )
+        return not (may_land and is_gentle)
+
+    def _hit(self, before: _Pose, now: _Pose, *, crashed: bool) -> Collision | None:
+        poses = (before.position, before.quaternion, now.position, now.quaternion)
         share, box, self.min_clearance_m = sweep(
             *poses, self._half, self._boxes, self.min_clearance_m
         )
         if box < 0 and not crashed:
             return None
         share = share if box >= 0 else 1.0
-        place = before + share * (position - before)
+        place = before.position + share * (now.position - before.position)
         self.collision = Collision(
-            stamp_s=since + share * (stamp_s - since),
+            stamp_s=before.stamp_s + share * (now.stamp_s - before.stamp_s),
             position_enu_m=(float(place[0]), float(place[1]), float(place[2])),
-            speed_mps=float(np.linalg.norm(velocity)),
+            speed_mps=float(np.linalg.norm(now.velocity)),
             box_index=int(box) if box >= 0 else None,
         )
         return self.collision
@@ -232,14 +196,9 @@ class Referee:
     def report(self, energies_j: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of the flight for JSON. An infinite clearance (no boxes) is None."""
         hit, least = self.collision, self.min_clearance_m
+        what = {} if hit is None else {**dataclasses.asdict(hit), "what": hit.what}
         return {
-            "collision": None
-            if hit is None
-            else {
-                **dataclasses.asdict(hit),
-                "position_enu_m": list(hit.position_enu_m),
-                "what": hit.what,
-            },
+            "collision": what or None,
             "min_clearance_m": least if math.isfinite(least) else None,
             "distance_m": self.distance_m,
             "energies_j": dict(energies_j or {}),

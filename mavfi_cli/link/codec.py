@@ -30,6 +30,7 @@ UNITS_PER_S = 100_000  # one unit is 10 us
 NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
 
 _TIMESTAMP_END = 2**48
+_LINK_ID = 0  # of our channel
 _RADIO_STATUS = 109  # sent by telemetry radios, which hold no key; the guide says to accept it
 
 MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
@@ -70,20 +71,11 @@ class Signing:
     Args:
         key: 32 secret bytes, see `key_from_passphrase`.
         clock: Function of seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
-        link_id: Id of this channel among those of the sender, 0..255.
-
-    Raises:
-        ValueError: The key does not have 32 bytes, or the link id is out of range.
     """
 
-    def __init__(self, key: bytes, clock: Callable[[], float], *, link_id: int = 0) -> None:
-        if len(key) != 32:
-            raise ValueError(f"a signing key has 32 bytes, not {len(key)}")
-        if not 0 <= link_id <= 255:
-            raise ValueError(f"a signing link id lies in 0..255, not {link_id}")
+    def __init__(self, key: bytes, clock: Callable[[], float]) -> None:
         self._key = key
         self._clock = clock
-        self._link_id = link_id
         self._next_timestamp = 0
         self._streams: dict[tuple[int, int, int], int] = {}
 
@@ -91,7 +83,7 @@ class Signing:
         """Return the 13-byte signature block of a frame (header to CRC, signed flag set)."""
         timestamp = max(self._now(), self._next_timestamp) % _TIMESTAMP_END
         self._next_timestamp = timestamp + 1
-        block = bytes([self._link_id]) + timestamp.to_bytes(6, "little")
+        block = bytes([_LINK_ID]) + timestamp.to_bytes(6, "little")
         return block + self._digest(frame + block)
 
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:

@@ -158,11 +158,6 @@ SILENCE_S = 5.0  # time after which another sender may take a silent one's place
 TWO_AUTOPILOTS = "two autopilots send here"
 
 
-def two_autopilots(address: str, rival_address: str) -> str:
-    """Return the text that tells the senders, also as a STATUSTEXT of a camera."""
-    return f"{TWO_AUTOPILOTS}, {address} and {rival_address}"
-
-
 class SenderSlot(Generic[Sender]):
     """The place of one sender. Another one may take it after 5 s of silence."""
 

@@ -7,7 +7,7 @@ Lockstep, real time and tests drive it the same way. Call `handle` with every re
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -35,6 +35,14 @@ _NO_YAW = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
 _CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _LARGEST_FLOAT32 = 3.4028234663852886e38
 
+_HEARD = (
+    dialect.MAVLINK_MSG_ID_TIMESYNC,
+    dialect.MAVLINK_MSG_ID_PING,
+    dialect.MAVLINK_MSG_ID_COMMAND_ACK,
+    dialect.MAVLINK_MSG_ID_HEARTBEAT,
+    dialect.MAVLINK_MSG_ID_STATUSTEXT,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET,
+)
 _HEARTBEAT_INTERVAL_S = 1.0
 _MAX_ANSWERS = 64  # maximum replies per tick; further requests are ignored
 _HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
@@ -198,22 +206,37 @@ class OffboardSession:
     def handle(self, message: Message) -> None:
         """Handle a received message. Messages for other receivers are ignored."""
         self.telemetry.handle(message)
-        handler = _HANDLERS.get(type(message).id)
-        if handler is not None:
-            handler(self, message)
-
-    def _acknowledged(self, message: Message) -> None:
-        if self._is_of_vehicle(message):
-            self._commands.acknowledge(message)
-            self._camera_heard = self._camera_heard or message.get_srcComponent() == _CAMERA
-
-    def _heartbeat(self, message: Message) -> None:
-        """Ask the camera for its information at its first HEARTBEAT, unless that has been done."""
-        if message.get_srcComponent() != _CAMERA or self._camera_heard:
+        number = type(message).id
+        if number not in _HEARD:
             return
-        if self._is_of_vehicle(message):
+        reply = None
+        if number == dialect.MAVLINK_MSG_ID_TIMESYNC:
+            if message.tc1 == 0:  # a request; the reply to one of our own needs none
+                reply = dialect.MAVLink_timesync_message(round(self._now_s * 1e9), message.ts1)
+        elif number == dialect.MAVLINK_MSG_ID_PING:
+            if message.target_system == message.target_component == 0:
+                asker = (message.get_srcSystem(), message.get_srcComponent())
+                reply = dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
+        elif self.telemetry.heard and message.get_srcSystem() == self.telemetry.system:
+            if number == dialect.MAVLINK_MSG_ID_COMMAND_ACK:
+                self._commands.acknowledge(message)
+            if message.get_srcComponent() == _CAMERA:
+                self._hear_camera(number, message)
+        if reply is not None and len(self._answers) < _MAX_ANSWERS:
+            self._answers.append(reply)
+
+    def _hear_camera(self, number: int, message: Message) -> None:
+        """Handle what the camera says, which has the referee of a foreign autopilot."""
+        if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET:
+            origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
+            if np.isfinite(origin).all():
+                self.telemetry.move_origin(origin)
+        elif number == dialect.MAVLINK_MSG_ID_STATUSTEXT:
+            self.telemetry.take_text(message)
+        else:
+            is_new = number == dialect.MAVLINK_MSG_ID_HEARTBEAT and not self._camera_heard
             self._camera_heard = True
-            if not self._settings.needs_camera:
+            if is_new and not self._settings.needs_camera:
                 self._ask_camera()
 
     def _ask_camera(self) -> None:
@@ -223,37 +246,6 @@ class OffboardSession:
             wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
         request = dialect.MAV_CMD_REQUEST_MESSAGE
         self._origin_asked = self._commands.submit(request, wanted, component=_CAMERA)
-
-    def _told_origin(self, message: Message) -> None:
-        if message.get_srcComponent() == _CAMERA and self._is_of_vehicle(message):
-            origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
-            if np.isfinite(origin).all():
-                self.telemetry.move_origin(origin)
-
-    def _camera_text(self, message: Message) -> None:
-        """Take a text of the camera, which has the referee of a foreign autopilot."""
-        if message.get_srcComponent() == _CAMERA and self._is_of_vehicle(message):
-            self.telemetry.take_text(message)
-
-    def _is_of_vehicle(self, message: Message) -> bool:
-        """Return True if a message comes from a component of the autopilot's system."""
-        return self.telemetry.heard and bool(message.get_srcSystem() == self.telemetry.system)
-
-    def _timesync(self, message: Message) -> None:
-        """Reply to a request; the reply to one of our own needs none."""
-        if message.tc1 == 0:
-            own_ns = round(self._now_s * 1e9)
-            self._answer(dialect.MAVLink_timesync_message(own_ns, message.ts1))
-
-    def _ping(self, message: Message) -> None:
-        if message.target_system == message.target_component == 0:
-            asker = (message.get_srcSystem(), message.get_srcComponent())
-            self._answer(dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker))
-
-    def _answer(self, answer: Message) -> None:
-        """Send a reply at the next tick, unless too many wait already."""
-        if len(self._answers) < _MAX_ANSWERS:
-            self._answers.append(answer)
 
     # Sent messages ------------------------------------------------------------------------------
 
@@ -463,12 +455,4 @@ _STEPS = {
     Phase.LANDING: OffboardSession._landing,
     Phase.DONE: OffboardSession._ended,
     Phase.FAILED: OffboardSession._ended,
-}
-_HANDLERS: dict[int, Callable[[OffboardSession, Message], None]] = {
-    dialect.MAVLINK_MSG_ID_COMMAND_ACK: OffboardSession._acknowledged,
-    dialect.MAVLINK_MSG_ID_HEARTBEAT: OffboardSession._heartbeat,
-    dialect.MAVLINK_MSG_ID_TIMESYNC: OffboardSession._timesync,
-    dialect.MAVLINK_MSG_ID_PING: OffboardSession._ping,
-    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: OffboardSession._told_origin,
-    dialect.MAVLINK_MSG_ID_STATUSTEXT: OffboardSession._camera_text,
 }

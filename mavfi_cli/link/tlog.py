@@ -17,7 +17,7 @@ from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length, frame_of
-from mavfi_cli.link.endpoint import two_autopilots
+from mavfi_cli.link.endpoint import TWO_AUTOPILOTS
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
@@ -146,7 +146,7 @@ class RecordedLink:
     def rivals(self) -> str:
         """Text about two autopilots that send to this end; "" without a second one."""
         rival = self._transport.rival_address
-        return two_autopilots(self._transport.address, rival) if rival else ""
+        return f"{TWO_AUTOPILOTS}, {self._transport.address} and {rival}" if rival else ""
 
     def receive(self, timeout_s: float) -> bytes:
         """Return the next bytes, or b"" after `timeout_s`.

@@ -132,7 +132,9 @@ class Autopilot:
     def set_home(self, place_ned_m: Vector) -> None:
         """Set the home position and broadcast it."""
         self.snapshot.home_ned_m = place_ned_m
-        self._announce_home()
+        for link in self._links:
+            link.hasten(dialect.MAVLINK_MSG_ID_HOME_POSITION, self.snapshot.stamp_us)
+            link.hasten(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, self.snapshot.stamp_us)
 
     def set_parameter(self, name: str, value: float) -> None:
         """Change a REAL32 parameter internally and broadcast it."""
@@ -203,14 +205,6 @@ class Autopilot:
         amsl = self.snapshot.amsl_m(float(self.snapshot.home_ned_m[2])) + height_m
         text = f"RTL: start return at {amsl:.0f} m ({height_m:.0f} m above destination)"
         self.commander.say(Severity.INFO, text)
-
-    def _announce_home(self) -> None:
-        for number in (
-            dialect.MAVLINK_MSG_ID_HOME_POSITION,
-            dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-        ):
-            for link in self._links:
-                link.hasten(number, self.snapshot.stamp_us)
 
     def _flush_texts(self) -> None:
         texts = self.commander.texts
@@ -297,18 +291,17 @@ class _Authority:
         After `silence_us` another sender may take over.
         """
         sender = (link, message.get_srcSystem(), message.get_srcComponent())
-        if self._holder not in (None, sender):
+        holder = self._holder
+        if holder is not None and holder != sender:
             if stamp_us - self._held_us <= silence_us:
-                self._tell(sender, f"Setpoints of {_name(sender)} ignored: {self._name} commands")
+                self._tell(
+                    sender, f"Setpoints of {_name(sender)} ignored: {_name(holder)} commands"
+                )
                 return False
-            self._say(Severity.WARNING, f"{_name(sender)} commands instead of {self._name}")
+            self._say(Severity.WARNING, f"{_name(sender)} commands instead of {_name(holder)}")
             self._told.clear()
         self._holder, self._held_us = sender, stamp_us
         return True
-
-    @property
-    def _name(self) -> str:
-        return "" if self._holder is None else _name(self._holder)
 
     def _tell(self, sender: _Sender, text: str) -> None:
         if sender not in self._told:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, quaternion_from_euler
 from mavfi_cli.link.codec import Codec, Signing, dialect, text_messages
-from mavfi_cli.link.endpoint import SenderSlot, parse_endpoint, two_autopilots
+from mavfi_cli.link.endpoint import TWO_AUTOPILOTS, SenderSlot, parse_endpoint
 from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID, Camera
 from sitl.firmware.autopilot import follows_companion
@@ -309,7 +309,8 @@ class Station:
         """Send the addresses of two autopilots, if both speak."""
         if slot.holder is None or slot.rival is None:
             return
-        text = two_autopilots(slot.holder.transport.address, slot.rival.transport.address)
+        holder, rival = slot.holder.transport.address, slot.rival.transport.address
+        text = f"{TWO_AUTOPILOTS}, {holder} and {rival}"
         slot.rival = None
         severity = dialect.MAV_SEVERITY_CRITICAL
         self._send(list(text_messages(severity, text.encode(), _TEXT_ID)))

@@ -173,7 +173,10 @@ class Px4Link:
         if self._steps % _FIX_STEPS == 0:
             messages.insert(0, self._hil_gps(stamp_us, truth))
         self._steps += 1
-        self._send(messages)
+        try:
+            self._transport.send(b"".join(map(self._codec.encode, messages)))
+        except LinkLost:
+            raise VehicleProcessError(_GONE) from None
         self._await_answer(stamp_us)
         return self._throttles
 
@@ -207,12 +210,6 @@ class Px4Link:
                 answered = message.time_usec
                 self._throttles = _throttles(message)
         return answered
-
-    def _send(self, messages: list[Message]) -> None:
-        try:
-            self._transport.send(b"".join(map(self._codec.encode, messages)))
-        except LinkLost:
-            raise VehicleProcessError(_GONE) from None
 
     def _hil_sensor(self, stamp_us: int, truth: Truth) -> Message:
         sensors, fields = self._sensors, _INERTIAL_FIELDS

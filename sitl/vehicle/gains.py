@@ -129,6 +129,9 @@ class RateLoops:
     def of(cls, profile: VehicleProfile) -> RateLoops:
         """Return the loops of a vehicle."""
         gains = gains_for(profile, 0.004)
+        shares = np.linspace(0.05, 1.0, 40)
+        commands = np.array([cascade.throttle(share, gains) for share in shares])
+        bend = commands**2 - commands
         inertia = gains[cascade.G_INERTIA : cascade.G_INERTIA + 3]
         thrust_n = 4.0 * float(gains[cascade.G_ROTOR_THRUST])
         return cls(
@@ -139,7 +142,7 @@ class RateLoops:
             yaw_nm=thrust_n * float(gains[cascade.G_TORQUE_PER_THRUST]),
             tilt_p=float(gains[cascade.G_TILT_P]) * _REDUCED,
             hover_share=profile.total_mass_kg * GRAVITY_MPS2 / thrust_n,
-            curve=_throttle_curve(gains),
+            curve=float(bend @ (shares - commands) / (bend @ bend)),  # fitted by least squares
         )
 
     def parameters(
@@ -155,11 +158,3 @@ class RateLoops:
             for number, axis in enumerate(axes)
             for term, gain in (("P", self.p), ("I", self.i), ("D", self.d))
         }
-
-
-def _throttle_curve(gains: Vector) -> float:
-    """Fit f by least squares to the motors' throttle curve."""
-    shares = np.linspace(0.05, 1.0, 40)
-    commands = np.array([cascade.throttle(share, gains) for share in shares])
-    bend = commands**2 - commands
-    return float(bend @ (shares - commands) / (bend @ bend))

@@ -66,8 +66,10 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _W
     """
     height = float(world.goal_enu_m[2])
     free, origin = _free_grid(world, height, clearance_m)
-    cells = [_cell(p, origin) for p in (world.start_enu_m, world.goal_enu_m)]
-    found = _shortest(free, cells[0], cells[1])
+    ends = np.array([world.start_enu_m[:2], world.goal_enu_m[:2]])
+    cells = np.minimum(np.floor((ends - origin) / _CELL_M).astype(int), np.array(free.shape) - 1)
+    start, goal = map(tuple, cells.tolist())
+    found = _shortest(free, start, goal)
     plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
     path = np.zeros((0, 3))
     if found is not None:
@@ -109,18 +111,11 @@ def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask,
     return free, origin
 
 
-def _cell(place: Vector, origin: Vector) -> tuple[int, int]:
-    i, j = np.floor((place[:2] - origin) / _CELL_M).astype(int)
-    return int(i), int(j)
-
-
 def _shortest(
     free: Mask, start: tuple[int, int], goal: tuple[int, int]
 ) -> list[tuple[int, int]] | None:
     """Return the cells of a shortest path, found by A* with the straight line as heuristic."""
     shape = free.shape
-    start = (min(start[0], shape[0] - 1), min(start[1], shape[1] - 1))
-    goal = (min(goal[0], shape[0] - 1), min(goal[1], shape[1] - 1))
     if not (free[start] and free[goal]):
         return None
     best = {start: 0.0}

@@ -130,7 +130,10 @@ def test_the_collision_is_in_the_report() -> None:
     collision = watcher.report()["collision"]
     assert collision["what"] == "box 0"
     assert collision["speed_mps"] == pytest.approx(3.0)
-    assert json.loads(json.dumps(collision)) == collision
+    assert json.loads(json.dumps(collision)) == {
+        **collision,
+        "position_enu_m": list(collision["position_enu_m"]),
+    }
 
 
 def test_without_boxes_the_clearance_is_none() -> None:
