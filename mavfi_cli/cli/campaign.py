@@ -176,13 +176,16 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 def export(what: str, path: Path) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
-    from mavfi_cli.report.campaign import flights_csv, write_flights
+    from mavfi_cli.core.files import write_atomically
+    from mavfi_cli.report.campaign import flights_file
 
     table = library.campaign(what).table
+    content = flights_file(table, path)
     if path == Path("-"):
-        click.echo(flights_csv(table), nl=False)
+        click.echo(content, nl=False)
     else:
-        click.echo(f"{write_flights(table, path)} missions in {path}")
+        write_atomically(path, lambda file: file.write(content))
+        click.echo(f"{table.num_rows} missions in {path}")
 
 
 @campaign.command()

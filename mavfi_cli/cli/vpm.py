@@ -96,7 +96,7 @@ def vpm(
     """
     from mavfi_cli.campaigns.specification import require_named
     from mavfi_cli.core.files import plain
-    from mavfi_cli.report.model import model_csv, model_lines, redundancy_csv
+    from mavfi_cli.report.model import model_csv, model_lines
     from mavfi_cli.vpm.model import ModelVehicle, schemes_with
     from mavfi_cli.vpm.report import report
 
@@ -124,7 +124,7 @@ def vpm(
     if as_json:
         click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(redundancy_csv(told["flights"]) if fly else model_csv(told), nl=False)
+        click.echo(model_csv(told["flights"] if fly else told), nl=False)
     else:
         written = ["", f"Files  {out}: {', '.join(files)}"] if files else []
         click.echo("\n".join([*model_lines(told), *written]))
@@ -209,7 +209,7 @@ def _choices(options: dict[str, Any]) -> Any:
 def _save(told: dict[str, Any], out: Path) -> list[str]:
     from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.model import PICTURES, model_csv, redundancy_csv
+    from mavfi_cli.report.model import PICTURES, model_csv
 
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -220,7 +220,7 @@ def _save(told: dict[str, Any], out: Path) -> list[str]:
         if name == "flights.svg":
             if "flights" not in told:
                 continue
-            write_text(out / "flights.csv", redundancy_csv(told["flights"]))
+            write_text(out / "flights.csv", model_csv(told["flights"]))
             names.append("flights.csv")
         write_figure(draw(told), out / name)
         names.append(name)

@@ -14,14 +14,12 @@ import pyarrow as pa
 from mavfi_cli.analysis.summary import INACTIVE, METRICS
 from mavfi_cli.campaigns.missions import label_text, label_value, ordered
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.columns import blocks, number, percent, spread
 from mavfi_cli.stats.paired import McNemar
 
 Row = Mapping[str, Any]
-_FORMATS = (".parquet", ".csv")  # of an export
 _STAGES = tuple(stage.value for stage in Stage)
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),
@@ -312,35 +310,20 @@ def _share(share: Row) -> str:
 # Export ---------------------------------------------------------------------------------------
 
 
-def write_flights(table: pa.Table, path: Path) -> int:
-    """Write an exported table to a .parquet or .csv file; return the number of rows.
+def flights_file(table: pa.Table, path: Path) -> bytes:
+    """The content of a .parquet or .csv file with an exported table; that of `-` is CSV.
 
     Raises:
         ConfigError: the file has another suffix.
-        RecordError: it cannot be written.
     """
-    if path.suffix not in _FORMATS:
-        raise ConfigError(
-            f"the name must end in {' or '.join(_FORMATS)}, or - for CSV on stdout", path=path
-        )
+    from pyarrow import csv, parquet
 
-    def write(file: Any) -> None:
-        """Write the table in the format of the name."""
-        from pyarrow import csv, parquet
-
-        if path.suffix == ".csv":
-            csv.write_csv(table, file)
-        else:
-            parquet.write_table(table, file, compression="zstd")
-
-    write_atomically(path, write)
-    return int(table.num_rows)
-
-
-def flights_csv(table: pa.Table) -> bytes:
-    """Return an exported table as CSV."""
-    from pyarrow import csv
-
-    text = io.BytesIO()
-    csv.write_csv(table, text)
-    return text.getvalue()
+    content = io.BytesIO()
+    if path.suffix == ".parquet":
+        parquet.write_table(table, content, compression="zstd")
+    elif path.suffix == ".csv" or path == Path("-"):
+        csv.write_csv(table, content)
+    else:
+        problem = "the name must end in .parquet or .csv, or - for CSV on stdout"
+        raise ConfigError(problem, path=path)
+    return content.getvalue()

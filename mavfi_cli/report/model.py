@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.columns import columns, csv_text, wrapped
+from mavfi_cli.report.columns import columns, csv_text, formed, wrapped
 from mavfi_cli.report.drawing import (
     INK,
     NOTE,
@@ -40,12 +40,18 @@ def model_lines(told: Mapping[str, Any]) -> list[str]:
 
 
 def model_csv(told: Mapping[str, Any]) -> str:
-    """CSV text, one row per vehicle and scheme; the header names the units."""
+    """CSV text of the model or of its flights, one row per vehicle and scheme.
+
+    The header names the units.
+    """
+    distance = {"distance_m": told["distance_m"]} if "distance_m" in told else {}
     return csv_text(
-        {"vehicle": one["vehicle"], "board": one["board"], "distance_m": told["distance_m"], **row}
+        {"vehicle": one["vehicle"], "board": one["board"], **distance}
+        | {name: "; ".join(cell) if isinstance(cell, list) else cell for name, cell in row.items()
+           if name != "outcomes"}
         for one in told["vehicles"]
         for row in one["schemes"]
-    )
+    )  # fmt: skip
 
 
 def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
@@ -53,32 +59,28 @@ def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
     yield f"== {one['vehicle']}{title}; board {one['board']} =="
     yield from (f"Note: {note}" for note in one["notes"])
     flying = [row for row in one["schemes"] if row["problem"] is None]
-    yield from columns([
-        ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
-        *([row["scheme"], f"{row['boards']}", f"{row['compute_kg']:.3f} kg",
-           f"{row['mass_kg']:.3f} kg", f"{row['thrust_to_weight']:.2f} N/N",
-           f"{row['acceleration_mps2']:.2f} m/s²", f"{row['roof_mps']:.2f} m/s",
-           f"{row['knee_hz']:.1f} Hz"]
-          for row in flying),
-    ])  # fmt: skip
+    yield from formed(
+        flying, ("scheme", "{scheme}"), ("boards", "{boards}"), ("compute", "{compute_kg:.3f} kg"),
+        ("mass", "{mass_kg:.3f} kg"), ("thrust/weight", "{thrust_to_weight:.2f} N/N"),
+        ("acceleration", "{acceleration_mps2:.2f} m/s²"), ("roof", "{roof_mps:.2f} m/s"),
+        ("knee", "{knee_hz:.1f} Hz"),
+    )  # fmt: skip
     yield ""
-    yield from columns([
-        ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
-         "compute ceiling"],
-        *([row["scheme"], f"{row['overhead_percent']:.4g} %", f"{row['throughput_hz']:.3f} Hz",
-           f"{row['velocity_mps']:.3f} m/s", row["bound"], f"{row['sensor_ceiling_mps']:.2f} m/s",
-           f"{row['compute_ceiling_mps']:.2f} m/s"]
-          for row in flying),
-    ])  # fmt: skip
+    yield from formed(
+        flying, ("scheme", "{scheme}"), ("overhead", "{overhead_percent:.4g} %"),
+        ("throughput", "{throughput_hz:.3f} Hz"), ("velocity", "{velocity_mps:.3f} m/s"),
+        ("bound by", "{bound}"), ("sensor ceiling", "{sensor_ceiling_mps:.2f} m/s"),
+        ("compute ceiling", "{compute_ceiling_mps:.2f} m/s"),
+    )  # fmt: skip
     yield ""
-    yield from columns([
-        [f"over {over}", "velocity", "time", "energy", "missions", "flight time", "power",
-         "energy", "a charge"],
-        *([row["scheme"], *(f"x {row[name]:.4f}" for name in RATIOS),
-           f"{row['flight_time_s']:.1f} s", f"{row['power_w']:.1f} W",
-           f"{row['energy_j'] / 1000:.2f} kJ", f"{row['missions']:.1f} missions"]
-          for row in flying),
-    ])  # fmt: skip
+    heads = ("velocity", "time", "energy", "missions")
+    ratios = ((head, f"x {{{name}:.4f}}") for head, name in zip(heads, RATIOS, strict=True))
+    yield from formed(
+        ({**row, "energy_kj": row["energy_j"] / 1000} for row in flying),
+        (f"over {over}", "{scheme}"), *ratios, ("flight time", "{flight_time_s:.1f} s"),
+        ("power", "{power_w:.1f} W"), ("energy", "{energy_kj:.2f} kJ"),
+        ("a charge", "{missions:.1f} missions"),
+    )  # fmt: skip
     for row in one["schemes"]:
         if row["problem"] is not None:
             yield f"{row['scheme']}: {row['problem']}"
@@ -114,13 +116,13 @@ def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         return
     yield ""
     yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
-    yield from columns([
-        ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
-        *([f"  {row['board']}", f"{1000 * row['board_kg']:.0f} g",
-           f"{row['parameter']} = {row['value']:.4g} {row['unit']}", f"x {row['tmr_ratio']:.4f}",
-           f"x {row['published_tmr_ratio']:g}", f"x {row['predicted_dmr_ratio']:.4f}"]
-          for row in rows),
-    ])  # fmt: skip
+    yield from formed(
+        ({**row, "board_g": 1000 * row["board_kg"]} for row in rows),
+        ("  board", "  {board}"), ("a copy", "{board_g:.0f} g"),
+        ("calibrated", "{parameter} = {value:.4g} {unit}"), ("TMR", "x {tmr_ratio:.4f}"),
+        ("paper's TMR", "x {published_tmr_ratio:g}"),
+        ("DMR, predicted", "x {predicted_dmr_ratio:.4f}"),
+    )  # fmt: skip
 
 
 def _sources(one: Mapping[str, Any]) -> Iterator[str]:
@@ -140,15 +142,13 @@ def _sources(one: Mapping[str, Any]) -> Iterator[str]:
 # Beside flights -----------------------------------------------------------------------------------
 
 _MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
-_NUMBERS = (
-    # heading, name, unit in the key, unit as printed, factor, digits
-    ("Mean velocity against the model's safe velocity", "velocity", "_mps", "m/s", 1.0, 2),
-    ("Top velocity against it", "top_velocity", "_mps", "m/s", 1.0, 2),
-    ("Flight time", "flight_time", "_s", "s", 1.0, 1),
-    ("Energy of rotors and boards", "energy", "_j", "kJ", 1.0e-3, 2),
-    ("Response time, median", "response", "_s", "s", 1.0, 3),
+_NUMBERS = (  # heading, name, unit in the key, format, factor
+    ("Mean velocity against the model's safe velocity", "velocity", "_mps", "{:.2f} m/s", 1.0),
+    ("Top velocity against it", "top_velocity", "_mps", "{:.2f} m/s", 1.0),
+    ("Flight time", "flight_time", "_s", "{:.1f} s", 1.0),
+    ("Energy of rotors and boards", "energy", "_j", "{:.2f} kJ", 1.0e-3),
+    ("Response time, median", "response", "_s", "{:.3f} s", 1.0),
 )
-_HEAD = ["scheme", "model", "flight", "", "flight against model"]
 _RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
 
 
@@ -166,39 +166,20 @@ def _flight_lines(flights: Mapping[str, Any]) -> list[str]:
     return [*lines, *wrapped(["", text] for text in flights["not_scaled"])]
 
 
-def redundancy_csv(flights: Mapping[str, Any]) -> str:
-    """CSV text, one row per vehicle and scheme; the header names the units."""
-    rows = [
-        {
-            "vehicle": one["vehicle"],
-            "board": one["board"],
-            **{
-                key: "; ".join(value) if isinstance(value, list) else value
-                for key, value in row.items()
-                if key != "outcomes"
-            },
-        }
-        for one in flights["vehicles"]
-        for row in one["schemes"]
-    ]
-    return csv_text(rows)
-
-
 def _flown(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
     yield f"== {one['vehicle']} flown, board {one['board']} =="
     rows = [row for row in one["schemes"] if row["problem"] is None]
-    yield from columns([
-        ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
-        *([row["scheme"], f"{row['mass_kg']:.3f} kg", f"{row['v_max_mps']:.3f} m/s",
-           f"{row['a_max_mps2']:.2f} m/s²", f"{row['braking_velocity_mps']:.3f} m/s",
-           _success(row), ", ".join(f"{count} {name}" for name, count in row["outcomes"].items())]
-          for row in rows),
-    ])  # fmt: skip
-    for heading, name, key, unit, factor, digits in _NUMBERS:
-        yield ""
-        yield f"{heading}:"
-        told = (_beside(row, name, key, unit, factor, digits) for row in rows)
-        yield from columns([_HEAD, *told])
+    ends = (", ".join(f"{count} {name}" for name, count in row["outcomes"].items()) for row in rows)
+    yield from formed(
+        ({**row, "ends": told} for row, told in zip(rows, ends, strict=True)),
+        ("scheme", "{scheme}"), ("mass", "{mass_kg:.3f} kg"), ("v-max", "{v_max_mps:.3f} m/s"),
+        ("a-max", "{a_max_mps2:.2f} m/s²"), ("safe, braking", "{braking_velocity_mps:.3f} m/s"),
+        ("success", "{success_percent:.0f} % ({success_low_percent:.0f} to "
+                    "{success_high_percent:.0f} %)"),
+        ("ends", "{ends}"),
+    )  # fmt: skip
+    for heading, name, key, form, factor in _NUMBERS:
+        yield from _beside(heading, rows, name, key, form, factor)
     yield ""
     yield "Why flights take longer than the model says:"
     yield from columns([["scheme", "path", "pace", "replans", "alarms"], *(_why(r) for r in rows)])
@@ -207,36 +188,45 @@ def _flown(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
         *((name, f"{title} over {over}", "") for name, title in _RATIOS),
         ("flight_time", f"Flight time over {paper}, as the paper's Fig. 15", f"_over_{paper}"),
     ):
-        yield ""
-        yield f"{title}:"
-        told = (_ratio(row, name, suffix) for row in rows if f"pairs{suffix}" in row)
-        yield from columns([_HEAD, *told])
+        told = [row for row in rows if f"pairs{suffix}" in row]
+        yield from _beside(title, told, f"{name}{suffix}", "_ratio", "x {:.4f}", pairs=suffix)
     for row in one["schemes"]:
         yield from _remarks(row)
 
 
-def _success(row: Mapping[str, Any]) -> str:
-    return (
-        f"{row['success_percent']:.0f} % ({row['success_low_percent']:.0f} to "
-        f"{row['success_high_percent']:.0f} %)"
-    )
-
-
 def _beside(
-    row: Mapping[str, Any], name: str, key: str, unit: str, factor: float, digits: int
-) -> list[str]:
-    model, flight, low, high = (
-        factor * row[f"{which}{key}"]
-        for which in (f"model_{name}", f"flight_{name}", f"flight_{name}_low",
-                      f"flight_{name}_high")
-    )  # fmt: skip
-    return [
-        row["scheme"],
-        _known(f"{model:.{digits}f} {unit}", model),
-        _known(f"{flight:.{digits}f} {unit}", flight),
-        _known(f"({low:.{digits}f} to {high:.{digits}f} {unit})", low, ""),
-        _known(f"{row[f'{name}_difference_percent']:+.1f} %", flight),
-    ]
+    heading: str,
+    rows: Sequence[Mapping[str, Any]],
+    name: str,
+    key: str,
+    form: str,
+    factor: float = 1.0,
+    pairs: str | None = None,
+) -> Iterator[str]:
+    """A number of the model beside that of its flights.
+
+    Args:
+        key: unit, as in the names of the row's fields.
+        pairs: suffix of the field that counts the pairs of a ratio; None of what is no ratio.
+    """
+    lines = [["scheme", "model", "flight", "", "flight against model"]]
+    for row in rows:
+        model, flight, low, high = (
+            factor * row[f"{which}{key}"]
+            for which in (f"model_{name}", f"flight_{name}", f"flight_{name}_low",
+                          f"flight_{name}_high")
+        )  # fmt: skip
+        if pairs is None:
+            number, _, unit = form.partition(" ")
+            ends = f"({number.format(low)} to {number.format(high)} {unit})"
+            ends, difference = _known(ends, low, ""), f"{name}_difference_percent"
+        else:
+            ends = _known(f"{form.format(low)} to {form.format(high)}, ", low, "")
+            ends = f"({ends}{row[f'pairs{pairs}']} pairs)"
+            difference = f"{name}_ratio_difference_percent"
+        told = (_known(form.format(each), each) for each in (model, flight))
+        lines.append([row["scheme"], *told, ends, _known(f"{row[difference]:+.1f} %", flight)])
+    yield from ["", f"{heading}:", *columns(lines)]
 
 
 def _why(row: Mapping[str, Any]) -> list[str]:
@@ -248,19 +238,6 @@ def _why(row: Mapping[str, Any]) -> list[str]:
         _known(f"x {pace:.3f} slower", pace),
         _known(f"{row['flight_replans']:.1f} a flight", row["flight_replans"]),
         "no detector" if alarms != alarms else f"{alarms:.1f} a flight",
-    ]
-
-
-def _ratio(row: Mapping[str, Any], name: str, suffix: str) -> list[str]:
-    key = f"{name}{suffix}"
-    flight, low, high = (row[f"flight_{key}{end}_ratio"] for end in ("", "_low", "_high"))
-    ends = _known(f"x {low:.4f} to x {high:.4f}, ", low, "")
-    return [
-        row["scheme"],
-        f"x {row[f'model_{key}_ratio']:.4f}",
-        _known(f"x {flight:.4f}", flight),
-        f"({ends}{row[f'pairs{suffix}']} pairs)",
-        _known(f"{row[f'{key}_ratio_difference_percent']:+.1f} %", flight),
     ]
 
 
@@ -295,14 +272,12 @@ def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield "Overhead of detection and recovery: no flight with a detector"
         return
     yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
-    yield from columns([
-        ["detector", "measured", "of it checks", "paper", "recomputations",
-         "checks of this host's kernel time"],
-        *([row["detector"], f"{row['measured_percent']:.4g} %", f"{row['checks_percent']:.4g} %",
-           f"{row['paper_percent']:.4g} %", f"{row['alarms']} in {row['flights']} flights",
-           f"{row['checks_of_host_kernels_percent']:.4g} %"]
-          for row in rows),
-    ])  # fmt: skip
+    yield from formed(
+        rows, ("detector", "{detector}"), ("measured", "{measured_percent:.4g} %"),
+        ("of it checks", "{checks_percent:.4g} %"), ("paper", "{paper_percent:.4g} %"),
+        ("recomputations", "{alarms} in {flights} flights"),
+        ("checks of this host's kernel time", "{checks_of_host_kernels_percent:.4g} %"),
+    )  # fmt: skip
     yield f"({HOST_CHECKS})"
 
 

@@ -12,7 +12,7 @@ from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.model import PICTURES, model_lines, redundancy_csv
+from mavfi_cli.report.model import PICTURES, model_csv, model_lines
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
@@ -143,7 +143,7 @@ def test_a_scheme_that_is_not_flown_says_why(spark):
     assert rows_of(told)["tmr"]["problem"] == "too heavy to fly"
     lines = model_lines(told)
     assert "tmr: not flown: too heavy to fly" in lines
-    rows = redundancy_csv(told["flights"]).splitlines()
+    rows = model_csv(told["flights"]).splitlines()
     assert len(rows) == 6
     assert "too heavy to fly" in rows[3]
 

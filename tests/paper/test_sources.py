@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.sources import Evidence
-from mavfi_cli.report.campaign import write_flights
+from mavfi_cli.report.campaign import flights_file
 from mavfi_cli.spec.mission import MissionConfig
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
@@ -68,7 +68,8 @@ def test_a_whole_campaign_has_no_problems(campaign):
 def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
     folder = campaign("half", 5, 2)
     with Ledger(folder) as ledger:
-        write_flights(exported(ledger), tmp_path / "half.parquet")
+        path = tmp_path / "half.parquet"
+        path.write_bytes(flights_file(exported(ledger), path))
     found = [Evidence.gather([place]) for place in (folder, tmp_path / "half.parquet")]
     there, here = (each.campaigns[0] for each in found)
     assert (here.planned, here.versions, here.host) == (there.planned, there.versions, there.host)
