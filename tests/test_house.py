@@ -29,7 +29,6 @@ UNCALLED = {
     "format_options": "click calls it",
     "checkMotion": "OMPL calls it",
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
-    "occupied_voxels": "what a map holds, for tests of the map",
 }
 COMMANDS = ("mavfi_cli/cli/",)  # functions that click calls by decorator
 

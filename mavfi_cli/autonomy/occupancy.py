@@ -84,11 +84,6 @@ class OccupancyMap:
         self._tree.setClampingThresMax(params.clamp_max)
         self._tree.setOccupancyThres(params.occupancy_threshold)
 
-    @property
-    def occupied_voxels(self) -> int:
-        """Return the number of occupied voxels."""
-        return int(self._occupied.sum())
-
     def insert(self, cloud: PointCloud) -> None:
         """Integrate one cloud: rays clear voxels, end points within the range mark them occupied.
 

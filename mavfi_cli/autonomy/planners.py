@@ -110,11 +110,6 @@ class PlanResult:
         """Return a failure. `nearest_m` is the shortest distance to the goal that was reached."""
         return cls(found=False, path_enu_m=np.empty((0, 3)), reason=reason, nearest_m=nearest_m)
 
-    @property
-    def length_m(self) -> float:
-        """Length of the path, m."""
-        return float(np.linalg.norm(np.diff(self.path_enu_m, axis=0), axis=1).sum())
-
 
 class Planner(Protocol):
     """A path planner whose result depends on problem and seed only."""

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -209,7 +210,7 @@ def step(
     track(*law, params.v_max_mps, *limits, out)
     stretch = 1.0
     if params.stretches_clock:
-        stretch = max(1.0, _demanded_mps(*law, *limits) / params.v_max_mps)
+        stretch = max(1.0, _demanded_mps(law, limits) / params.v_max_mps)
     yaw_rad = float(out[9])
     command = Command(
         stamp_s=inputs.stamp_s,
@@ -271,29 +272,13 @@ def track(
 
 
 @compiled
-def _demanded_mps(
-    target: FloatArray,
-    rate: float,
-    rate_change_per_s: float,
-    position: FloatArray,
-    velocity: FloatArray,
-    integral: FloatArray,
-    last_yaw: float,
-    elapsed_s: float,
-    kp: float,
-    ki: float,
-    kd: float,
-    integral_max: float,
-    a_max: float,
-    yaw_rate_max: float,
-    step_max_s: float,
-) -> float:
-    """Return the commanded speed before the speed limit, m/s; inf on overflow."""
+def _demanded_mps(law: tuple[Any, ...], limits: tuple[float, float, float]) -> float:
+    """Return the commanded speed before the speed limit, m/s; inf on overflow.
+
+    `law` and `limits` are the arguments of `track` before and after the speed limit.
+    """
     out = np.empty(10)
-    track(
-        target, rate, rate_change_per_s, position, velocity, integral, last_yaw, elapsed_s,
-        kp, ki, kd, integral_max, math.inf, a_max, yaw_rate_max, step_max_s, out,
-    )  # fmt: skip
+    track(*law, math.inf, *limits, out)  # type: ignore[call-arg]  # `law` has twelve
     largest = max(abs(out[0]), abs(out[1]), abs(out[2]))
     if largest == 0.0:
         return 0.0

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Message, Stage, Trajectory
+from mavfi_cli.detect import preprocess
 from mavfi_cli.detect.base import (
     OF_CONTROL,
     OF_PLANNING,
@@ -33,22 +34,13 @@ from mavfi_cli.detect.base import (
     TickJudge,
 )
 from mavfi_cli.detect.preprocess import (
-    CODE,
     COUNT,
-    DELTA,
     EXTENDED,
-    LIMIT,
     NAMES,
-    PREVIOUS,
-    REFERENCE,
     SPANS,
     Codes,
     PreprocessParams,
     Ranges,
-    extended_codes,
-    plan_deltas,
-    take_report,
-    take_tick,
 )
 from mavfi_cli.detect.span import MARGIN
 
@@ -95,7 +87,7 @@ class _ExtendedWatch:
 
     def accept(self, message: CollisionReport | Trajectory) -> None:
         """Accept a message, which takes effect and becomes the reference."""
-        for place, code in extended_codes(message):
+        for place, code in preprocess.extended_codes(message):
             self.memory[0, place] = code
         self._lost[type(message)] = 0
         if isinstance(message, Trajectory):
@@ -110,7 +102,7 @@ class _ExtendedWatch:
         accepted = self._accepted.get(plan.stamp_s)
         if accepted is None:
             return None
-        alarm = self._judge(plan, dict(extended_codes(accepted)), 1)
+        alarm = self._judge(plan, dict(preprocess.extended_codes(accepted)), 1)
         if alarm is None:
             return None
         mended: Message = plan
@@ -127,8 +119,8 @@ class _ExtendedWatch:
         steps: int,
     ) -> Alarm | None:
         found: list[tuple[int, int]] = []
-        for place, code in extended_codes(message):
-            delta = min(max(code - references[place], -LIMIT), LIMIT)
+        for place, code in preprocess.extended_codes(message):
+            delta = min(max(code - references[place], -preprocess.LIMIT), preprocess.LIMIT)
             lowest, highest = self.memory[1:, place].tolist()
             distance = max(steps * lowest - delta, delta - steps * highest)
             if distance > 0:
@@ -172,7 +164,7 @@ class Gate:
         self.fresh: tuple[Stage, ...] = ()
         self._per_stage = detector.per_stage
         self._work = (params or PreprocessParams()).working_array()
-        self._deltas = self._work[DELTA]
+        self._deltas = self._work[preprocess.DELTA]
         self._trajectory: Trajectory | None = None  # last accepted waypoint
         self._index = -1
         self._judged: tuple[Trajectory | None, int] = (None, -1)
@@ -201,7 +193,7 @@ class Gate:
 
     def judge_report(self, report: CollisionReport) -> Alarm | None:
         """Judge a collision report on its arrival."""
-        take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
+        preprocess.take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
         self.fresh = (Stage.PERCEPTION,)
         self._pending = False
         if Stage.PERCEPTION not in self.protect:
@@ -217,7 +209,7 @@ class Gate:
             self.detector.learn(self._deltas, Stage.PERCEPTION)
             self._pending = not self._per_stage
         else:
-            self._refer(Stage.PERCEPTION, PREVIOUS)
+            self._refer(Stage.PERCEPTION, preprocess.PREVIOUS)
         return self._settled(report, alarm)
 
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
@@ -290,7 +282,7 @@ class Gate:
             )
             scores: list[float] = self._scores[:count].tolist()
             return scores
-        count = plan_deltas(waypoints, first, self._work, self._steps, self._changes)
+        count = preprocess.plan_deltas(waypoints, first, self._work, self._steps, self._changes)
         stage = Stage.PLANNING if self._per_stage else Stage.CONTROL
         return [self.detector.score(self._changes[number], stage) for number in range(count)]
 
@@ -320,7 +312,7 @@ class Gate:
         if verdict == PASSED:
             return None
         for stage in _TICK if of_control else self.fresh:
-            self._refer(stage, PREVIOUS)
+            self._refer(stage, preprocess.PREVIOUS)
         stage = Stage.PLANNING if verdict == OF_PLANNING else Stage.CONTROL
         return self._alarm(stage, score, self._deltas)
 
@@ -335,7 +327,7 @@ class Gate:
         keep_report: bool,
     ) -> tuple[float, int]:
         """Judge a tick as `FittedDetector.tick_judge` does, for a detector that has none."""
-        take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
+        preprocess.take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
         for span in self._ignored:
             self._deltas[span] = 0
         for stage in self.fresh if self._per_stage else _TICK:
@@ -349,7 +341,7 @@ class Gate:
 
     def accept_report(self) -> None:
         """Accept the last judged report in spite of its alarm. It becomes the reference."""
-        self._refer(Stage.PERCEPTION, CODE)
+        self._refer(Stage.PERCEPTION, preprocess.CODE)
         if self._watch is not None and self._report is not None:
             self._watch.accept(self._report)
 
@@ -362,14 +354,14 @@ class Gate:
         """Accept the last judged waypoint and command in spite of an alarm."""
         for stage in self.fresh:
             if stage is not Stage.PERCEPTION:
-                self._refer(stage, CODE)
+                self._refer(stage, preprocess.CODE)
         if Stage.PLANNING in self.fresh:
             self._trajectory, self._index = self._judged
 
     def _refer(self, stage: Stage, row: int) -> None:
         """Make a row of the working array the reference of a stage."""
         first, end = SPANS[stage]
-        self._work[REFERENCE, first:end] = self._work[row, first:end]
+        self._work[preprocess.REFERENCE, first:end] = self._work[row, first:end]
 
     def _alarm(
         self, stage: Stage, score: float, deltas: Codes, waypoint: int | None = None

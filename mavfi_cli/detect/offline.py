@@ -36,20 +36,10 @@ from mavfi_cli.core.types import (
     Stage,
     Trajectory,
 )
+from mavfi_cli.detect import preprocess
 from mavfi_cli.detect.base import Detector
 from mavfi_cli.detect.gate import ALL_STAGES, Alarm, Gate
-from mavfi_cli.detect.preprocess import (
-    COUNT,
-    EXTENDED,
-    LIMIT,
-    NAMES,
-    SPANS,
-    STATES_DIGEST,
-    Codes,
-    PreprocessParams,
-    extended_codes,
-    plan_deltas,
-)
+from mavfi_cli.detect.preprocess import COUNT, EXTENDED, NAMES, SPANS, Codes, PreprocessParams
 
 Columns = Mapping[str, NDArray[Any]]
 _WAYPOINT = [s.name for s in STATES if s.group.startswith("waypoint_") and s.unit != "s"]
@@ -381,7 +371,7 @@ def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
     """Return the deltas (n - 1, COUNT) of a plan's steps, computed as in the gate."""
     rows = len(plan.waypoints)
     steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
-    count = plan_deltas(plan.waypoints, 0, params.working_array(), steps, changes)
+    count = preprocess.plan_deltas(plan.waypoints, 0, params.working_array(), steps, changes)
     found = np.zeros((max(0, rows - 1), COUNT), np.int16)
     found[steps[:count]] = changes[:count]
     return found
@@ -392,8 +382,8 @@ def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes
     found = np.zeros((len(messages), len(EXTENDED)), np.int16)
     before = [0] * len(EXTENDED)
     for row, message in enumerate(messages):
-        for place, code in extended_codes(message):
-            found[row, place] = min(max(code - before[place], -LIMIT), LIMIT)
+        for place, code in preprocess.extended_codes(message):
+            found[row, place] = min(max(code - before[place], -preprocess.LIMIT), preprocess.LIMIT)
             before[place] = code
     return found
 
@@ -465,11 +455,11 @@ class Dataset:
         return cls(flights=tuple(_flights(table)), preprocess=params, stack=stack)
 
 
-def _signature(preprocess: PreprocessParams) -> dict[str, str]:
+def _signature(params: PreprocessParams) -> dict[str, str]:
     return {
         "mavfi_samples": SCHEMA,
-        "mavfi_states": STATES_DIGEST,
-        "mavfi_preprocess": preprocess.digest(),
+        "mavfi_states": preprocess.STATES_DIGEST,
+        "mavfi_preprocess": params.digest(),
     }
 
 
