@@ -50,8 +50,7 @@ class FlightPlan:
     """Plan of the flights of a vehicle with a scheme.
 
     Attributes:
-        mission: configuration without world and seed.
-        files: TOML files of the mission, by path.
+        mission: without world and seed.
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
         rotors_w: electrical hover power with all boards.
         boards_w: power of all boards.
@@ -122,11 +121,7 @@ class FlightPlan:
         )
 
     def write(self) -> None:
-        """Write the files.
-
-        Raises:
-            RecordError: a file cannot be written.
-        """
+        """Write the files; a RecordError says why one cannot be written."""
         for path, text in self.files.items():
             with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -217,7 +217,7 @@ def found(
 
     Args:
         detectors: all of them, `none` first.
-        error_free, faults: as `detector_pairs.pairs_of` returns them.
+        error_free, faults: as `pairs_of` returns them.
         scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
             and the scores of its error-free flights.
     """

@@ -27,11 +27,7 @@ KERNELS = "kernels.json"
 
 
 def kernel_summary(path: Path) -> Mapping[str, Any]:
-    """Read a summary.
-
-    Raises:
-        RecordError: the file cannot be read, or is no such summary.
-    """
+    """Read a summary; a RecordError says why it cannot be read, or is none."""
     try:
         found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]

@@ -15,7 +15,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -201,31 +201,24 @@ GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detecto
 CONFIDENCE = 0.95
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Quantity:
-    """A quantity that is measured in each flight.
-
-    Attributes:
-        name: name of its column.
-        any_end: whether failed flights have it, too.
-        ratio: whether platforms are compared by ratio or by difference.
-    """
+class _Quantity(NamedTuple):
+    """A quantity that is measured in each flight, by the name of its column."""
 
     name: str
     title: str
     unit: str
-    any_end: bool = False
-    ratio: bool = True
+    any_end: bool = False  # failed flights have it, too
+    ratio: bool = True  # platforms are compared by ratio, else by difference
 
 
 QUANTITIES = (
-    _Quantity(name="flight_time_s", title="flight time", unit="s"),
-    _Quantity(name="distance_m", title="distance", unit="m"),
-    _Quantity(name="energy_regression_j", title="energy (regression)", unit="J"),
-    _Quantity(name="energy_propeller_j", title="energy (propellers)", unit="J"),
-    _Quantity(name="replans", title="replans", unit="count", ratio=False),
-    _Quantity(name="response_median_s", title="response, median", unit="s", any_end=True),
-    _Quantity(name="response_p95_s", title="response, 95th percentile", unit="s", any_end=True),
+    _Quantity("flight_time_s", "flight time", "s"),
+    _Quantity("distance_m", "distance", "m"),
+    _Quantity("energy_regression_j", "energy (regression)", "J"),
+    _Quantity("energy_propeller_j", "energy (propellers)", "J"),
+    _Quantity("replans", "replans", "count", ratio=False),
+    _Quantity("response_median_s", "response, median", "s", any_end=True),
+    _Quantity("response_p95_s", "response, 95th percentile", "s", any_end=True),
 )
 SCHEMA = pa.schema(
     {

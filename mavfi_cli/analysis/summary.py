@@ -140,11 +140,7 @@ def untreated(labels: Mapping[str, Any]) -> str:
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
-    """The settings, merged if they have equal values of the labels `by`.
-
-    Raises:
-        UnknownName: no setting has such a label.
-    """
+    """The settings, merged by equal labels `by`; UnknownName if no setting has such a label."""
     labels = ledger.cells()
     names = {name for each in labels for name in each}
     for name in by:

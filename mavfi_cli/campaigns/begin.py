@@ -256,11 +256,7 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
-    """List the missions of a campaign after a check that each kind can be flown.
-
-    Raises:
-        MavfiError: no mission can be flown with a world, vehicle, planner, target or other choice.
-    """
+    """List the missions of a campaign; a MavfiError says which kind of them cannot be flown."""
     check_kinds(spec.kinds())
     return spec.missions()
 

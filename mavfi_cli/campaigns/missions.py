@@ -26,7 +26,6 @@ class PlannedMission:
     """One mission of a campaign; its number is its place in the list, from 0.
 
     Attributes:
-        config: the mission's configuration.
         labels: the setting that the mission belongs to; missions of equal labels are counted
             together.
         pair: missions of equal pairs share world, start and noise; empty: a hash of everything
@@ -160,12 +159,7 @@ class Injected(Enum):
 
     @classmethod
     def of(cls, result: Mapping[str, Any], *, asked: bool) -> Injected:
-        """What happened to the fault of a mission, by its record.
-
-        Args:
-            result: result.json.
-            asked: true if the mission was to have a fault.
-        """
+        """What happened to the fault of a mission, by its record; `asked`: it was to have one."""
         flight = record_of(result)
         fault = flight.fault
         if not asked:
@@ -206,7 +200,6 @@ class MissionResult:
     """One row of the ledger.
 
     Attributes:
-        number: the mission's place in the list.
         result: its result.json, the same as of `mavfi fly`; of a mission that crashed or hung
             before it could write one, what is known of it. Empty for an error.
         injected: what happened to its fault; None for an error.

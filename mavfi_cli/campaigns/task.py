@@ -21,11 +21,7 @@ def prepare() -> None:
 
 
 def perform(changes: Mapping[str, Any], out: Path) -> Path:
-    """Fly one mission; return its run folder.
-
-    Args:
-        changes: changes of the mission, by `missions.changes_of`.
-        out: where the run folder goes.
+    """Fly the mission of `missions.changes_of`; return its run folder, which is in `out`.
 
     Raises:
         MavfiError: the mission could not begin, or its record could not be written.

@@ -51,8 +51,6 @@ class Verdict:
     Attributes:
         state: state of the mission; None if something outside ended the attempt.
         result: the mission's record; empty if there is none.
-        reason: the reason in words.
-        run: its run folder; None if there is none.
         doubtful: true if there is a record, but something outside may have affected it.
     """
 
@@ -123,10 +121,6 @@ _STOP_S = 10.0  # time after which a worker with a closed channel counts as ende
 class LocalWorkers:
     """Keeps up to `jobs` missions flying.
 
-    Args:
-        jobs: missions at the same time.
-        module: the module that does the work.
-
     Attributes:
         running: process id by mission number; 0 until the worker's guard has sent it.
     """
@@ -144,13 +138,7 @@ class LocalWorkers:
         return self._jobs - len(self._number)
 
     def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
-        """Start a mission.
-
-        Args:
-            number: its number, for the message of its end.
-            changes: its values that differ from the defaults.
-            out: the folder for its run folder.
-            limit_s: limit of wall time, s.
+        """Start a mission; `changes`: its values that differ from the defaults.
 
         Raises:
             MavfiError: the processes cannot be started.
@@ -283,7 +271,6 @@ class Cluster:
     Args:
         address: address of the scheduler, such as tcp://host:8786.
         keep: the campaign's policy; other run folders are sent without their traces.
-        task: the module that does the work.
 
     Raises:
         CampaignStopped: dask is not installed, the scheduler does not answer, no worker connects,

@@ -69,22 +69,22 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
         **{name: options[name] for name in named},
     )
     with missions_view(quiet=quiet) as view:
-        trained = run(plan, out, Options(jobs=options["jobs"] or 0), view)
-    if "aad" in trained.models:
-        model, _ = trained.models["aad"]
+        dataset, models, left = run(plan, out, Options(jobs=options["jobs"] or 0), view)
+    if "aad" in models:
+        model, _ = models["aad"]
         write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")
     if as_json:
-        told = {kind: dict(model.provenance) for kind, (model, _) in trained.models.items()}
+        told = {kind: dict(model.provenance) for kind, (model, _) in models.items()}
         click.echo(json.dumps(told, indent=2))
         return
-    failed = f"{trained.failed} flights failed and are left out"
-    left_out = failed if flown is None else f"left out: {trained.failed}"
-    samples = sum(len(flight.deltas) for flight in trained.dataset.flights)
+    failed = f"{left} flights failed and are left out"
+    left_out = failed if flown is None else f"left out: {left}"
+    samples = sum(len(flight.deltas) for flight in dataset.flights)
     click.echo(
-        f"Data set    {len(trained.dataset)} flights of {stack}, {samples} samples"
-        + (f"; {left_out}" if trained.failed else "")
+        f"Data set    {len(dataset)} flights of {stack}, {samples} samples"
+        + (f"; {left_out}" if left else "")
     )
-    for kind, (model, path) in trained.models.items():
+    for kind, (model, path) in models.items():
         click.echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")
-    files = ["dataset.parquet", *(["loss.svg"] if "aad" in trained.models else [])]
+    files = ["dataset.parquet", *(["loss.svg"] if "aad" in models else [])]
     click.echo(f"\nFiles  {out}: {', '.join(files)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.analysis.scores import flown_samples, samples_of
@@ -24,24 +24,14 @@ from mavfi_cli.spec.stack import load_stack
 DATASET = "dataset.parquet"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _TrainedDetectors:
-    """The result of a training.
-
-    Attributes:
-        models: model and file of each detector.
-        failed: number of flights outside the data set, because they did not reach the goal.
-    """
-
-    dataset: Dataset
-    models: Mapping[str, tuple[Model, Path]]
-    failed: int
-
-
 def train(
     plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
-) -> _TrainedDetectors:
+) -> tuple[Dataset, Mapping[str, tuple[Model, Path]], int]:
     """Fly or collect flights, fit the detectors, and write the models with their provenance.
+
+    Returns:
+        The data set; model and file of each detector; and the number of flights outside the data
+        set, because they did not reach the goal.
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
@@ -74,7 +64,7 @@ def train(
     models = {kind: (model, folder / f"{kind}.json") for kind, model in fitted.items()}
     for model, path in models.values():  # all of them, or none
         model.save(path)
-    return _TrainedDetectors(dataset=dataset, models=models, failed=failed)
+    return dataset, models, failed
 
 
 def _fly(
