@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ from mavfi_cli.analysis.flights import (
 from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.stats.bootstrap import interval, interval_of_rows, mean, median
+from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import rate
 
@@ -198,7 +198,7 @@ def _late(values: FloatArray) -> FloatArray:
 
 
 GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of all intervals
 
 
 class _Quantity(NamedTuple):
@@ -304,9 +304,7 @@ def _setting(every: pa.Table, counted: pa.Table) -> dict[str, Any]:
         "flown": every.num_rows,
         "counted": counted.num_rows,
         "outcomes": dict(sorted((each["values"], each["counts"]) for each in ends)),
-        "success": asdict(
-            rate(int(flags(counted, "succeeded").sum()), counted.num_rows, CONFIDENCE)
-        ),
+        "success": asdict(rate(int(flags(counted, "succeeded").sum()), counted.num_rows)),
         "quantities": {each.name: _measured(each, counted) for each in QUANTITIES},
     }
 
@@ -316,14 +314,10 @@ def _measured(quantity: _Quantity, counted: pa.Table) -> dict[str, Any]:
     values = known(numbers(chosen_ones, quantity.name))
     return {
         "unit": quantity.unit,
-        "median": _spread(values, median),
-        "mean": _spread(values, mean),
+        "median": asdict(interval(values, median, resamples=RESAMPLES)),
+        "mean": asdict(interval(values, resamples=RESAMPLES)),
         "largest": max(values.tolist(), default=math.nan),
     }
-
-
-def _spread(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> dict[str, Any]:
-    return asdict(interval(values, statistic, confidence=CONFIDENCE, resamples=RESAMPLES))
 
 
 # Two platforms --------------------------------------------------------------------------------

@@ -284,9 +284,10 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     """Raise now what would keep every mission like this one from being flown.
 
     Args:
-        start: start the simulated vehicle, too, which checks world, vehicle, start and goal.
+        start: start the simulated vehicle, too, and end it at once.
 
     Raises:
+        VehicleProcessError: the vehicle refuses the world, the vehicle, the start or the goal.
         MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
             for another stack; values make no fault; or the start is blocked.
     """
@@ -303,20 +304,11 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector needs a detector")
     if start:
-        ask_vehicle(config)
-
-
-def ask_vehicle(config: MissionConfig) -> None:
-    """Start the vehicle of a mission and end it at once.
-
-    Raises:
-        VehicleProcessError: it refuses the world, the vehicle, the start or the goal.
-    """
-    with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
-        try:
-            VehicleInProcess(config, Path(folder)).end()
-        except MavfiError as error:
-            raise VehicleProcessError(str(error), error.exit_code) from None
+        with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
+            try:
+                VehicleInProcess(config, Path(folder)).end()
+            except MavfiError as error:
+                raise VehicleProcessError(str(error), error.exit_code) from None
 
 
 # Fixed worlds: candidates get golden runs in turn until one fits the rule. They are a campaign of

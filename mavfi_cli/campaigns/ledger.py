@@ -28,7 +28,6 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     canonical,
-    changes_of,
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -205,12 +204,11 @@ class Ledger:
         count = 0
         with self._transaction():
             for count, mission in enumerate(missions, start=1):
-                labels = canonical(dict(mission.labels))
+                labels, pair, changes = mission.stored
                 if labels not in known:
                     known[labels] = len(known)
                     self._db.execute("INSERT INTO cells VALUES (?, ?)", (known[labels], labels))
-                changes = canonical(changes_of(mission.config))
-                row = (first + count - 1, known[labels], mission.pair, changes)
+                row = (first + count - 1, known[labels], pair, changes)
                 self._db.execute("INSERT INTO missions VALUES (?, ?, ?, ?)", row)
         return count
 

@@ -40,6 +40,11 @@ class PlannedMission:
         if not self.pair:
             object.__setattr__(self, "pair", _pair_of(_shared(self.config)))
 
+    @property
+    def stored(self) -> tuple[str, str, str]:
+        """Labels, pair, and changes of the configuration, as a ledger stores them."""
+        return canonical(dict(self.labels)), self.pair, canonical(changes_of(self.config))
+
 
 _DEFAULT = MissionConfig()
 _BASE: Mapping[str, Any] = json.loads(json.dumps(asdict(_DEFAULT)))

@@ -28,7 +28,6 @@ from mavfi_cli.campaigns.missions import (
     PlannedMission,
     ResultState,
     canonical,
-    changes_of,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
@@ -147,7 +146,7 @@ def store_plan(
     stored = left.total()
     new = []
     for mission in missions:
-        row = _row(mission)
+        row = mission.stored
         if left[row]:
             left[row] -= 1
         else:
@@ -167,12 +166,8 @@ def store_plan(
     ledger.plan(new)
 
 
-def _row(mission: PlannedMission) -> tuple[str, str, str]:
-    return canonical(dict(mission.labels)), mission.pair, canonical(changes_of(mission.config))
-
-
 def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]) -> list[str]:
-    firsts = {"new": _row(new[0]) if new else None, "gone": next(iter(gone), None)}
+    firsts = {"new": new[0].stored if new else None, "gone": next(iter(gone), None)}
     return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
 
 

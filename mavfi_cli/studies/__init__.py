@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
 from mavfi_cli.campaigns.specification import Keep
@@ -30,12 +30,9 @@ def fly(
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
-    wanted = {
-        (canonical(dict(each.labels)), canonical(changes_of(each.config))) for each in missions
-    }
+    wanted = {each.stored for each in missions}
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=True)
-        mine = [number for number, labels, _, changes in ledger.rows()
-                if (labels, changes) in wanted]  # fmt: skip
+        mine = [number for number, *stored in ledger.rows() if tuple(stored) in wanted]
         fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
         return flights(ledger, mine)

@@ -17,7 +17,7 @@ from mavfi_cli.analysis.beside_model import (
 )
 from mavfi_cli.analysis.flights import chosen, flown
 from mavfi_cli.analysis.overhead import ComputeOverhead
-from mavfi_cli.campaigns.begin import ask_vehicle, check_names
+from mavfi_cli.campaigns.begin import check_names
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import canonical, changes_of
@@ -53,12 +53,10 @@ def _plans_of(
         bare, key = scheme.name == BASE, (vehicle.name, scheme.name)
         try:
             each = FlightPlan.of(setting, scheme, platform, chain_s, folder, models, plan.stack)
-            if each.mission.detector is not None:
-                each.mission.detector.built(each.mission.stack)
             each.write()
-            if scheme.copies not in refused:
-                ask_vehicle(replace(each.mission, world=plan.worlds[0], seed=plan.first_seed))
-                refused[scheme.copies] = None
+            first = replace(each.mission, world=plan.worlds[0], seed=plan.first_seed)
+            check_names(first, start=scheme.copies not in refused)
+            refused.setdefault(scheme.copies, None)
         except (CannotLift, VehicleProcessError) as error:
             if bare:
                 raise

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from record_digest import record_digest
 
-from mavfi_cli.campaigns.begin import ask_vehicle
+from mavfi_cli.campaigns.begin import check_names
 from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.mission.vehicle import Vehicle, VehicleProcess
@@ -88,5 +88,5 @@ def test_what_the_vehicle_refuses_is_one_clear_error(
     with pytest.raises(error, match=text):
         fly_short(**changes)
     with pytest.raises(VehicleProcessError, match=text):
-        ask_vehicle(replace(short_config, **changes))
+        check_names(replace(short_config, **changes))
     assert capfd.readouterr().err == ""
