@@ -69,8 +69,8 @@ def chosen(
         UnknownName: no preset, file or folder has this name.
     """
     spec = chosen_spec(what, scale, changes, out)
-    if _is_folder(what):
-        return spec, Path(what)
+    if (folder := _folder(what)) is not None:
+        return spec, folder
     if out is None:
         _require_one_meaning(what)
     return spec, out or DEFAULT / spec.name
@@ -80,18 +80,18 @@ def chosen_spec(
     what: str, scale: float | None, changes: Sequence[str] = (), out: Path | None = None
 ) -> Spec:
     """Find the named specification, as `chosen` does, without its folder."""
-    if not _is_folder(what):
-        _require_known(what)
+    folder = _folder(what)
+    if folder is None:
         spec = replaced(load_spec(what), changes)
         return spec if scale is None else spec.scaled(scale)
-    with Ledger(Path(what)) as ledger:
+    with Ledger(folder) as ledger:
         if scale is not None or changes or out is not None:
             raise ConfigError(
-                "does not take --scale, --set or --out: the folder stores them", path=Path(what)
+                "does not take --scale, --set or --out: the folder stores them", path=folder
             )
         stored = stored_spec(ledger)
     if stored is None:
-        raise ConfigError("has no specification, because a program made its list", path=Path(what))
+        raise ConfigError("has no specification, because a program made its list", path=folder)
     return stored
 
 
@@ -106,27 +106,24 @@ def folder_of(what: str) -> Path:
         ConfigError: a file is not a specification, or a name has two meanings.
         UnknownName: a single word is neither a preset nor a folder.
     """
-    if _is_folder(what):
-        return Path(what)
-    _require_known(what)
+    if (folder := _folder(what)) is not None:
+        return folder
     _require_one_meaning(what)
     return DEFAULT / load_spec(what).name
 
 
-def _is_folder(what: str) -> bool:
-    """True if the name is that of a campaign's folder, not of a preset or a file."""
+def _folder(what: str) -> Path | None:
+    """The named campaign's folder; None for a preset or a file."""
     folder = Path(what)
-    return what not in PRESETS.names and (
-        folder.is_dir() or (os.sep in what and folder.suffix != ".toml")
-    )
-
-
-def _require_known(what: str) -> None:
-    """Refuse a word that is not a preset; the error may suggest campaigns/NAME."""
-    if what not in PRESETS.names and Path(what).suffix != ".toml":
-        begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
-        meant = [each for each in begun if Path(each).name == what]
-        raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun])
+    if what in PRESETS.names:
+        return None
+    if folder.is_dir() or (os.sep in what and folder.suffix != ".toml"):
+        return folder
+    if folder.suffix == ".toml":
+        return None
+    begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
+    meant = [each for each in begun if Path(each).name == what]
+    raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun])
 
 
 def _require_one_meaning(what: str) -> None:

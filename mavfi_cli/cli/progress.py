@@ -81,11 +81,16 @@ class _FlightView(Watcher):
     def __init__(self, screen: _Lines, title: str) -> None:
         self._screen, self._title = screen, title
 
-    def on_progress(self, progress: FlightProgress) -> None:
-        self._screen.update(_flight_line(progress), progress.stamp_s)
-
     def on_note(self, text: str) -> None:
         self._screen.note(text)
+
+    def on_progress(self, progress: FlightProgress) -> None:
+        line = f"{progress.stamp_s:7.2f} s  {progress.phase:<12} "
+        if progress.goal_distance_m is not None:
+            line += f"{progress.goal_distance_m:5.1f} m to go  "
+        line += f"{progress.speed_mps:.1f} m/s"
+        line += f"  replans {progress.replans}" if progress.replans else ""
+        self._screen.update(line, progress.stamp_s)
 
     def on_event(self, event: Event) -> None:
         if self._title:  # not earlier: a mission that cannot begin prints one line only
@@ -100,11 +105,30 @@ class _MissionsView(Spectator):
         self._screen = screen
 
     def on_progress(self, progress: Progress) -> None:
+        """One line: missions, rate, remaining time, success rates so far."""
+        parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
+        if progress.eta_s is not None:
+            parts.append(f"{progress.rate_per_h:.0f} an hour")
+            if progress.over < progress.total:
+                parts.append(f"{duration(progress.eta_s)} to go")
+        if progress.success_rate is not None:
+            told = f"{100.0 * progress.success_rate:.1f} % success"
+            if 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
+                rates = progress.success_rates.items()
+                told += f" ({', '.join(f'{name} {100.0 * rate:.1f}' for name, rate in rates)})"
+            parts.append(told)
+        if progress.again:
+            parts.append(f"{progress.again} begun again")
         last = progress.over == progress.total
-        self._screen.update(_progress_line(progress), progress.elapsed_s, last=last)
+        self._screen.update(", ".join(parts), progress.elapsed_s, last=last)
 
     def on_end(self, progress: Progress) -> None:
-        if line := _end_line(progress):
+        """The time that the missions took; nothing if none was flown."""
+        if flown := progress.over - progress.before:
+            line = f"{flown} missions in {duration(progress.elapsed_s)}"
+            line += f", {progress.rate_per_h:.0f} an hour"
+            if progress.outside is not None:
+                line += f", {100.0 * progress.outside:.1f} % of it outside missions"
             self._screen.note(line)
 
     def on_note(self, text: str) -> None:
@@ -172,44 +196,3 @@ def missions_view(*, quiet: bool) -> Iterator[Spectator]:
         return
     with _screen(0.0) as screen:
         yield _MissionsView(screen)
-
-
-def _flight_line(progress: FlightProgress) -> str:
-    goal = "" if progress.goal_distance_m is None else f"{progress.goal_distance_m:5.1f} m to go  "
-    return f"{progress.stamp_s:7.2f} s  {progress.phase:<12} {goal}{progress.speed_mps:.1f} m/s" + (
-        f"  replans {progress.replans}" if progress.replans else ""
-    )
-
-
-def _progress_line(progress: Progress) -> str:
-    """One line: missions, rate, remaining time, success rates so far."""
-    parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
-    if progress.eta_s is not None:
-        parts.append(f"{progress.rate_per_h:.0f} an hour")
-        if progress.over < progress.total:
-            parts.append(f"{duration(progress.eta_s)} to go")
-    if progress.success_rate is not None:
-        parts.append(f"{_percent(progress.success_rate)} % success{_by_setting(progress)}")
-    if progress.again:
-        parts.append(f"{progress.again} begun again")
-    return ", ".join(parts)
-
-
-def _by_setting(progress: Progress) -> str:
-    if not 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
-        return ""
-    rates = [f"{name} {_percent(rate)}" for name, rate in progress.success_rates.items()]
-    return f" ({', '.join(rates)})"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.1f}"
-
-
-def _end_line(progress: Progress) -> str:
-    flown = progress.over - progress.before
-    if not flown:
-        return ""
-    line = f"{flown} missions in {duration(progress.elapsed_s)}, {progress.rate_per_h:.0f} an hour"
-    outside = progress.outside
-    return line if outside is None else f"{line}, {100.0 * outside:.1f} % of it outside missions"
