@@ -226,7 +226,18 @@ def side_by_side(
         "ratios_over": BASE,
         "paper_ratios_over": REFERENCE,
         "not_scaled": list(NOT_SCALED),
-        "overheads": [_overhead(each) for each in overheads.values()],
+        "overheads": [
+            {
+                "detector": each.detector,
+                "flights": each.flights,
+                "alarms": each.alarms,
+                "measured_percent": 100.0 * each.share,
+                "checks_percent": 100.0 * each.checks_share,
+                "checks_of_host_kernels_percent": 100.0 * each.checks_host_share,
+                "paper_percent": 100.0 * SCHEMES[each.detector].overhead,
+            }
+            for each in overheads.values()
+        ],
         "vehicles": [
             {
                 "vehicle": one["vehicle"],
@@ -239,18 +250,6 @@ def side_by_side(
             }
             for one in told["vehicles"]
         ],
-    }
-
-
-def _overhead(measured: ComputeOverhead) -> dict[str, Any]:
-    return {
-        "detector": measured.detector,
-        "flights": measured.flights,
-        "alarms": measured.alarms,
-        "measured_percent": 100.0 * measured.share,
-        "checks_percent": 100.0 * measured.checks_share,
-        "checks_of_host_kernels_percent": 100.0 * measured.checks_host_share,
-        "paper_percent": 100.0 * SCHEMES[measured.detector].overhead,
     }
 
 

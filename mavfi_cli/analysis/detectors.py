@@ -362,7 +362,10 @@ def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
     harmful = flown.filter(pc.not_equal(flown["harm"], HARMLESS))
     harmless = chosen(complete, harm=HARMLESS)
     latencies_s = known(numbers(harmful, "latency_s"))
-    middle, late = _interval(latencies_s, median), _interval(latencies_s, _p95)
+    middle, late = (
+        _interval(latencies_s, median),
+        _interval(latencies_s, lambda drawn: np.quantile(drawn, 0.95, axis=-1)),
+    )
     protected = mixture(
         [(harmful_count, _share(harmful, "won")), (harms[HARMLESS], _share(harmless, "won"))]
     )
@@ -455,10 +458,6 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
         "recovered": asdict(interval_of_rows(len(faulty), recovered, resamples=RESAMPLES)),
         "recovered_share": worst["recovered_share"] if worst["increase"] > LONGER else math.nan,
     }
-
-
-def _p95(values: FloatArray) -> FloatArray:
-    return np.asarray(np.quantile(values, 0.95, axis=-1))
 
 
 def _interval(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Interval:

@@ -85,6 +85,11 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
     fault = config.fault or config.instruction
     level = None if fault is None else "instruction" if config.fault is None else "source"
     injected = None if entry.injected is None else entry.injected.value
+    shares: list[float | None] = [None] * len(COSTS)
+    cost = detection_cost(entry.result)
+    if cost is not None:
+        recovery = (cost.recovery_s[stage] / cost.flight_s for stage in RECOMPUTED)
+        shares = [cost.detection_share, *recovery]
     return {
         "number": entry.number,
         "pair": entry.mission.pair,
@@ -106,17 +111,8 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
         "attempts": entry.attempts,
         "path": None if entry.path is None else str(entry.path),
         **measures_of(entry.result),
-        **_costs(entry.result),
+        **dict(zip(COSTS, shares, strict=True)),
     }
-
-
-def _costs(record: Mapping[str, Any]) -> dict[str, float | None]:
-    """Shares of the flight time of checks and of each stage's recomputations; None without."""
-    cost = detection_cost(record)
-    if cost is None:
-        return dict.fromkeys(COSTS)
-    shares = (cost.detection_share, *(cost.recovery_s[s] / cost.flight_s for s in RECOMPUTED))
-    return dict(zip(COSTS, shares, strict=True))
 
 
 def _column(values: Sequence[Any]) -> pa.Array:

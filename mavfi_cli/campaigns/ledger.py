@@ -31,7 +31,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import plain
+from mavfi_cli.core.files import plain, writing
 from mavfi_cli.mission.measures import fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -115,11 +115,9 @@ class Ledger:
         self._unlock()
 
     def _become_writer(self) -> None:
-        try:
+        with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = (self.folder / LOCK).open("w")
-        except OSError as error:
-            raise RecordError(f"{self.folder}: {error.strerror or error}") from None
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

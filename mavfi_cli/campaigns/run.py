@@ -40,8 +40,8 @@ from mavfi_cli.campaigns.workers import (
     Verdict,
 )
 from mavfi_cli.core.config import structure
-from mavfi_cli.core.errors import ConfigError, Interrupted, RecordError
-from mavfi_cli.core.files import file_digest
+from mavfi_cli.core.errors import ConfigError, Interrupted
+from mavfi_cli.core.files import file_digest, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.mission.measures import record_of
@@ -135,7 +135,7 @@ def store_plan(
     Args:
         append: missions that are not among the stored ones are added; those that are only there
             stay.
-        differing: phrases that say in what another list differs; without, its first missions do.
+        differing: phrases that say in what another list differs.
         can_append: how to have new missions added, told where no stored one is gone.
 
     Raises:
@@ -152,7 +152,7 @@ def store_plan(
         else:
             new.append(mission)
     if stored and not append and (new or left.total()):
-        found = [*differing] or _first_of(new, +left)
+        found = [*differing]
         found.append(f"{stored} missions there, {len(missions)} here, of which {len(new)} are new")
         remedy = "choose another folder"
         if left.total():
@@ -164,11 +164,6 @@ def store_plan(
         )
     _note_files(ledger, new)
     ledger.plan(new)
-
-
-def _first_of(new: Sequence[PlannedMission], gone: Counter[tuple[str, str, str]]) -> list[str]:
-    firsts = {"new": new[0].stored if new else None, "gone": next(iter(gone), None)}
-    return [f"the first {how} one is {row[0]} {row[2]}" for how, row in firsts.items() if row]
 
 
 def fly_missing(
@@ -188,12 +183,10 @@ def fly_missing(
 def _prepared(folder: Path) -> Iterator[None]:
     """Make a clean folder for the attempts; remnants of a killed run are removed."""
     work = folder / WORK
-    try:
+    with writing(work):
         shutil.rmtree(work, ignore_errors=True)
         for path in (work, folder / PROFILES):
             path.mkdir(exist_ok=True)
-    except OSError as error:
-        raise RecordError(f"{work}: {error.strerror or error}") from None
     try:
         yield
     finally:
@@ -300,7 +293,9 @@ class _Run:
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
-        self._setting_of, self._outcomes = _settings(ledger)
+        names = [str(labels.get("setting", "")) for labels in ledger.cells()]
+        self._setting_of = [names[cell] for cell in ledger.cell_of_each()]
+        self._outcomes = {name: Counter[str]() for name in names}
         self._errors = self._repeated = 0
         self._inside_s = 0.0
         self._total = ledger.planned() if only is None else len(only)
@@ -310,8 +305,13 @@ class _Run:
 
     def fly(self, asked: Sequence[int]) -> None:
         """Fly until nothing is missing, or the user asks to stop."""
-        told = False
-        with contextlib.closing(self._workers()) as workers:
+        told, options = False, self._options
+        fleet: LocalWorkers | Cluster
+        if options.cluster is None:
+            fleet = LocalWorkers(self._jobs, options.task)
+        else:
+            fleet = Cluster(options.cluster, options.keep, options.task)
+        with contextlib.closing(fleet) as workers:
             while len(asked) < 2:
                 self._fill(workers, asked)
                 if not self._flying:
@@ -334,12 +334,6 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _workers(self) -> LocalWorkers | Cluster:
-        options = self._options
-        if options.cluster is None:
-            return LocalWorkers(self._jobs, options.task)
-        return Cluster(options.cluster, options.keep, options.task)
-
     def _fill(self, workers: LocalWorkers | Cluster, asked: Sequence[int]) -> None:
         while workers.free and not asked:
             entry = self._again.pop() if self._again else self._queue.next()
@@ -352,11 +346,9 @@ class _Run:
 
     def _made(self, number: int) -> Path:
         out = self._out(number)
-        try:
+        with writing(out):
             out.mkdir()
             (out / ".profiles").symlink_to(self._folder / PROFILES)
-        except OSError as error:
-            raise RecordError(f"{out}: {error.strerror or error}") from None
         return out
 
     def _out(self, number: int) -> Path:
@@ -426,30 +418,16 @@ class _Run:
         )
 
 
-def _settings(ledger: Ledger) -> tuple[list[str], dict[str, Counter[str]]]:
-    names = [str(labels.get("setting", "")) for labels in ledger.cells()]
-    return [names[cell] for cell in ledger.cell_of_each()], {name: Counter() for name in names}
-
-
 def _put_away(run: Path, runs: Path, number: int) -> Path:
-    """Move a run folder to the kept ones; return its new path.
-
-    Raises:
-        RecordError: it cannot be moved.
-    """
+    """Move a run folder to the kept ones; return its new path."""
     stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
     place = runs / f"{number:06d}-{stem}"
-    try:
+    with writing(place):
         runs.mkdir(exist_ok=True)
         for old in runs.glob(f"{number:06d}-*"):  # of an attempt whose row was never written
             shutil.rmtree(old)
         run.replace(place)
-    except OSError as error:
-        raise RecordError(f"{place}: {error.strerror or error}") from None
     return place
-
-
-_VERSIONS, _FILES = "versions", "files"  # keys of the ledger's `meta`
 
 
 def require_unchanged(ledger: Ledger) -> None:
@@ -459,13 +437,14 @@ def require_unchanged(ledger: Ledger) -> None:
         ConfigError: the campaign was begun with others; names them.
     """
     versions = installed_versions()
-    stored = ledger.meta(_VERSIONS)
+    stored = ledger.meta("versions")
     if stored is None:
-        ledger.set_meta({_VERSIONS: canonical(versions)})
+        ledger.set_meta({"versions": canonical(versions)})
     elif stored != canonical(versions):
         differing = version_differences(json.loads(stored), versions)
         raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
-    changed = [name for name, digest in _noted(ledger).items() if digest != file_digest(name)]
+    noted = json.loads(ledger.meta("files") or "{}")
+    changed = [name for name, digest in noted.items() if digest != file_digest(name)]
     if changed:
         raise ConfigError(
             f"{', '.join(changed)}: changed after the campaign began; choose another folder",
@@ -475,13 +454,8 @@ def require_unchanged(ledger: Ledger) -> None:
 
 def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
     """Store hashes of the files that missions name, for `require_unchanged`."""
-    noted = _noted(ledger)
+    noted = json.loads(ledger.meta("files") or "{}")
     named = {name for mission in missions for name in mission.config.files}
     new = {name: file_digest(name) for name in sorted(named - noted.keys())}
     if new:
-        ledger.set_meta({_FILES: canonical({**noted, **new})})
-
-
-def _noted(ledger: Ledger) -> dict[str, str]:
-    found: dict[str, str] = json.loads(ledger.meta(_FILES) or "{}")
-    return found
+        ledger.set_meta({"files": canonical({**noted, **new})})

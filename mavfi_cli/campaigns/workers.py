@@ -96,7 +96,8 @@ class AttemptEnd:
         report = self.report or {}
         if self.exit == 0 and "folder" in report:
             return _recorded(out / report["folder"], config)
-        _require_space(out)
+        if shutil.disk_usage(out if out.is_dir() else out.parent).free < FULL_BYTES:
+            raise CampaignStopped(f"{out.parent}: the disk is full; run again when there is room")
         if "error" in report:
             return _refused(report["error"], report["text"])
         if self.timeout:
@@ -198,11 +199,6 @@ _OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
 _BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
 # Errors that every other mission would have too.
 _OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
-
-
-def _require_space(out: Path) -> None:
-    if shutil.disk_usage(out if out.is_dir() else out.parent).free < FULL_BYTES:
-        raise CampaignStopped(f"{out.parent}: the disk is full; run again when there is room")
 
 
 def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:

@@ -144,7 +144,11 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
     for text in texts:
         name, _, number = text.partition("=")
         if os.path.exists(text):  # false also of a text that is too long for a path
-            found |= _measured(text, platform)
+            from mavfi_cli.analysis.overhead import recorded_overheads
+            from mavfi_cli.vpm.model import DETECTORS
+
+            known = recorded_overheads(Path(text), DETECTORS, platform)
+            found |= {name: (100.0 * each.share, each.told(text)) for name, each in known.items()}
             continue
         try:
             found[name.strip()] = float(number), "--overhead"
@@ -153,14 +157,6 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
                 f"--overhead {text}: no such file or folder; for a percentage write aad=0.0062"
             ) from None
     return found
-
-
-def _measured(path: str, platform: str | None) -> dict[str, tuple[float, str]]:
-    from mavfi_cli.analysis.overhead import recorded_overheads
-    from mavfi_cli.vpm.model import DETECTORS
-
-    known = recorded_overheads(Path(path), DETECTORS, platform)
-    return {name: (100.0 * each.share, each.told(path)) for name, each in known.items()}
 
 
 def _flown(

@@ -22,7 +22,7 @@ from mavfi_cli.campaigns.detector_plans import NONE, EvaluationPlan, model_diges
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import writing
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.studies import fly
 
@@ -74,12 +74,10 @@ def _protected_folder(plan: EvaluationPlan, folder: Path, detector: str) -> Path
     """
     digest = model_digest(plan.detector_config(detector), plan.base.stack)
     place = folder / PROTECTED / f"{detector}-{digest[:12]}"
-    try:
+    with writing(folder):
         place.mkdir(parents=True, exist_ok=True)
         if not (place / PROFILES).exists():
             (place / PROFILES).symlink_to(Path("..") / ".." / BARE / PROFILES)
-    except OSError as error:
-        raise RecordError(f"{folder}: {error.strerror or error}") from None
     return place
 
 
