@@ -24,6 +24,7 @@ from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import Vector
 
 _PARALLEL = 1e-12
+_Ends = tuple[Vector, Vector, Vector, Vector]  # position, attitude; at the start and the end
 
 
 @compiled
@@ -182,10 +183,9 @@ APPROACH_TOLERANCE_M = 1e-3
 
 
 @compiled
-def _pose_at(
-    share: float, p0: Vector, q0: Vector, p1: Vector, q1: Vector, centre: Vector, rotation: Vector
-) -> None:
+def _pose_at(share: float, ends: _Ends, centre: Vector, rotation: Vector) -> None:
     """Write the pose at a fraction 0..1 of the motion: centre (3,) and rotation (3, 3)."""
+    p0, q0, p1, q1 = ends
     for i in range(3):
         centre[i] = p0[i] + share * (p1[i] - p0[i])
     dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
@@ -211,7 +211,7 @@ def clearance(
 ) -> tuple[float, int]:
     """Return distance, m, from the body to the nearest box, and its index (-1: no box)."""
     centre, rotation = np.empty(3), np.empty((3, 3))
-    _pose_at(0.0, position, quaternion, position, quaternion, centre, rotation)
+    _pose_at(0.0, (position, quaternion, position, quaternion), centre, rotation)
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
     best, nearest, likely = math.inf, -1, 0
     for index in range(boxes.shape[0]):
@@ -254,22 +254,20 @@ def sweep(
     for index in range(boxes.shape[0]):
         outer = _point_distance(p0, boxes[index]) - reach - travel
         if outer <= CONTACT_M:
-            share = _first_touch(p0, q0, p1, q1, half, boxes[index], travel)
+            share = _first_touch((p0, q0, p1, q1), half, boxes[index], travel)
             if share < first:
                 first, touched = share, index
         if outer < least_m:
-            least_m = _approach(p0, q0, p1, q1, half, boxes[index], travel, least_m)
+            least_m = _approach((p0, q0, p1, q1), half, boxes[index], travel, least_m)
     return first, touched, 0.0 if touched >= 0 else least_m
 
 
 @compiled
-def _first_touch(
-    p0: Vector, q0: Vector, p1: Vector, q1: Vector, half: Vector, box: Vector, travel: float
-) -> float:
+def _first_touch(ends: _Ends, half: Vector, box: Vector, travel: float) -> float:
     centre, rotation = np.empty(3), np.empty((3, 3))
     share = 0.0
     while True:
-        _pose_at(share, p0, q0, p1, q1, centre, rotation)
+        _pose_at(share, ends, centre, rotation)
         gap = _body_distance(centre, rotation, half, box)
         if gap <= CONTACT_M:
             return share
@@ -279,22 +277,13 @@ def _first_touch(
 
 
 @compiled
-def _approach(
-    p0: Vector,
-    q0: Vector,
-    p1: Vector,
-    q1: Vector,
-    half: Vector,
-    box: Vector,
-    travel: float,
-    least_m: float,
-) -> float:
+def _approach(ends: _Ends, half: Vector, box: Vector, travel: float, least_m: float) -> float:
     """Return the smallest distance during the motion, at most `least_m`."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     lows, highs, gaps_low, gaps_high = np.empty(64), np.empty(64), np.empty(64), np.empty(64)
-    _pose_at(0.0, p0, q0, p1, q1, centre, rotation)
+    _pose_at(0.0, ends, centre, rotation)
     gaps_low[0] = _body_distance(centre, rotation, half, box)
-    _pose_at(1.0, p0, q0, p1, q1, centre, rotation)
+    _pose_at(1.0, ends, centre, rotation)
     gaps_high[0] = _body_distance(centre, rotation, half, box)
     lows[0], highs[0] = 0.0, 1.0
     least_m = min(least_m, gaps_low[0], gaps_high[0])
@@ -307,7 +296,7 @@ def _approach(
         if bound >= least_m - APPROACH_TOLERANCE_M or waiting > 60:
             continue
         middle = 0.5 * (low + high)
-        _pose_at(middle, p0, q0, p1, q1, centre, rotation)
+        _pose_at(middle, ends, centre, rotation)
         gap = _body_distance(centre, rotation, half, box)
         least_m = min(least_m, gap)
         lows[waiting], highs[waiting] = low, middle

@@ -230,30 +230,21 @@ class Autopilot:
 
 _TOLD = 64  # senders that are remembered as told
 
-_HARMLESS = frozenset(
-    {
-        dialect.MAV_CMD_REQUEST_MESSAGE,
-        dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-        dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
-        dialect.MAV_CMD_GET_MESSAGE_INTERVAL,
-        dialect.MAV_CMD_GET_HOME_POSITION,
-        dialect.MAV_CMD_RUN_PREARM_CHECKS,
-    }
+# Commands that anybody may send, because they change nothing but the sender's own streams.
+_HARMLESS = (
+    dialect.MAV_CMD_REQUEST_MESSAGE,
+    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+    dialect.MAV_CMD_GET_MESSAGE_INTERVAL,
+    dialect.MAV_CMD_GET_HOME_POSITION,
+    dialect.MAV_CMD_RUN_PREARM_CHECKS,
 )
-"""Commands that anybody may send, because they change nothing but the sender's own streams."""
 
-_COMMANDS = (dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT)
-_COMMANDING = frozenset(
-    {
-        *_COMMANDS,
-        dialect.MAVLINK_MSG_ID_SET_MODE,
-        dialect.MAVLINK_MSG_ID_MANUAL_CONTROL,
-        dialect.MAVLINK_MSG_ID_PARAM_SET,
-        dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
-        dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT,
-        dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET,
-    }
-)
+_COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
+_COMMANDING = (
+    *_COMMANDS, "SET_MODE", "MANUAL_CONTROL", "PARAM_SET", "SET_POSITION_TARGET_LOCAL_NED",
+    "SET_POSITION_TARGET_GLOBAL_INT", "SET_ATTITUDE_TARGET",
+)  # fmt: skip
 
 _Sender = tuple[Link, int, int]  # link, system, component
 
@@ -278,8 +269,8 @@ class _Authority:
         system = message.get_srcSystem()
         if not self._trusted or system in self._trusted:
             return True
-        number = message.get_msgId()
-        if number not in _COMMANDING or (number in _COMMANDS and message.command in _HARMLESS):
+        kind = message.get_type()
+        if kind not in _COMMANDING or (kind in _COMMANDS and message.command in _HARMLESS):
             return True
         names = ", ".join(str(each) for each in sorted(self._trusted))
         self._tell((link, system, 0), f"Commands of system {system} refused, trusted: {names}")

@@ -51,11 +51,6 @@ class FlightMode(Enum):
         numbers = (main, (sub or cls.LOITER.sub) if auto else 0)
         return next((mode for mode in cls if (mode.main, mode.sub) == numbers), None)
 
-    @classmethod
-    def from_custom(cls, custom_mode: int) -> FlightMode | None:
-        """Return the mode of a SET_MODE's custom_mode; None if there is none."""
-        return cls.from_numbers(custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF)
-
     def base_mode(self, *, armed: bool) -> int:
         """Return HEARTBEAT.base_mode as in PX4 v1.17."""
         flags: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED

@@ -350,7 +350,9 @@ def _set_mode_message(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
     if message.target_system != autopilot.system_id:
         return
-    mode = FlightMode.from_custom(message.custom_mode) if message.base_mode & 1 else None
+    mode, custom = None, message.custom_mode
+    if message.base_mode & 1:
+        mode = FlightMode.from_numbers(custom >> 16 & 0xFF, custom >> 24 & 0xFF)
     result = autopilot.enter_mode(mode)
     link.send(_acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, result))
 

@@ -111,13 +111,15 @@ RAW_PROPERTIES = (
     *(f"propulsion/engine[{n}]/propeller-rpm" for n in range(ROTORS)),
     *(f"propulsion/engine[{n}]/propeller-power-ftlbps" for n in range(ROTORS)),
 )
-RAW_POSITION = 0
-RAW_VELOCITY = 3
-RAW_EULER = 6
-RAW_RATES = 9
-RAW_WOW = 12
-RAW_RPM = 13
-RAW_POWER = 17
+RAW_POSITION, RAW_VELOCITY, RAW_EULER, RAW_RATES, RAW_WOW, RAW_RPM, RAW_POWER = (
+    0,
+    3,
+    6,
+    9,
+    12,
+    13,
+    17,
+)
 RAW_SIZE = len(RAW_PROPERTIES)
 
 

@@ -9,50 +9,23 @@ import numpy as np
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import Vector, ned_from_enu, ned_yaw_from_enu
-from sitl.vehicle.cascade import (
-    M_ON_GROUND,
-    M_POSITION,
-    M_QUATERNION,
-    M_RATES,
-    M_VELOCITY,
-    MEASUREMENT_SIZE,
-    STATE_SIZE,
-    control_step,
-)
+from sitl.vehicle import cascade, physics
 from sitl.vehicle.gains import gains_for
-from sitl.vehicle.physics import (
-    FOOT_M,
-    FOOT_POUND_J,
-    PLANET_RADIUS_M,
-    RAW_EULER,
-    RAW_POSITION,
-    RAW_POWER,
-    RAW_RATES,
-    RAW_RPM,
-    RAW_SIZE,
-    RAW_VELOCITY,
-    RAW_WOW,
-    Physics,
-)
 from sitl.vehicle.profile import VehicleProfile
 
 T_STAMP = 0
-T_POSITION = M_POSITION
-T_VELOCITY = M_VELOCITY
+T_POSITION = cascade.M_POSITION
+T_VELOCITY = cascade.M_VELOCITY
 T_ACCELERATION = 7
-T_QUATERNION = M_QUATERNION
-T_RATES = M_RATES
+T_QUATERNION = cascade.M_QUATERNION
+T_RATES = cascade.M_RATES
 T_COMMANDS = 17
 T_RPM = 21
-T_ON_GROUND = M_ON_GROUND
-T_VOLTAGE = 26
-T_CURRENT = 27
-T_REMAINING = 28
-T_POWER_REGRESSION = 29
-T_POWER_PROPELLER = 30
-T_ENERGY_REGRESSION = 31
-T_ENERGY_PROPELLER = 32
-TRUTH_SIZE = MEASUREMENT_SIZE
+T_ON_GROUND = cascade.M_ON_GROUND
+T_VOLTAGE, T_CURRENT, T_REMAINING = 26, 27, 28
+T_POWER_REGRESSION, T_POWER_PROPELLER = 29, 30
+T_ENERGY_REGRESSION, T_ENERGY_PROPELLER = 31, 32
+TRUTH_SIZE = cascade.MEASUREMENT_SIZE
 
 KMH_PER_MPS = 3.6
 
@@ -184,20 +157,20 @@ def _observe_motion(raw: Vector, dt_s: float, truth: Vector) -> None:
     """Update motion and rotors in `truth` from JSBSim's raw state."""
     for axis in range(3):
         sign = -1.0 if axis == 2 else 1.0
-        velocity = sign * raw[RAW_VELOCITY + axis] * FOOT_M
+        velocity = sign * raw[physics.RAW_VELOCITY + axis] * physics.FOOT_M
         if dt_s > 0.0:
             truth[T_ACCELERATION + axis] = (velocity - truth[T_VELOCITY + axis]) / dt_s
         truth[T_VELOCITY + axis] = velocity
-        truth[T_POSITION + axis] = raw[RAW_POSITION + axis] * FOOT_M
-        truth[T_RATES + axis] = raw[RAW_RATES + axis]
-    truth[T_POSITION + 2] = PLANET_RADIUS_M - raw[RAW_POSITION + 2] * FOOT_M
-    roll, pitch, yaw = raw[RAW_EULER : RAW_EULER + 3]
+        truth[T_POSITION + axis] = raw[physics.RAW_POSITION + axis] * physics.FOOT_M
+        truth[T_RATES + axis] = raw[physics.RAW_RATES + axis]
+    truth[T_POSITION + 2] = physics.PLANET_RADIUS_M - raw[physics.RAW_POSITION + 2] * physics.FOOT_M
+    roll, pitch, yaw = raw[physics.RAW_EULER : physics.RAW_EULER + 3]
     _euler_quaternion(roll, pitch, yaw, truth[T_QUATERNION : T_QUATERNION + 4])
-    truth[T_ON_GROUND] = 1.0 if raw[RAW_WOW] > 0.0 else 0.0
+    truth[T_ON_GROUND] = 1.0 if raw[physics.RAW_WOW] > 0.0 else 0.0
     power_w = 0.0
     for rotor in range(4):
-        truth[T_RPM + rotor] = raw[RAW_RPM + rotor]
-        power_w += raw[RAW_POWER + rotor] * FOOT_POUND_J
+        truth[T_RPM + rotor] = raw[physics.RAW_RPM + rotor]
+        power_w += raw[physics.RAW_POWER + rotor] * physics.FOOT_POUND_J
     truth[T_POWER_PROPELLER] = power_w
 
 
@@ -261,7 +234,7 @@ class Quadrotor:
         self.dt_s = dt_s
         start = np.array(position_enu_m, dtype=np.float64)
         start[2] = max(start[2], profile.rest_height_m)
-        self._physics = Physics(
+        self._physics = physics.Physics(
             profile,
             position_ned_m=ned_from_enu(start),
             heading_rad=ned_yaw_from_enu(yaw_enu_rad),
@@ -270,8 +243,8 @@ class Quadrotor:
         self._gains = gains_for(profile, dt_s)
         self._regression = profile.energy.coefficients(profile.extra_payload_kg)
         self._battery = profile.battery.parameters()
-        self._state = np.zeros(STATE_SIZE)
-        self._raw = np.zeros(RAW_SIZE)
+        self._state = np.zeros(cascade.STATE_SIZE)
+        self._raw = np.zeros(physics.RAW_SIZE)
         self._flat = np.zeros(TRUTH_SIZE)
         self._flat[T_REMAINING] = 1.0
         self._steps = 0
@@ -286,7 +259,9 @@ class Quadrotor:
                 m/s^2, rad, rad/s. Values that are not finite are not controlled.
             armed: False stops the motors.
         """
-        self._state, commands = control_step(self._state, self._flat, setpoint, self._gains, armed)
+        self._state, commands = cascade.control_step(
+            self._state, self._flat, setpoint, self._gains, armed
+        )
         self.drive(commands, armed=armed)
 
     def drive(self, commands: Vector, *, armed: bool) -> None:
