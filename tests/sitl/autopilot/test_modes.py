@@ -17,7 +17,7 @@ from sitl.autopilot.commander import FlightMode
 )
 def test_custom_mode_is_px4s(mode, custom):
     assert mode.custom_mode == custom
-    assert FlightMode.from_custom(custom) is mode
+    assert FlightMode.from_numbers(custom >> 16 & 0xFF, custom >> 24 & 0xFF) is mode
 
 
 @pytest.mark.parametrize(
