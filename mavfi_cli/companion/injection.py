@@ -57,6 +57,9 @@ class NoInjection:
         """Write and return the record at the end of the mission."""
         return None
 
+    def close(self) -> None:
+        """End what was started for the injection."""
+
 
 class _Killer(Injector):
     """Decides when the process of a node is killed, which happens once."""

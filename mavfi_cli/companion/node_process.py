@@ -104,7 +104,7 @@ class NodeProcess:
         def child() -> int:
             """Serve the parent until it closes the connection."""
             ours.close()
-            serve(theirs, runs)
+            cls.serve(theirs, runs)
 
         pid = fork(child)
         theirs.close()
@@ -204,34 +204,34 @@ class NodeProcess:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(self.pid, 0)
 
-
-def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:
-    """Process orders in the child until the parent closes the connection. Does not return."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # only the parent ends this process
-    faulthandler.disable()
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    try:
-        while True:
-            order: _Order | _Rehearse = receive(connection)
-            if isinstance(order, _Rehearse):
-                _rehearse(connection, runs)
-                continue
-            begun = perf_counter()
-            output, error = None, None
-            try:
-                output = runs[order.node](order.input, order.start_s)
-            except Exception as failure:  # the node's boundary: a crash is a result
-                error = f"{described(failure)}\n{traceback.format_exc()}"
-            host_s = perf_counter() - begun
-            send(
-                connection,
-                _Answer(number=order.number, output=output, host_s=host_s, error=error),
-            )
-    except (OSError, EOFError):
-        os._exit(0)
-    finally:
-        os._exit(1)
+    @staticmethod
+    def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:
+        """Process orders in the child until the parent closes the connection. Does not return."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # only the parent ends this process
+        faulthandler.disable()
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        try:
+            while True:
+                order: _Order | _Rehearse = receive(connection)
+                if isinstance(order, _Rehearse):
+                    _rehearse(connection, runs)
+                    continue
+                begun = perf_counter()
+                output, error = None, None
+                try:
+                    output = runs[order.node](order.input, order.start_s)
+                except Exception as failure:  # the node's boundary: a crash is a result
+                    error = f"{described(failure)}\n{traceback.format_exc()}"
+                host_s = perf_counter() - begun
+                send(
+                    connection,
+                    _Answer(number=order.number, output=output, host_s=host_s, error=error),
+                )
+        except (OSError, EOFError):
+            os._exit(0)
+        finally:
+            os._exit(1)
 
 
 def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:

@@ -279,32 +279,32 @@ class Protection(NoProtection):
             },
         }
 
+    @staticmethod
+    def is_compiled(config: DetectorConfig, stack: str) -> bool:
+        """Return True if the kernels are compiled. Otherwise `warm_up` takes many seconds."""
+        judge = getattr(config.built(stack), "tick_judge", None)
+        return in_cache(judge or take_tick)
 
-def is_compiled(config: DetectorConfig, stack: str) -> bool:
-    """Return True if the gate's kernels are compiled. Otherwise `warm_up` takes many seconds."""
-    judge = getattr(config.built(stack), "tick_judge", None)
-    return in_cache(judge or take_tick)
-
-
-def warm_up(config: DetectorConfig, stack: str) -> None:
-    """Load and compile everything that a gate runs. Raises as `DetectorConfig.built`."""
-    gate = Gate(config.built(stack))
-    report = CollisionReport(
-        stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
-    )
-    plan = Trajectory(
-        stamp_s=0.0,
-        waypoints=np.zeros((2, 10)),
-        durations_s=np.ones(2),
-        trajectory_seq=1,
-        future_collision_seq=0,
-    )
-    command = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
-    for _ in range(2):
-        gate.judge_report(report)
-        gate.judge_plan(plan)
-        gate.judge_ahead(plan, 0)
-        gate.judge_tick(plan, 0, command)
+    @staticmethod
+    def warm_up(config: DetectorConfig, stack: str) -> None:
+        """Load and compile everything that a gate runs. Raises as `DetectorConfig.built`."""
+        gate = Gate(config.built(stack))
+        report = CollisionReport(
+            stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
+        )
+        plan = Trajectory(
+            stamp_s=0.0,
+            waypoints=np.zeros((2, 10)),
+            durations_s=np.ones(2),
+            trajectory_seq=1,
+            future_collision_seq=0,
+        )
+        command = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
+        for _ in range(2):
+            gate.judge_report(report)
+            gate.judge_plan(plan)
+            gate.judge_ahead(plan, 0)
+            gate.judge_tick(plan, 0, command)
 
 
 class Recovery:

@@ -26,7 +26,7 @@ from mavfi_cli.core.errors import (
 )
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.images import IMAGE_MESSAGES, ImageFrame, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import Telemetry
@@ -41,7 +41,7 @@ SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts
 BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
-_POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+_POSITION, _AUTOPILOT = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, dialect.MAV_COMP_ID_AUTOPILOT1
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _PACE_AFTER_S = 1.0  # wall time after which the pace of a foreign vehicle is known
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
@@ -308,16 +308,11 @@ class Flight:
                         self._seen_s = self.stamp_s
                     continue
                 self._session.handle(message)
-                if number == _POSITION and self._is_autopilot(message):
-                    stamp_ms = message.time_boot_ms
+                if number == _POSITION:
+                    known, system = self._session.telemetry.system, message.get_srcSystem()
+                    if system == (known or system) and message.get_srcComponent() == _AUTOPILOT:
+                        stamp_ms = message.time_boot_ms
         return None if stamp_ms is None else stamp_ms / 1e3
-
-    def _is_autopilot(self, message: Message) -> bool:
-        system = self._session.telemetry.system or message.get_srcSystem()
-        return bool(
-            message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1
-            and message.get_srcSystem() == system
-        )
 
     def _go_without(self, clock: ForeignClock, waited_s: float) -> None:
         clock.wait(waited_s)

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy import planners, warm
-from mavfi_cli.companion import protection
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
+from mavfi_cli.companion.protection import Protection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import file_digest, write_json, write_parquet, write_text, writing
 from mavfi_cli.core.installed import installed_versions
@@ -67,8 +67,13 @@ def fly_mission(
     load_platform(config.platform), planners.find(config.planner)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
+    injection = NoInjection()
+    if config.instruction is not None:
+        from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the tracer
+
+        injection = InstructionInjection(config, out, repeat, for_debugger)
     with (
-        _injection(config, out, repeat, for_debugger) as injection,
+        contextlib.closing(injection),
         interruptible() as interrupt,
         other_end(config, launch) as (link, vehicle),
     ):
@@ -94,29 +99,12 @@ def fly_mission(
 
 def _warm_up(config: MissionConfig, watcher: Watcher) -> None:
     detector = config.detector
-    known = detector is None or protection.is_compiled(detector, config.stack)
+    known = detector is None or Protection.is_compiled(detector, config.stack)
     if not (warm.is_compiled() and known):
         watcher.on_note(COMPILING)
     warm.warm_up()
     if detector is not None:
-        protection.warm_up(detector, config.stack)
-
-
-@contextlib.contextmanager
-def _injection(
-    config: MissionConfig,
-    out: Path,
-    repeat: Mapping[str, Any] | None,
-    for_debugger: Callable[[int], None] | None,
-) -> Iterator[NoInjection]:
-    if config.instruction is None:
-        yield NoInjection()
-        return
-    from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the debugger
-
-    injection = InstructionInjection(config, out, repeat, for_debugger)
-    with contextlib.closing(injection):
-        yield injection
+        Protection.warm_up(detector, config.stack)
 
 
 def _begin(

@@ -154,20 +154,14 @@ class MissionConfig:
                 raise ConfigError(f"must be within {span}, got {number}", key=name)
 
     def _check_link(self) -> None:
-        if self.eyes and self.link is None:
-            raise ConfigError(_NEEDS_LINK, key="eyes")
+        if self.link is None:
+            for name in ("eyes", "key_file", "loss_limit_s"):
+                if getattr(self, name) not in (False, None, _LOSS_LIMIT_S):
+                    raise ConfigError(_NEEDS_LINK, key=name)
         if self.origin is not None and not self.eyes:
             raise ConfigError("needs --eyes, without which there is no world", key="origin")
-        if self.link is not None:
-            self._check_foreign()
+        if self.link is None:
             return
-        if self.key_file is not None:
-            raise ConfigError(_NEEDS_LINK, key="key_file")
-        if self.loss_limit_s != _LOSS_LIMIT_S:
-            raise ConfigError(_NEEDS_LINK, key="loss_limit_s")
-
-    def _check_foreign(self) -> None:
-        """Reject what has no meaning for a foreign autopilot."""
         if self.realtime:
             raise ConfigError(f"paces {_SIMULATED}", key="realtime")
         if self.eyes:

@@ -9,7 +9,7 @@ from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.attack.served import channel, newest_cache_ns
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.node_process import serve
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.config import structure
@@ -57,7 +57,7 @@ def main() -> None:
     config = setup.config
     companion = Companion(config, setup.briefing, WallClock(), NoInjection(), NoProtection())
     send(connection, (node_scope(setup.node, config.planner), newest_cache_ns()))
-    serve(connection, companion.executor.process_of(setup.node))
+    NodeProcess.serve(connection, companion.executor.process_of(setup.node))
 
 
 if __name__ == "__main__":
