@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from mavfi_cli.core.errors import RecordError
+
 if TYPE_CHECKING:
     from mavfi_cli.mission.progress import Recorder
     from mavfi_cli.mission.run_folder import Run
@@ -41,7 +43,6 @@ def view(run: Path, save: Path | None) -> None:
 
 def _golden(run: Run) -> Run | None:
     """Return the golden flight of the pair; None if it cannot be flown."""
-    from mavfi_cli.core.errors import RecordError
     from mavfi_cli.mission.run import paired_golden
 
     try:
@@ -53,7 +54,6 @@ def _golden(run: Run) -> Run | None:
 
 def _again(run: Run) -> Recorder | None:
     """Fly a run again and return what its nodes received; None if it does not repeat."""
-    from mavfi_cli.core.errors import RecordError
     from mavfi_cli.mission.run import watch_again
 
     try:

@@ -11,7 +11,7 @@ from typing import Any
 
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.flights import flights
-from mavfi_cli.analysis.summary import METRICS, Group, groups
+from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import PRESETS
@@ -132,68 +132,52 @@ def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
 def of_model() -> PaperTable:
     """The table of Fig. 15, of the performance model with the paper's overheads."""
     item = BY_NAME["fig15"]
-    vehicles = [ModelVehicle.load(column.title) for column in item.columns]
-    told = report(vehicles, Choices(), schemes_with({}))["vehicles"]
-    ratio_of = {
-        (row["scheme"], one["vehicle"]): row["flight_time_ratio"]
-        for one in told
-        for row in one["schemes"]
-    }
-    rows = {
-        scheme: PaperRow(labels=(scheme,), cells=tuple(
+    names = [column.title for column in item.columns]
+    told = report([ModelVehicle.load(each) for each in names], Choices(), schemes_with({}))
+    rows = {}
+    for of_vehicles in zip(*(one["schemes"] for one in told["vehicles"]), strict=True):
+        scheme, ratios = of_vehicles[0]["scheme"], [x["flight_time_ratio"] for x in of_vehicles]
+        cells = (
             PaperCell(
-                value=math.nan if (ratio := ratio_of[scheme, name]) is None else float(ratio),
+                value=math.nan if ratio is None else float(ratio),
                 paper=printed("fig15", "time_ratio", scheme, name),
             )
-            for name in (column.title for column in item.columns)
-        ))
-        for scheme, _ in ratio_of
-    }  # fmt: skip
+            for name, ratio in zip(names, ratios, strict=True)
+        )
+        rows[scheme] = PaperRow(labels=(scheme,), cells=tuple(cells))
     table = item.table([*rows.values()])
-    times = (
-        f"{x.title} {table.told(rows['tmr'], place, '')}" for place, x in enumerate(table.columns)
-    )
+    times = (f"{name} {table.told(rows['tmr'], place, '')}" for place, name in enumerate(names))
     return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
 
 
 # Campaigns that are no item's --------------------------------------------------------------------
 
 
+_MEANS = {
+    "time, s": ("flight_time_s", 1.0), "distance, m": ("distance_m", 1.0),
+    "energy, kJ": ("energy_regression_j", 1e-3), "replans": ("replans", 1.0),
+}  # fmt: skip
+
+
 def _settings_table(ledger: Ledger) -> PaperTable:
-    scales = {"flight_time_s": ("time, s", 1.0), "distance_m": ("distance, m", 1.0),
-              "energy_regression_j": ("energy, kJ", 1e-3), "replans": ("replans", 1.0)}  # fmt: skip
-    assert tuple(scales) == METRICS
     found = groups(ledger)
     settings = SettingColumns.of([group.labels for group in found])
+    rows = []
+    for group in found:
+        won = group.succeeded[group.counted]
+        success = PaperCell.of_share(rate(int(won.sum()), len(won)))
+        means = (PaperCell.of_mean(k * group.successes(name)) for name, k in _MEANS.values())
+        labels = tuple(settings.cells(group.labels, group.name))
+        rows.append(PaperRow(labels=labels, cells=(success, *means)))
+    about = "success: golden missions and faults that struck; means: the successful of them"
     return PaperTable(
         name=_SETTINGS,
         title=f"{ledger.meta('name') or ledger.folder.name}: settings",
         labels=settings.heads,
-        columns=(
-            PaperColumn(title="success, %", ends=0),
-            *(PaperColumn(title=title) for title, _ in scales.values()),
-        ),
-        rows=tuple(
-            PaperRow(
-                labels=tuple(settings.cells(group.labels, group.name)),
-                cells=(
-                    _success(group),
-                    *(PaperCell.of_mean(scale * group.successes(name))
-                      for name, (_, scale) in scales.items()),
-                ),
-            )
-            for group in found
-        ),
-        notes=(
-            *settings.told(),
-            "success: golden missions and faults that struck; means: the successful of them",
-        ),
-    )  # fmt: skip
-
-
-def _success(group: Group) -> PaperCell:
-    won = group.succeeded[group.counted]
-    return PaperCell.of_share(rate(int(won.sum()), len(won)))
+        columns=(PaperColumn(title="success, %", ends=0), *(PaperColumn(title=x) for x in _MEANS)),
+        rows=tuple(rows),
+        notes=(*settings.told(), about),
+    )
 
 
 def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
