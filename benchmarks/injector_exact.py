@@ -36,7 +36,7 @@ from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, Record, one_processor, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.fi.tracer import record
@@ -132,7 +132,7 @@ def taken_fault(profile: TargetProfile):
     return fault
 
 
-def counted(place: KernelPlace, address: int) -> int:
+def counted(place: Any, address: int) -> int:
     """Executions of an instruction in one undisturbed run, before its end is written."""
     tracee = place.start()
     try:
@@ -141,9 +141,7 @@ def counted(place: KernelPlace, address: int) -> int:
         tracee.kill()
 
 
-def chi_square(
-    place: KernelPlace, profile: TargetProfile, draws: int, rng: np.random.Generator
-) -> str:
+def chi_square(place: Any, profile: TargetProfile, draws: int, rng: np.random.Generator) -> str:
     """Chi-square of drawn instructions against the counts of a run that was not stepped."""
     addresses = sorted({int(each) for each in profile.strata[0].segments[0].trace})
     counts = np.array([counted(place, address) for address in addresses])
@@ -163,9 +161,7 @@ def chi_square(
     )
 
 
-def estimates(
-    place: KernelPlace, profile: TargetProfile, number: int, rng: np.random.Generator
-) -> str:
+def estimates(place: Any, profile: TargetProfile, number: int, rng: np.random.Generator) -> str:
     """The counts of sampled instructions over their estimates, and how many are in the interval."""
     traces = [[segment.trace for segment in stratum.segments] for stratum in profile.strata]
     addresses = np.unique(np.concatenate([trace for some in traces for trace in some]))

@@ -29,12 +29,13 @@ import select
 import tempfile
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.target import KernelPlace, KernelTarget
+from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.profile import detour_of
 from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.inject import instruction_at
@@ -64,7 +65,7 @@ def finish_alone(tracee: Tracee) -> None:
         os.close(process)
 
 
-def run(place: KernelPlace, way: str, detour: Detour | None) -> float:
+def run(place: Any, way: str, detour: Detour | None) -> float:
     """CPU time of one call, s."""
     tracee = place.start()
     entry = place.image(tracee).address(place.kernel_scope.entry)

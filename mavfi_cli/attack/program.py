@@ -187,21 +187,17 @@ class _Workplace:
 
     def __init__(self, target: ProgramTarget) -> None:
         _require_attackable(Path(target.command.argv[0]))
-        self.target, self.limits = target, target.limits
+        self.target, self.name, self.limits = target, target.name, target.limits
+        self.context = target.context
         self._golden: Golden | None = None
         self._watched: Watched | None = None
         with writing(Path(tempfile.gettempdir())):
             scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
-        self._remove = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self.close = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
         self._counts = scratch / "counts"
         self._folder = scratch / "run"
         self._command = replace(target.command, directory=self._folder)
-
-    @property
-    def name(self) -> str:
-        """The program's file name."""
-        return self.target.name
 
     def start(self) -> Tracee:
         """Start the program, stopped at its entry point.
@@ -232,19 +228,12 @@ class _Workplace:
             raise TargetError(self.name, problem) from None
 
     def image(self, tracee: Tracee) -> Image:
-        """The memory image of a run."""
         return Image(tracee.pid)
 
     def scope(self, image: Image) -> Scope:
-        """The code that may be hit."""
         return image.scope(self.target.scope_objects)
 
-    def context(self) -> dict[str, Any]:
-        """Entries of every record about the program."""
-        return self.target.context()
-
     def _parts(self) -> dict[str, bytes | None]:
-        """The outputs of the last run, by name."""
         return self.target.comparison.parts(self._folder, self._stdout)
 
     def profile(
@@ -418,7 +407,6 @@ class _Workplace:
         return f"their outputs differ {where}; --ignore-lines leaves out lines that change"
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None if it exceeded its limit."""
         parts, comparison = self._parts(), self.target.comparison
         output = _joined(parts)
         outcome, difference = judged(
@@ -432,10 +420,6 @@ class _Workplace:
                 "magnitude": None if difference is None else difference.relative,
             },
         )
-
-    def close(self) -> None:
-        """Delete the scratch folder."""
-        self._remove()
 
 
 def _joined(parts: dict[str, bytes | None]) -> bytes:

@@ -125,11 +125,6 @@ class ServedProcess:
             self._errors = -1
 
 
-def channel() -> socket.socket:
-    """The program's end of the socket; call it in the program."""
-    return socket.socket(fileno=CHANNEL)
-
-
 def newest_cache_ns() -> int:
     """Time of the newest file in the caches of the code that this process has loaded.
 

@@ -71,7 +71,7 @@ class _Killer(Injector):
         super().__init__(rng, config.trigger(), config.corruption(), shortest_flight_s, listener)
 
     def strike(self, moment: Moment) -> None:
-        if self._schedule.due(moment):
+        if self._due(moment):
             self._tell(moment, moment.tick, ())
 
 

@@ -90,6 +90,19 @@ class Corruption:
         if not (self.period_s > 0.0 and math.isfinite(self.period_s)):
             raise FaultSpecError(f"a period of {self.period_s:g} s is not possible")
 
+    def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
+        """Refuse a corruption whose bits the value of this name and type does not have.
+
+        Raises:
+            FaultError: an exact bit or the field is missing, or the field has too few bits.
+        """
+        if bits is not None:
+            kind.mask(bits)
+        elif self.effect is Effect.FLIP and self.bits > len(kind.field_bits(self.field)):
+            raise FaultSpecError(
+                f"{name} is {kind.name}: its field {self.field.value} has no {self.bits} bits"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceFault:
@@ -136,29 +149,9 @@ def draw_fault(
     rng = Stream.FAULT.generator(seed, "site")
     states = _states(target, rng, together, corruption.field)
     for state in states:
-        require_bits(state.name, NUMPY_TYPES[state.dtype.value], corruption, bits)
+        corruption.require(state.name, NUMPY_TYPES[state.dtype.value], bits)
     chosen = None if bits is None else tuple(tuple(sorted(bits)) for _ in states)
     return SourceFault(states=states, trigger=trigger, corruption=corruption, bits=chosen)
-
-
-def require_bits(
-    name: str, kind: BitType, corruption: Corruption, bits: Sequence[int] | None
-) -> None:
-    """Refuse a fault whose bits a value does not have.
-
-    Raises:
-        FaultError: an exact bit or the field is missing.
-        FaultSpecError: the field has too few bits.
-    """
-    if bits is not None:
-        kind.mask(bits)
-    elif corruption.effect is Effect.FLIP and corruption.bits > len(
-        kind.field_bits(corruption.field)
-    ):
-        raise FaultSpecError(
-            f"{name} is {kind.name}: its field {corruption.field.value} has no "
-            f"{corruption.bits} bits"
-        )
 
 
 def _states(

@@ -33,7 +33,6 @@ from mavfi_cli.fi.fault import (
     SourceFault,
     Trigger,
     When,
-    require_bits,
 )
 
 M = TypeVar("M")
@@ -51,80 +50,6 @@ class Moment:
     tick: int  # control ticks since then
     phase: str  # the pilot's mode
     foresees: bool = False  # a report of a foreseen collision is being passed on
-
-
-class _Schedule:
-    """Decides at which moments a fault strikes."""
-
-    def __init__(self, trigger: Trigger, corruption: Corruption, drawn_time_s: float) -> None:
-        self._came = False  # the trigger came, whether or not there was anything to strike
-        self._trigger = trigger
-        self._corruption = corruption
-        self._drawn_time_s = drawn_time_s
-        self._begun_s: float | None = None
-        self._last_s = -math.inf
-
-    def watch(self, moment: Moment) -> None:
-        """Note the mission's present state, even if there is nothing to strike.
-
-        A phase may begin and end before the next message with the attacked state.
-        """
-        self._came = self._came or self._comes(moment)
-
-    def missed(self, what: str) -> str:
-        """The reason if the fault never struck; `what` is what it waited for, such as "report"."""
-        trigger = self._trigger
-        never, since = {
-            When.PHASE: (
-                f"the pilot was never in phase {trigger.phase}",
-                f"phase {trigger.phase} had begun",
-            ),
-            When.FORESEEN: ("no collision was ever foreseen", "a collision was first foreseen"),
-        }.get(trigger.when, ("the mission ended before the trigger", "the trigger"))
-        return f"no {what} came after {since}" if self._came else never
-
-    def due(self, moment: Moment, invocations: int = 0) -> bool:
-        """True if the fault strikes now; `invocations` counts the kernel's outputs so far."""
-        self.watch(moment)
-        corruption = self._corruption
-        if self._begun_s is None:
-            return self._reached(moment, invocations)
-        if corruption.persistence is Persistence.TRANSIENT:
-            return False
-        if moment.stamp_s - self._begun_s >= corruption.duration_s:
-            return False
-        if corruption.persistence is Persistence.INTERMITTENT:
-            return moment.stamp_s - self._last_s >= corruption.period_s - 1e-9
-        return True
-
-    def acted(self, moment: Moment) -> None:
-        """Note a strike."""
-        if self._begun_s is None:
-            self._begun_s = moment.stamp_s
-        self._last_s = moment.stamp_s
-
-    def _reached(self, moment: Moment, invocations: int) -> bool:
-        trigger = self._trigger
-        if trigger.when in (When.PHASE, When.FORESEEN):
-            return self._came
-        if trigger.when is When.INVOCATION:
-            return invocations >= trigger.number
-        return self._comes(moment)
-
-    def _comes(self, moment: Moment) -> bool:
-        """True if the trigger has come; invocations are counted with the messages instead."""
-        trigger = self._trigger
-        if trigger.when is When.TIME:
-            return moment.flight_s >= trigger.number - 1e-9
-        if trigger.when is When.TICK:
-            return moment.tick >= trigger.number
-        if trigger.when is When.PHASE:
-            return moment.phase == trigger.phase
-        if trigger.when is When.FORESEEN:
-            return moment.foresees
-        if trigger.when is When.INVOCATION:
-            return False
-        return moment.flight_s >= self._drawn_time_s
 
 
 class _Pattern:
@@ -241,22 +166,65 @@ class Injector(NoInjector):
     ) -> None:
         super().__init__()
         self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
-        self._schedule = _Schedule(trigger, corruption, self.drawn_time_s)
+        self._trigger, self._corruption = trigger, corruption
+        self._came = False  # the trigger came, whether or not there was anything to strike
+        self._begun_s: float | None = None
+        self._last_s = -math.inf
         self._listener = listener
         self.strikes: list[Strike] = []
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """See `NoInjector`."""
-        self._schedule.watch(moment)
+        """Note the mission's present state, even if there is nothing to strike.
+
+        A phase may begin and end before the next message with the attacked state.
+        """
+        self._came = self._came or self._comes(moment)
 
     @property
     def missed(self) -> str:
         """The reason if the fault never struck."""
-        return self._schedule.missed(self._awaits)
+        never, since = {
+            When.PHASE: (
+                f"the pilot was never in phase {self._trigger.phase}",
+                f"phase {self._trigger.phase} had begun",
+            ),
+            When.FORESEEN: ("no collision was ever foreseen", "a collision was first foreseen"),
+        }.get(self._trigger.when, ("the mission ended before the trigger", "the trigger"))
+        return f"no {self._awaits} came after {since}" if self._came else never
+
+    def _due(self, moment: Moment, invocations: int = 0) -> bool:
+        """True if the fault strikes now; `invocations` counts the kernel's outputs so far."""
+        self.watch(moment)
+        corruption = self._corruption
+        if self._begun_s is None:
+            if self._trigger.when is When.INVOCATION:
+                return invocations >= self._trigger.number
+            lasts = self._trigger.when in (When.PHASE, When.FORESEEN)
+            return self._came if lasts else self._comes(moment)
+        if corruption.persistence is Persistence.TRANSIENT:
+            return False
+        if moment.stamp_s - self._begun_s >= corruption.duration_s:
+            return False
+        if corruption.persistence is Persistence.INTERMITTENT:
+            return moment.stamp_s - self._last_s >= corruption.period_s - 1e-9
+        return True
+
+    def _comes(self, moment: Moment) -> bool:
+        """True if the trigger has come; invocations are counted with the messages instead."""
+        trigger = self._trigger
+        return {
+            When.TIME: moment.flight_s >= trigger.number - 1e-9,
+            When.TICK: moment.tick >= trigger.number,
+            When.PHASE: moment.phase == trigger.phase,
+            When.FORESEEN: moment.foresees,
+            When.INVOCATION: False,
+            When.RANDOM: moment.flight_s >= self.drawn_time_s,
+        }[trigger.when]
 
     def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> Strike:
-        self._schedule.acted(moment)
+        self._begun_s = moment.stamp_s if self._begun_s is None else self._begun_s
+        self._last_s = moment.stamp_s
         strike = Strike(
             stamp_s=moment.stamp_s,
             tick=moment.tick,
@@ -297,7 +265,7 @@ class SourceInjector(Injector):
         self._invocations += 1
         if type(message) is Trajectory and self._strikes_latched():
             return message
-        if not self._schedule.due(moment, self._invocations):
+        if not self._due(moment, self._invocations):
             return message
         return self._strike(message, moment, 0)
 
@@ -309,7 +277,7 @@ class SourceInjector(Injector):
             Persistence.INTERMITTENT
         ):
             return trajectory
-        if not self._schedule.due(moment, self._invocations):
+        if not self._due(moment, self._invocations):
             return trajectory
         struck = self._strike(trajectory, moment, index)
         self._struck = struck
@@ -408,14 +376,14 @@ class MemoryInjector(Injector):
         self.array = array
         self.element = int(rng.integers(memory[array].size))
         self._kind = NUMPY_TYPES[memory[array].dtype.name]
-        require_bits(array, self._kind, corruption, bits)
+        corruption.require(array, self._kind, bits)
         self._memory = memory
         chosen = None if bits is None else tuple(sorted(bits))
         self._pattern = _Pattern(corruption, rng, chosen)
 
     def strike(self, moment: Moment) -> None:
         """See `NoInjector`."""
-        if not self._schedule.due(moment, moment.tick):
+        if not self._due(moment, moment.tick):
             return
         place = self._memory[self.array]
         before = place.flat[self.element].item()

@@ -353,10 +353,10 @@ class Kernel:
 
     def scope(self) -> KernelScope:
         """The machine code that can be hit, in a process in which the kernel has run."""
-        from mavfi_cli.attack.kernels.scope import compiled_region, kernel_scope
+        from mavfi_cli.attack.kernels.scope import compiled_scope, kernel_scope
 
         found = kernel_scope(self.name) if self.code is None else self.code()
-        more = tuple(compiled_region(function)[1] for function in self.inner)
+        more = tuple(compiled_scope(self.name, function).entry for function in self.inner)
         return replace(found, inner=(*found.inner, *more))
 
 

@@ -120,7 +120,7 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
     Raises:
         FaultError: The function has not run yet.
     """
-    name, entry, region = compiled_region(function)
+    name, entry, region = _compiled_region(function)
     return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
 
 
@@ -144,9 +144,9 @@ def _whole_request(search: KernelScope) -> KernelScope:
     from mavfi_cli.autonomy.grid import path_free, segment_free
     from mavfi_cli.autonomy.octree import decode_leaves
 
-    reader, begin, reading = compiled_region(decode_leaves)
-    pieces, piece, testing = compiled_region(path_free)
-    _, segment, _ = compiled_region(segment_free)
+    reader, begin, reading = _compiled_region(decode_leaves)
+    pieces, piece, testing = _compiled_region(path_free)
+    _, segment, _ = _compiled_region(segment_free)
     return replace(
         search,
         entry=begin,
@@ -215,7 +215,7 @@ def _planner(kernel: str) -> KernelScope:
     wanted = (f"ompl9geometric{name}{end}", motion, *_OMPL_SHARED)
     solve = f"_ZN4ompl9geometric{name}5solveERKNS_4base27PlannerTerminationConditionE"
     part = _part(_functions_with(image, library, *wanted))
-    segment, _, region = compiled_region(segment_free)
+    segment, _, region = _compiled_region(segment_free)
     return KernelScope(
         kernel=kernel,
         entry=image.function(solve, [library]),
@@ -261,7 +261,7 @@ def _part(functions: Iterable[Function]) -> Part:
     return Part(text=tuple(spans))
 
 
-def compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
+def _compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
     """Find name, entry and code of a function that `core.compiled` compiled and that has run.
 
     Python calls this entry. The compiled object identifies the build, because the code in memory

@@ -71,12 +71,12 @@ class KernelTarget:
             "sources": own_digest(),
         }
 
-    def open(self) -> KernelPlace:
+    def open(self) -> _KernelPlace:
         """Start the kernel's template."""
-        return KernelPlace(self)
+        return _KernelPlace(self)
 
 
-class KernelPlace:
+class _KernelPlace:
     """Runs one kernel in forks of one template; use it only in the thread that made it.
 
     Attributes:
@@ -103,7 +103,7 @@ class KernelPlace:
             count = self._template.begin((target.kernel, inputs), self.name)
             self.kernel_scope = self._find_scope()
             self._image = Image(self._template.pid, self.kernel_scope.regions)
-            self._closing = undo.pop_all()
+            self.close = undo.pop_all().close
         self._target, self._number = target, 0
         self.inputs = [self]
         while len(self.inputs) < count:
@@ -137,15 +137,12 @@ class KernelPlace:
         return tracee
 
     def image(self, _: Tracee) -> Image:
-        """The memory image of a run, the same for all runs."""
         return self._image
 
     def scope(self, image: Image) -> Scope:
-        """The code that may be hit."""
         return image.scope(self.kernel_scope.objects)
 
     def context(self) -> dict[str, Any]:
-        """Entries of every record about the kernel."""
         objects = list(self.kernel_scope.objects)
         return {"scope": objects, "inputs_sha256": self._target.inputs_sha256}
 
@@ -186,7 +183,6 @@ class KernelPlace:
         return output
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ; empty if they are equal."""
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:
@@ -198,7 +194,6 @@ class KernelPlace:
         return Golden(output=data[TIMES.size :], cpu_s=cpu_s, wall_s=wall_s)
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
-        """Judge the last run; `ended` is None if it exceeded its limit."""
         run = None if ended is None else self.left()
         left = None if run is None else run.output
         tolerance = self._target.tolerance or None
@@ -221,10 +216,6 @@ class KernelPlace:
         except (ValueError, KeyError) as damage:
             text = f"unreadable: {damage}"
             return Difference(relative=math.inf, absolute=math.inf, text=text)
-
-    def close(self) -> None:
-        """End the template."""
-        self._closing.close()
 
 
 def _read(inputs: Path) -> bytes:

@@ -29,7 +29,7 @@ from typing import NoReturn
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.catalogue import Call, pack
 from mavfi_cli.attack.kernels.inputs import inputs_of_bytes
-from mavfi_cli.attack.served import channel, newest_cache_ns
+from mavfi_cli.attack.served import CHANNEL, newest_cache_ns
 from mavfi_cli.core.processes import fork, receive, send
 
 RAISED = 3  # exit code of a child whose kernel raised an error
@@ -42,7 +42,7 @@ _LARGEST_FILE = 1 << 28
 
 def main() -> None:
     """Load and warm up the kernel, then fork until the other end closes."""
-    connection = channel()
+    connection = socket.socket(fileno=CHANNEL)
     name, inputs = receive(connection)
     kernel = catalogue.find(name)
     calls = [kernel.prepare(each) for each in inputs_of_bytes(inputs)]

@@ -26,7 +26,6 @@ from mavfi_cli.fi.tracer.vectors import (
     ALL,
     VECTOR,
     Touched,
-    is_vector,
     low,
     vector_bits,
 )
@@ -91,13 +90,9 @@ class Instruction:
         return self.address + len(self.raw)
 
 
+@functools.lru_cache(maxsize=65536)
 def decode(code: bytes, address: int) -> Instruction | None:
     """Decode one instruction from 16 bytes; None if the bytes are not an instruction."""
-    return _decode(bytes(code[:16]), address)
-
-
-@functools.lru_cache(maxsize=65536)
-def _decode(code: bytes, address: int) -> Instruction | None:
     found = next(engine.disasm(code, address, 1), None)
     if found is None:
         return None
@@ -206,11 +201,8 @@ def address_of(use: MemoryUse, instruction: Instruction, read: Any) -> int:
 
 
 def _part(name: str | None, read: Any) -> int:
-    part = _general_part(name) if name else None
-    if part is None:
-        return 0
-    full, mask = part
-    return int(read(full)) & mask
+    named = _GENERAL.get(name or "")
+    return 0 if named is None else int(read(named.full)) & low(named.width) << named.shift
 
 
 # -- registers by their names
@@ -246,13 +238,6 @@ def _general_names() -> dict[str, _Named]:
 
 
 _GENERAL = _general_names()
-
-
-def _general_part(name: str) -> tuple[str, int] | None:
-    """Full register and mask of a general register's name; None for another name."""
-    if (named := _GENERAL.get(name)) is None:
-        return None
-    return named.full, low(named.width) << named.shift
 
 
 @functools.cache
@@ -309,7 +294,8 @@ class _Operands:
 
 def _operands_of(found: Any) -> _Operands:
     """What an instruction, as capstone decodes it, reads and writes."""
-    all_of = _Operands(explicit=vector_bits(found) if is_vector(found) else _bits(found))
+    vector = vector_bits(found)
+    all_of = _Operands(explicit=_bits(found) if vector is None else vector)
     for op, bits in zip(found.operands, all_of.explicit, strict=True):
         if op.type == x86.X86_OP_REG:
             all_of.touch(found.reg_name(op.reg), bits, explicit=True)
@@ -318,7 +304,7 @@ def _operands_of(found: Any) -> _Operands:
     for name, bits in _implicit(found):
         all_of.touch(name, bits)
     if x86.X86_GRP_FPU not in found.groups:
-        _flags(found, all_of)
+        _flags(found, all_of, vector is not None)
     return all_of
 
 
@@ -486,9 +472,9 @@ _FLAGS = {
 _FLAGS["of", "RESET"] |= x86.X86_EFLAGS_RESET_0F  # capstone spells it with a zero
 
 
-def _flags(found: Any, all_of: _Operands) -> None:
+def _flags(found: Any, all_of: _Operands, vector: bool) -> None:
     mnemonic = found.mnemonic.split()[-1]
-    if is_vector(found) or mnemonic.startswith("k"):  # capstone has the flags of a namesake
+    if vector or mnemonic.startswith("k"):  # capstone has the flags of a namesake
         for name in _ARITHMETIC_FLAGS if _VECTOR_TESTS.match(mnemonic) else ():
             all_of.flag(name, reads=False, defined=True, clears=True)
         return

@@ -114,27 +114,22 @@ def _apply(
     if corruption.site is Site.MEMORY:
         use = instruction.memory[corruption.memory_operand]
         place = address_of(use, instruction, tracee.registers.read)
+    before = after = 0
     if corruption.role is Role.DESTINATION and clean_step(tracee, instruction) is not None:
-        return _not_applied("the program ended in the instruction", place, 0, start)
-    try:
-        before, after = _invert(tracee, instruction, corruption, place)
-    except OSError as error:
-        return _not_applied(f"refused by the operating system: {error.strerror}", place, 0, start)
-    lost = [bit for bit in corruption.struck(before) if not (before ^ after) >> bit & 1]
-    reason = f"discarded by the operating system: bits {lost}" if lost else ""
-    stop_s = (time.perf_counter_ns() - start) * 1e-9
+        reason = "the program ended in the instruction"
+    else:
+        try:
+            before, after = _invert(tracee, instruction, corruption, place)
+            lost = [bit for bit in corruption.struck(before) if not (before ^ after) >> bit & 1]
+            reason = f"discarded by the operating system: bits {lost}" if lost else ""
+        except OSError as error:
+            reason = f"refused by the operating system: {error.strerror}"
     return Injection(
-        applied=not lost, reason=reason, address=place, before=before, after=after, stop_s=stop_s
-    )
-
-
-def _not_applied(reason: str, place: int, value: int, start: int) -> Injection:
-    return Injection(
-        applied=False,
+        applied=not reason,
         reason=reason,
         address=place,
-        before=value,
-        after=value,
+        before=before,
+        after=after,
         stop_s=(time.perf_counter_ns() - start) * 1e-9,
     )
 

@@ -243,34 +243,35 @@ class Tracee:
             if detoured is not None:
                 return detoured
         self.registers.rearm()
-        if self.mechanism is Mechanism.PERF:
-            return self._run_to_counted(address, count)
-        return self._run_to_stepwise(address, count)
+        with contextlib.closing(self.breakpoint_at(address, count)) as trap:
+            left = count if isinstance(trap, _DebugBreakpoint) else 1
+            while left:
+                if self.resume() is not None:
+                    return False
+                left -= self.registers.ip == address
+            return True
 
     def count_to_end(self, address: int) -> int:
         """Run to the end of the program and count the executions of `address` on the way."""
         self.registers.rearm()
         if self.mechanism is Mechanism.PERF:
-            counter = ExecutionCounter(self.tid, address)
-            try:
+            with contextlib.closing(ExecutionCounter(self.tid, address)) as counter:
                 while self.resume() is None:
                     pass
                 return counter.read()
-            finally:
-                counter.close()
         count = 0
-        breakpoint_ = self.breakpoint_at(address)
-        try:
+        with contextlib.closing(self.breakpoint_at(address)):
             while self.resume() is None:
                 count += self.registers.ip == address
-            return count
-        finally:
-            breakpoint_.close()
+        return count
 
-    def breakpoint_at(self, address: int) -> ExecutionCounter | _DebugBreakpoint:
-        """A breakpoint that stops at the next execution of `address`, until it is closed."""
+    def breakpoint_at(self, address: int, count: int = 1) -> ExecutionCounter | _DebugBreakpoint:
+        """A breakpoint before execution `count` of `address`; a debug register stops at each."""
         if self.mechanism is Mechanism.PERF:
-            return ExecutionCounter(self.tid, address, 1)
+            try:
+                return ExecutionCounter(self.tid, address, count)
+            except OSError:
+                self.mechanism = Mechanism.DEBUG
         return _DebugBreakpoint(self.tid, address)
 
     def detach(self) -> None:
@@ -448,29 +449,3 @@ class Tracee:
         self.memory.write(here, code)
         self.registers.write_general(before)
         return result
-
-    def _run_to_counted(self, address: int, count: int) -> bool:
-        try:
-            breakpoint_ = ExecutionCounter(self.tid, address, count)
-        except OSError:
-            self.mechanism = Mechanism.DEBUG
-            return self._run_to_stepwise(address, count)
-        try:
-            while True:
-                if self.resume() is not None:
-                    return False
-                if self.registers.ip == address:
-                    return True
-        finally:
-            breakpoint_.close()
-
-    def _run_to_stepwise(self, address: int, count: int) -> bool:
-        breakpoint_ = _DebugBreakpoint(self.tid, address)
-        try:
-            while count:
-                if self.resume() is not None:
-                    return False
-                count -= self.registers.ip == address
-            return True
-        finally:
-            breakpoint_.close()

@@ -117,15 +117,15 @@ def _width(name: str, size: int) -> int:
     return {"x": 128, "y": 256, "z": 512}[match[1]] if match else 8 * size
 
 
-def is_vector(found: Any) -> bool:
-    """True if an explicit operand is a vector register."""
-    return any(
-        op.type == x86.X86_OP_REG and VECTOR.match(found.reg_name(op.reg)) for op in found.operands
-    )
+def vector_bits(found: Any) -> tuple[Touched, ...] | None:
+    """The bits of each explicit operand that a vector instruction reads and writes.
 
-
-def vector_bits(found: Any) -> tuple[Touched, ...]:
-    """The bits of each explicit operand that a vector instruction reads and writes."""
+    Returns:
+        None if no explicit operand is a vector register.
+    """
+    registers = [found.reg_name(op.reg) for op in found.operands if op.type == x86.X86_OP_REG]
+    if not any(map(VECTOR.match, registers)):
+        return None
     form = _VectorForm(found)
     scalar = _scalar(form)
     if not (scalar or _permuted(form)):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import socket
 from dataclasses import dataclass
 
 from mavfi_cli.attack.kernels.scope import node_scope
-from mavfi_cli.attack.served import channel, newest_cache_ns
+from mavfi_cli.attack.served import CHANNEL, newest_cache_ns
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
@@ -48,7 +49,7 @@ class Setup:
 
 def main() -> None:
     """Load every kernel, receive the node's setup, and work until the connection closes."""
-    connection = channel()
+    connection = socket.socket(fileno=CHANNEL)
     warm_up()
     try:
         setup: Setup = receive(connection)
