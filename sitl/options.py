@@ -119,9 +119,7 @@ def _sitl() -> None:
 def parse(arguments: Sequence[str]) -> ServerOptions:
     """Parse a command line.
 
-    Raises:
-        click.UsageError: It is not valid.
-        click.exceptions.Exit: It asks for help, which is printed.
+    Raises click.UsageError if it is not valid, and click.exceptions.Exit if it asks for help.
     """
     given = _sitl.make_context("mavfi sitl", list(arguments)).params
     hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))

@@ -75,8 +75,7 @@ class Peers(Generic[P]):
     def open(self, url: str, make: Callable[[Transport], P]) -> None:
         """Open an endpoint, whose transports `make` turns into peers; else close all.
 
-        Raises:
-            LinkError: It cannot be opened.
+        Raises LinkError if it cannot be opened.
         """
         signing = self._signing
         try:

@@ -211,8 +211,7 @@ class Referee:
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
         """Write `truth.npz` and then `truth.json` into `folder`, each atomically.
 
-        Raises:
-            RecordError: The folder cannot be created or written (no space, no permission).
+        Raises RecordError if it cannot be created or written (no space, no permission).
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -87,8 +87,7 @@ class Client(Peer):
     def receive(self, timeout_s: float) -> list[Any]:
         """Handle the next bytes, waiting at most `timeout_s`. Return the handled messages.
 
-        Raises:
-            LinkLost: The peer is gone.
+        Raises LinkLost if the peer is gone.
         """
         with self._simulation.wall.measure("wait"):
             data = self.transport.receive(timeout_s)
@@ -107,10 +106,9 @@ class Client(Peer):
         return messages
 
     def send_tick(self) -> bool:
-        """Send everything due at this tick at once, the autopilot's streams last.
+        """Send all that is due at this tick at once; True if there was any.
 
-        Returns:
-            True if anything was due.
+        The autopilot's streams are the last.
         """
         with self._simulation.wall.measure("link"):
             due = [
@@ -181,11 +179,7 @@ class _Pace:
 
 
 def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    """Run until the companion closes the connection, or until stopped.
-
-    Raises:
-        VehicleProcessError: The companion gave no answer within the limit.
-    """
+    """Run until the companion closes the connection or gives no answer, or until stopped."""
     client = Client(simulation, open_transport(f"fd:{options.fd}"), preset=Preset.LOCKSTEP)
     pace = None if options.speed is None else _Pace(options.speed)
     try:
@@ -263,7 +257,6 @@ class _EmbeddedVehicle:
             self.end()
 
     def _fly_tick(self) -> bool:
-        """Fly a tick if the companion has answered. Return True if it has."""
         messages, simulation = self._client.receive(0.0), self._simulation
         answered = not simulation.awaits_setpoints or _answers(
             messages, simulation.stamp_us // 1000
@@ -398,12 +391,8 @@ def _serve(options: ServerOptions) -> None:
 def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
     """Return the vehicle of `python -m sitl --lockstep` in this process, ready to fly.
 
-    Args:
-        arguments: Command line without the companion's descriptor.
-        truth_folder: Folder for the briefing and, at the end, the truth.
-
-    Raises:
-        MavfiError: The world, the vehicle, the start or the goal cannot be used.
+    Briefing and, at the end, the truth are left in the folder. Raises MavfiError if the world, the
+    vehicle, the start or the goal cannot be used.
     """
     options = parse(arguments)
     world, profile = _world(options), load_profile(options.vehicle)
@@ -465,7 +454,6 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
 
 
 def _needs_of_firmware(options: ServerOptions) -> list[str]:
-    """Return link and parameters that a firmware started by somebody else needs, a line each."""
     kind = options.firmware_kind
     if kind is None or options.firmware is not None:
         return []

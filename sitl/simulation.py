@@ -123,11 +123,7 @@ class Simulation:
         """Release everything outside this process. May be called repeatedly."""
 
     def save_truth(self, folder: Path) -> None:
-        """Write the referee's log and verdict.
-
-        Raises:
-            RecordError: A file cannot be written.
-        """
+        """Write the referee's log and verdict. Raises RecordError if a file cannot be written."""
         truth = self.vehicle.truth
         energies = {"regression": truth.energy_regression_j, "propeller": truth.energy_propeller_j}
         self.referee.save(folder, energies)

@@ -52,8 +52,7 @@ def key_from_passphrase(passphrase: str) -> bytes:
 def key_from_file(path: Path) -> bytes:
     """Return the key of the passphrase in a file, without the white space around it.
 
-    Raises:
-        ConfigError: The file cannot be read or is empty.
+    Raises ConfigError if the file cannot be read or is empty.
     """
     try:
         passphrase = path.read_text(encoding="utf-8").strip()

@@ -154,11 +154,7 @@ class Commands:
         return self._ticket is not None
 
     def refuse(self, command: str, result: str) -> NoReturn:
-        """Give up a request and quote the autopilot's texts since the start of the phase.
-
-        Raises:
-            CommandRefused: Always.
-        """
+        """Raise CommandRefused with the autopilot's texts since the start of the phase."""
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
         said = (each for each in texts.since(self._texts_before) if each.severity <= _WARNING)
@@ -169,10 +165,8 @@ class Commands:
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
         """Send a command until it is accepted. Return True from then on.
 
-        If an accepted command shows no effect, further calls send it again.
-
-        Raises:
-            CommandRefused: The command was refused permanently.
+        If an accepted command shows no effect, further calls send it again. Raises CommandRefused
+        if it was refused permanently.
         """
         if self._ticket is None:
             self._ticket = self.submit(command, *parameters, unused=unused, refusals=2)
@@ -194,8 +188,7 @@ class Commands:
     def mode(self, mode: str) -> bool:
         """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
 
-        Raises:
-            CommandRefused: The mode did not change after the maximum number of requests.
+        Raises CommandRefused if it did not change after the maximum number of requests.
         """
         if self._telemetry.mode == mode:
             return True

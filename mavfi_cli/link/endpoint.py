@@ -46,8 +46,7 @@ class Endpoint:
     def open_socket(self, *, beyond: bool) -> socket.socket:
         """Open the bound or connected socket of a network URL, `beyond` this machine if allowed.
 
-        Raises:
-            LinkError: As in `open_transport`.
+        Raises LinkError as `open_transport`.
         """
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
@@ -93,11 +92,7 @@ class Endpoint:
         }.get(error.errno or 0, text)
 
     def inherited_socket(self) -> socket.socket:
-        """Return the connected stream socket that the parent process left open.
-
-        Raises:
-            LinkError: The descriptor is not one.
-        """
+        """Return the connected stream socket that the parent left open, or raise LinkError."""
         try:
             connection = socket.socket(fileno=self.fd)
         except OSError as error:
@@ -117,8 +112,7 @@ class Endpoint:
 def parse_endpoint(url: str) -> Endpoint:
     """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
-    Raises:
-        LinkError: The scheme is unknown (lists the known ones), or the rest does not fit it.
+    Raises LinkError if the scheme is unknown (lists the known ones), or the rest does not fit it.
     """
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")

@@ -311,17 +311,11 @@ class OffboardSession:
             self._enter(Phase.WAITING_READY)
 
     def _require_fit(self) -> None:
-        """Refuse what cannot be flown, until the vehicle has taken off."""
         if self.telemetry.unfit:
             raise LinkError(f"{self._url}: {self.telemetry.unfit}")
 
     def _knows_place(self) -> bool:
-        """Return True once a needed camera has told the origin, if it knows one, and a state came.
-
-        Raises:
-            LinkError: No camera has answered for some seconds.
-            CommandRefused: One of them did not arrive within the time to get ready.
-        """
+        """Return True once a needed camera has told the origin, if any, and a state came."""
         settings, asked = self._settings, self._origin_asked
         if not settings.needs_camera or asked is None:
             return True

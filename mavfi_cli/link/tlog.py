@@ -135,8 +135,7 @@ class RecordedLink:
     def recording(self, path: Path) -> Iterator[None]:
         """Write the tlog during the context.
 
-        Raises:
-            RecordError: The file cannot be written, now or at any later message.
+        Raises RecordError if the file cannot be written, now or at any later message.
         """
         self._tlog.open(path)
         with contextlib.closing(self._tlog):
@@ -149,11 +148,7 @@ class RecordedLink:
         return f"{TWO_AUTOPILOTS}, {self._transport.address} and {rival}" if rival else ""
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s`.
-
-        Raises:
-            LinkLost: The other end closed the connection.
-        """
+        """Return the next bytes, or b"" after `timeout_s`. Raises LinkLost if the peer closed."""
         return self._transport.receive(timeout_s)
 
     def messages(self, data: bytes, stamp_s: float) -> list[Message]:
@@ -165,8 +160,7 @@ class RecordedLink:
     def send(self, messages: Sequence[Message], stamp_s: float) -> None:
         """Send the messages in this order and record them at the stamp.
 
-        Raises:
-            LinkLost: The other end closed the connection.
+        Raises LinkLost if the other end closed the connection.
         """
         frames = [self._codec.encode(message) for message in messages]
         self._record(stamp_s, frames)

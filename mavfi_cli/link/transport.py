@@ -52,8 +52,7 @@ class Transport(ABC):
     def receive(self, timeout_s: float) -> bytes:
         """Return the next bytes, or b"" after `timeout_s` (inf waits without end).
 
-        Raises:
-            LinkLost: The peer closed the connection, or the device was removed.
+        Raises LinkLost if the peer closed the connection, or the device was removed.
         """
         data = self._pull()
         if data or timeout_s <= 0.0:

@@ -41,7 +41,6 @@ class _Parameter(NamedTuple):
         return TYPE_INT32 if self.is_integer else TYPE_REAL32
 
     def packed(self, value: float) -> bytes:
-        """Return a value's four bytes on the wire."""
         return struct.pack("<i" if self.is_integer else "<f", value)
 
     def stored(self, value: float) -> float | int:

@@ -47,7 +47,6 @@ _CommandHandler = Callable[["Autopilot", Any, Link], Result | None]
 
 
 def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Execute a command for this system by name, and acknowledge it."""
     if message.target_system != autopilot.system_id:
         return
     handler = _COMMANDS.get(message.command)
@@ -257,7 +256,6 @@ _COMMANDS: Mapping[int, _CommandHandler] = {
 
 
 def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Take a setpoint of SET_POSITION_TARGET_LOCAL_NED or _GLOBAL_INT."""
     now = autopilot.snapshot
     setpoint = setpoint_of(
         message, heading_rad=now.truth.euler_rad[2], origin=now.origin,

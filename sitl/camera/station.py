@@ -137,8 +137,7 @@ class PoseTracker:
     def pose(self) -> tuple[float, Vector, Vector, Vector]:
         """Return stamp, s, position (3,) in the world, attitude (4,) FLU to ENU, and velocity (3,).
 
-        Raises:
-            LookupError: There is no pose yet.
+        Raises LookupError if there is no pose yet.
         """
         if self._position is None or self._attitude is None:
             raise LookupError("no pose yet")
@@ -269,8 +268,7 @@ class Station:
     def run(self, keep_on: Callable[[], bool]) -> None:
         """Serve until `keep_on` returns False, or until an inherited connection closes.
 
-        Raises:
-            LinkLost: The peer of a link closed it.
+        Raises LinkLost if the peer of a link closed it.
         """
         while keep_on() and not self.peers.over:
             self.peers.wait(_WAIT_S)
@@ -306,7 +304,6 @@ class Station:
         return True
 
     def _tell_rival(self, slot: SenderSlot[_Linked]) -> None:
-        """Send the addresses of two autopilots, if both speak."""
         if slot.holder is None or slot.rival is None:
             return
         holder, rival = slot.holder.transport.address, slot.rival.transport.address

@@ -41,8 +41,7 @@ _SPIN_MIN, _SPIN_ARM = 0.05, 0.03  # throttles of the rotors in flight and on th
 class ArduPilotLink:
     """One ArduPilot on the JSON backend, which sends to a UDP port; 0 for any.
 
-    Raises:
-        LinkError: The port cannot be opened.
+    Raises LinkError if the port cannot be opened.
     """
 
     step_s = STEP_S
@@ -124,8 +123,7 @@ class ArduPilotLink:
     def exchange(self, stamp_us: int, truth: Truth) -> Vector:
         """Send the state of a step and return the motor outputs (4,) in 0..1.
 
-        Raises:
-            VehicleProcessError: ArduPilot has stopped answering.
+        Raises VehicleProcessError if ArduPilot has stopped answering.
         """
         self._socket.sendto(self._state(stamp_us, truth), self._peer)
         if not self._await_servos(ANSWER_LIMIT_S):

@@ -123,8 +123,7 @@ class FirmwareAutopilot:
     def deliver(self) -> None:
         """Send the clients' messages, and wait until the firmware has read them.
 
-        Raises:
-            VehicleProcessError: The firmware closed its link.
+        Raises VehicleProcessError if the firmware closed its link.
         """
         if not self._to_firmware:
             return
@@ -140,8 +139,7 @@ class FirmwareAutopilot:
     def observe(self, stamp_us: int, _truth: Truth) -> None:
         """Take everything that the firmware has sent up to a stamp.
 
-        Raises:
-            VehicleProcessError: The firmware closed its link, or has been silent for a minute.
+        Raises VehicleProcessError if it closed its link, or has been silent for a minute.
         """
         while self._receive(0.0):
             self._heard_us = stamp_us
@@ -211,12 +209,8 @@ _OUTPUT = "output.txt"
 class FirmwareProcess:
     """A running firmware. Its folder and everything that it started end with it.
 
-    Args:
-        folder: Working folder, removed at the end.
-        environment: Additions to the environment.
-
-    Raises:
-        VehicleProcessError: The program cannot be started.
+    It works in the folder, with additions to the environment. Raises VehicleProcessError if it
+    cannot be started.
     """
 
     def __init__(
@@ -243,8 +237,7 @@ class FirmwareProcess:
     def program(path: Path) -> Path:
         """Return the absolute path of a program.
 
-        Raises:
-            VehicleProcessError: It does not exist or must not be executed.
+        Raises VehicleProcessError if it does not exist or must not be executed.
         """
         if not path.is_file():
             raise VehicleProcessError(f"no firmware at {path}")
@@ -253,11 +246,7 @@ class FirmwareProcess:
         return path.resolve()
 
     def require_running(self) -> None:
-        """Check that it still runs.
-
-        Raises:
-            VehicleProcessError: It has ended; quotes its last line.
-        """
+        """Raise VehicleProcessError if it has ended, with its last line."""
         code = self._process.poll()
         if code is None:
             return

@@ -85,8 +85,7 @@ class Px4Link:
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
         """Open the first free port of PX4's instances, of the first one unless we start it.
 
-        Raises:
-            LinkError: All of them are in use.
+        Raises LinkError if all of them are in use.
         """
         *others, last = range(PORT, PORT + (_INSTANCES if ours else 1))
         for port in others:
@@ -131,10 +130,8 @@ class Px4Link:
     ) -> FirmwareProcess:
         """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
 
-        Its MAVLink goes to a UDP port. The magnetometer tells PX4 its heading.
-
-        Raises:
-            VehicleProcessError: It cannot be started.
+        Its MAVLink goes to a UDP port. The magnetometer tells PX4 its heading. Raises
+        VehicleProcessError if it cannot be started.
         """
         program = FirmwareProcess.program(binary)
         startup = program.parent.parent / "etc"
@@ -166,8 +163,7 @@ class Px4Link:
     def exchange(self, stamp_us: int, truth: Truth) -> Vector:
         """Send the sensors of a step and return the motor outputs (4,) in 0..1.
 
-        Raises:
-            VehicleProcessError: PX4 has closed the link.
+        Raises VehicleProcessError if PX4 has closed the link.
         """
         messages = [self._hil_sensor(stamp_us, truth)]
         if self._steps % _FIX_STEPS == 0:

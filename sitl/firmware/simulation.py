@@ -100,8 +100,7 @@ class FirmwareSimulation(Simulation):
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Wait until the firmware calls and knows where it is, or until stopped.
 
-        Raises:
-            VehicleProcessError: It has ended, did not call within a minute, or gave no position.
+        Raises VehicleProcessError if it ended, did not call within a minute, or gave no position.
         """
         self._await_call(stopped)
         autopilot = self._firmware

@@ -375,11 +375,8 @@ PROFILES = Shipped("vehicle", Path(__file__).parent / "profiles")
 def load_profile(name_or_path: str) -> VehicleProfile:
     """Load a shipped profile by name, or any profile by the path of its TOML file.
 
-    A file with a `base` scales a shipped profile.
-
-    Raises:
-        UnknownName: It is neither a shipped profile nor a TOML path.
-        ConfigError: The file cannot be read, or its vehicle cannot fly.
+    A file with a `base` scales a shipped profile. Raises UnknownName for any other name, and
+    ConfigError if the file cannot be read or its vehicle cannot fly.
     """
     path = PROFILES.path(name_or_path)
     data, text = read_toml(path)

@@ -21,8 +21,6 @@ _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a T
 
 
 def _on_world(command: Callable[..., None]) -> Callable[..., Any]:
-    """Add the options of a world to a command, which gets the loaded world instead of them."""
-
     @click.argument("name", metavar="WORLD")
     @places
     @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")

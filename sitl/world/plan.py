@@ -61,8 +61,7 @@ class _WorldCheck:
 def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _WorldCheck:
     """Search a path from start to goal with `clearance_m` to every box.
 
-    Raises:
-        WorldError: The world is too large for the grid.
+    Raises WorldError if the world is too large for the grid.
     """
     height = float(world.goal_enu_m[2])
     free, origin = _free_grid(world, height, clearance_m)

@@ -120,11 +120,7 @@ class World:
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
-        """Write what a companion knows before the first message, into `briefing.json` of a folder.
-
-        Raises:
-            RecordError: The file cannot be written.
-        """
+        """Write what a companion knows before the first message, or raise RecordError."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
