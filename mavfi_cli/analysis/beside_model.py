@@ -44,6 +44,24 @@ from mavfi_cli.vpm.model import (
 )
 from mavfi_cli.vpm.report import Choices
 
+BASE = "none"  # reference of ratios: one board without protection
+MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
+PLACE = ("world", "seed")  # columns that identify a mission in all schemes
+_BY_PLACE = [(name, "ascending") for name in PLACE]
+Key = tuple[str, str]  # vehicle and scheme
+# Parts of the model that the simulation omits; printed with every report of flights.
+NOT_SCALED = (
+    "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
+    "size: inertia and drag do not grow with them",
+    "the model's acceleration is pull / mass - g; here it is the companion's limit, of which "
+    f"planning uses {100.0 * BRAKE_SHARE:g} % to speed up and to brake",
+    "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
+    "plan, and speeds up and slows down; the model flies straight at one velocity",
+    "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
+    "counted, as in the model; a turn before departure, where the stack has one, is counted",
+)
+WORLDS = ("sparse", "dense")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
@@ -185,22 +203,71 @@ def _file(folder: Path, stem: str, values: Mapping[str, Any]) -> tuple[Path, str
     return folder / f"{stem}-{digest}.toml", text
 
 
-BASE = "none"  # reference of ratios: one board without protection
-MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
-PLACE = ("world", "seed")  # columns that identify a mission in all schemes
-_BY_PLACE = [(name, "ascending") for name in PLACE]
-Key = tuple[str, str]  # vehicle and scheme
-# Parts of the model that the simulation omits; printed with every report of flights.
-NOT_SCALED = (
-    "size, propellers and drag are those of the simulated vehicle; boards weigh, but have no "
-    "size: inertia and drag do not grow with them",
-    "the model's acceleration is pull / mass - g; here it is the companion's limit, of which "
-    f"planning uses {100.0 * BRAKE_SHARE:g} % to speed up and to brake",
-    "the simulated companion plans with 90 % of the safe velocity, flies round obstacles, stops to "
-    "plan, and speeds up and slows down; the model flies straight at one velocity",
-    "flights begin at take-off height and end within the goal's tolerance; climbing there is not "
-    "counted, as in the model; a turn before departure, where the stack has one, is counted",
-)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RedundancyPlan:
+    """Plan of the flights of all vehicles and schemes.
+
+    Attributes:
+        missions: number per scheme and world.
+        folder: folder of flights and pictures; recorded missions are not flown again.
+        models: folder of the detectors' models; None takes the shipped ones.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
+        stack: stack of all flights.
+
+    Raises:
+        ConfigError, UnknownName: a world is missing or named twice, or the missions have seeds of
+            training flights, which no flight may share in any world.
+    """
+
+    vehicles: Sequence[ModelVehicle]
+    choices: Choices
+    worlds: tuple[str, ...] = WORLDS
+    missions: int
+    first_seed: int
+    folder: Path
+    models: Path | None = None
+    train: int = 0
+    stack: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        require_named("world", self.worlds)
+        first = TrainingPlan().first_seed
+        last = first + self.train * len(TRAINING_WORLDS) - 1
+        if self.train and self.first_seed <= last and first < self.first_seed + self.missions:
+            raise ConfigError(
+                f"seeds {first} to {last} are for training: choose another --first-seed",
+                key="first seed",
+            )
+
+    @property
+    def models_told(self) -> str:
+        """Origin of the detectors' models."""
+        if self.train:
+            return (
+                f"fitted for each vehicle to {self.train} error-free flights in each of "
+                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
+            )
+        if self.models is not None:
+            return f"of {self.models}"
+        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
+
+    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
+        """The list mission by mission, so that pairs are complete if it is cut off."""
+        seeds = range(self.first_seed, self.first_seed + self.missions)
+        return [
+            PlannedMission(
+                config=replace(plan.mission, world=world, seed=seed),
+                labels={"group": vehicle, "arm": scheme, "world": world},
+                pair=f"{world}/{seed}",
+            )
+            for seed in seeds
+            for world in self.worlds
+            for (vehicle, scheme), plan in flown.items()
+        ]
+
+
+# Beside the model ------------------------------------------------------------------------------
 
 
 def _arm(table: pa.Table, key: Key) -> pa.Table:
@@ -354,70 +421,3 @@ def _beside(name: str, unit: str, model: float, flight: Interval) -> dict[str, f
         f"flight_{name}_high{unit}": flight.high,
         f"{name}{of}_difference_percent": 100.0 * (flight.value / model - 1.0),
     }
-
-
-WORLDS = ("sparse", "dense")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RedundancyPlan:
-    """Plan of the flights of all vehicles and schemes.
-
-    Attributes:
-        missions: number per scheme and world.
-        folder: folder of flights and pictures; recorded missions are not flown again.
-        models: folder of the detectors' models; None takes the shipped ones.
-        train: flights of each training world to which detectors are fitted for each vehicle; 0
-            fits none.
-        stack: stack of all flights.
-
-    Raises:
-        ConfigError, UnknownName: a world is missing or named twice, or the missions have seeds of
-            training flights, which no flight may share in any world.
-    """
-
-    vehicles: Sequence[ModelVehicle]
-    choices: Choices
-    worlds: tuple[str, ...] = WORLDS
-    missions: int
-    first_seed: int
-    folder: Path
-    models: Path | None = None
-    train: int = 0
-    stack: str = DEFAULT
-
-    def __post_init__(self) -> None:
-        require_named("world", self.worlds)
-        first = TrainingPlan().first_seed
-        last = first + self.train * len(TRAINING_WORLDS) - 1
-        if self.train and self.first_seed <= last and first < self.first_seed + self.missions:
-            raise ConfigError(
-                f"seeds {first} to {last} are for training: choose another --first-seed",
-                key="first seed",
-            )
-
-    @property
-    def models_told(self) -> str:
-        """Origin of the detectors' models."""
-        if self.train:
-            return (
-                f"fitted for each vehicle to {self.train} error-free flights in each of "
-                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
-            )
-        if self.models is not None:
-            return f"of {self.models}"
-        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
-
-    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """The list mission by mission, so that pairs are complete if it is cut off."""
-        seeds = range(self.first_seed, self.first_seed + self.missions)
-        return [
-            PlannedMission(
-                config=replace(plan.mission, world=world, seed=seed),
-                labels={"group": vehicle, "arm": scheme, "world": world},
-                pair=f"{world}/{seed}",
-            )
-            for seed in seeds
-            for world in self.worlds
-            for (vehicle, scheme), plan in flown.items()
-        ]

@@ -40,6 +40,157 @@ from mavfi_cli.stats.shares import rate
 LATE = 0.95  # quantile given with the worst case, which has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
 _SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
+GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
+CONFIDENCE = 0.95  # of all intervals
+
+
+class _Quantity(NamedTuple):
+    """A quantity that is measured in each flight, by the name of its column."""
+
+    name: str
+    title: str
+    unit: str
+    any_end: bool = False  # failed flights have it, too
+    ratio: bool = True  # platforms are compared by ratio, else by difference
+
+
+QUANTITIES = (
+    _Quantity("flight_time_s", "flight time", "s"),
+    _Quantity("distance_m", "distance", "m"),
+    _Quantity("energy_regression_j", "energy (regression)", "J"),
+    _Quantity("energy_propeller_j", "energy (propellers)", "J"),
+    _Quantity("replans", "replans", "count", ratio=False),
+    _Quantity("response_median_s", "response, median", "s", any_end=True),
+    _Quantity("response_p95_s", "response, 95th percentile", "s", any_end=True),
+)
+SCHEMA = pa.schema(
+    {
+        "platform": pa.string(), "setting": pa.string(), "target": pa.string(), "seed": pa.int64(),
+        "fault_seed": pa.int64(), "outcome": pa.string(), "counted": pa.bool_(),
+        **{each.name: pa.float64() for each in QUANTITIES},
+    }
+)  # fmt: skip
+
+
+def compared(flights: pa.Table) -> pa.Table:
+    """The columns of SCHEMA for the missions that ended; golden flights have an empty target."""
+    table = flown(flights)
+    bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
+    setting = pc.coalesce(table["detector"].cast(pa.string()), bare)
+    target = pc.fill_null(table["fault_target"].cast(pa.string()), "")
+    for name, column in (("setting", setting), ("target", target)):
+        table = table.append_column(name, column)
+    return table.select(SCHEMA.names).cast(SCHEMA)
+
+
+def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table) -> dict[str, Any]:
+    """All numbers of the flights, as plain values.
+
+    `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
+    `cost_differences` have one row per setting and platform other than the first. `flights` has
+    one row per flight. Shares, increases and ratios have no unit; all other names end in the unit
+    or have it in a key of its own.
+
+    Args:
+        flights: with the columns of SCHEMA.
+    """
+    whole = flights.append_column("succeeded", pc.equal(flights["outcome"], "success"))
+    first, *others = platforms
+    faulty = [setting for setting in settings if setting != GOLDEN]
+    every = {
+        (platform, setting): chosen(whole, platform=platform, setting=setting)
+        for platform, setting in itertools.product(platforms, (GOLDEN, NONE, *settings))
+    }
+    counted = {place: chosen(table, counted=True) for place, table in every.items()}
+    won = {place: chosen(table, succeeded=True) for place, table in counted.items()}
+    found = {
+        (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
+        for platform, setting in itertools.product(platforms, faulty)
+    }
+
+    def at(platform: str, setting: str) -> dict[str, Any]:
+        return {"platform": platform, "setting": setting}
+
+    return {
+        "confidence": CONFIDENCE,
+        "settings": [
+            {**at(p, s), **_setting(every[p, s], counted[p, s])}
+            for s, p in itertools.product(settings, platforms)
+        ],
+        "ratios": [
+            {**at(p, s), "reference": first, **_ratio(counted[first, s], counted[p, s])}
+            for p, s in itertools.product(others, settings)
+        ],
+        "costs": [
+            {**at(p, s), **found[p, s].row(found[p, NONE], protected=s != NONE)}
+            for p, s in itertools.product(platforms, faulty)
+        ],
+        "cost_differences": [
+            {**at(p, s), "reference": first, **found[p, s].extra(found[first, s])}
+            for p, s in itertools.product(others, faulty)
+        ],
+        "worst": [
+            {**at(p, s), **_worst_row(won[p, GOLDEN], won[p, NONE], won[p, s],
+                                      protected=s not in (GOLDEN, NONE))}
+            for p, s in itertools.product(platforms, settings)
+        ],
+        "flights": flights.to_pylist(),
+    }  # fmt: skip
+
+
+# One platform and setting ---------------------------------------------------------------------
+
+
+def _setting(every: pa.Table, counted: pa.Table) -> dict[str, Any]:
+    ends = pc.value_counts(counted["outcome"]).to_pylist()
+    return {
+        "flown": every.num_rows,
+        "counted": counted.num_rows,
+        "outcomes": dict(sorted((each["values"], each["counts"]) for each in ends)),
+        "success": asdict(rate(int(flags(counted, "succeeded").sum()), counted.num_rows)),
+        "quantities": {each.name: _measured(each, counted) for each in QUANTITIES},
+    }
+
+
+def _measured(quantity: _Quantity, counted: pa.Table) -> dict[str, Any]:
+    chosen_ones = counted if quantity.any_end else chosen(counted, succeeded=True)
+    values = known(numbers(chosen_ones, quantity.name))
+    return {
+        "unit": quantity.unit,
+        "median": asdict(interval(values, median, resamples=RESAMPLES)),
+        "mean": asdict(interval(values, resamples=RESAMPLES)),
+        "largest": max(values.tolist(), default=math.nan),
+    }
+
+
+# Two platforms --------------------------------------------------------------------------------
+
+
+def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
+    pairs = paired(first, second, MISSION)
+    test = McNemar.of(*(flags(each, "succeeded") for each in pairs))
+    return {
+        "pairs": test.pairs,
+        "both_succeed": test.both,
+        "success": {**asdict(test), "difference": test.difference},
+        "quantities": {each.name: _changed(each, *pairs) for each in QUANTITIES},
+    }
+
+
+def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> dict[str, Any]:
+    """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
+    if not quantity.any_end:
+        both = pa.array(flags(first, "succeeded") & flags(second, "succeeded"))
+        first, second = first.filter(both), second.filter(both)
+    before, after = (numbers(each, quantity.name).tolist() for each in (first, second))
+    found = changed(
+        first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=RESAMPLES
+    )
+    kind, unit = ("ratio", "ratio") if quantity.ratio else ("difference", quantity.unit)
+    return {"kind": kind, "unit": unit, **asdict(found)}
+
+
+# Costs of faults -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,156 +346,6 @@ def _late(values: FloatArray) -> FloatArray:
     below = np.take_along_axis(flat, low[..., None], axis=-1)[..., 0]
     above = np.take_along_axis(flat, high[..., None], axis=-1)[..., 0]
     return np.asarray(below + (above - below) * (place - low))
-
-
-GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
-CONFIDENCE = 0.95  # of all intervals
-
-
-class _Quantity(NamedTuple):
-    """A quantity that is measured in each flight, by the name of its column."""
-
-    name: str
-    title: str
-    unit: str
-    any_end: bool = False  # failed flights have it, too
-    ratio: bool = True  # platforms are compared by ratio, else by difference
-
-
-QUANTITIES = (
-    _Quantity("flight_time_s", "flight time", "s"),
-    _Quantity("distance_m", "distance", "m"),
-    _Quantity("energy_regression_j", "energy (regression)", "J"),
-    _Quantity("energy_propeller_j", "energy (propellers)", "J"),
-    _Quantity("replans", "replans", "count", ratio=False),
-    _Quantity("response_median_s", "response, median", "s", any_end=True),
-    _Quantity("response_p95_s", "response, 95th percentile", "s", any_end=True),
-)
-SCHEMA = pa.schema(
-    {
-        "platform": pa.string(), "setting": pa.string(), "target": pa.string(), "seed": pa.int64(),
-        "fault_seed": pa.int64(), "outcome": pa.string(), "counted": pa.bool_(),
-        **{each.name: pa.float64() for each in QUANTITIES},
-    }
-)  # fmt: skip
-
-
-def compared(flights: pa.Table) -> pa.Table:
-    """The columns of SCHEMA for the missions that ended; golden flights have an empty target."""
-    table = flown(flights)
-    bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
-    setting = pc.coalesce(table["detector"].cast(pa.string()), bare)
-    target = pc.fill_null(table["fault_target"].cast(pa.string()), "")
-    for name, column in (("setting", setting), ("target", target)):
-        table = table.append_column(name, column)
-    return table.select(SCHEMA.names).cast(SCHEMA)
-
-
-def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table) -> dict[str, Any]:
-    """All numbers of the flights, as plain values.
-
-    `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
-    `cost_differences` have one row per setting and platform other than the first. `flights` has
-    one row per flight. Shares, increases and ratios have no unit; all other names end in the unit
-    or have it in a key of its own.
-
-    Args:
-        flights: with the columns of SCHEMA.
-    """
-    whole = flights.append_column("succeeded", pc.equal(flights["outcome"], "success"))
-    first, *others = platforms
-    faulty = [setting for setting in settings if setting != GOLDEN]
-    every = {
-        (platform, setting): chosen(whole, platform=platform, setting=setting)
-        for platform, setting in itertools.product(platforms, (GOLDEN, NONE, *settings))
-    }
-    counted = {place: chosen(table, counted=True) for place, table in every.items()}
-    won = {place: chosen(table, succeeded=True) for place, table in counted.items()}
-    found = {
-        (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
-        for platform, setting in itertools.product(platforms, faulty)
-    }
-
-    def at(platform: str, setting: str) -> dict[str, Any]:
-        return {"platform": platform, "setting": setting}
-
-    return {
-        "confidence": CONFIDENCE,
-        "settings": [
-            {**at(p, s), **_setting(every[p, s], counted[p, s])}
-            for s, p in itertools.product(settings, platforms)
-        ],
-        "ratios": [
-            {**at(p, s), "reference": first, **_ratio(counted[first, s], counted[p, s])}
-            for p, s in itertools.product(others, settings)
-        ],
-        "costs": [
-            {**at(p, s), **found[p, s].row(found[p, NONE], protected=s != NONE)}
-            for p, s in itertools.product(platforms, faulty)
-        ],
-        "cost_differences": [
-            {**at(p, s), "reference": first, **found[p, s].extra(found[first, s])}
-            for p, s in itertools.product(others, faulty)
-        ],
-        "worst": [
-            {**at(p, s), **_worst_row(won[p, GOLDEN], won[p, NONE], won[p, s],
-                                      protected=s not in (GOLDEN, NONE))}
-            for p, s in itertools.product(platforms, settings)
-        ],
-        "flights": flights.to_pylist(),
-    }  # fmt: skip
-
-
-# One platform and setting ---------------------------------------------------------------------
-
-
-def _setting(every: pa.Table, counted: pa.Table) -> dict[str, Any]:
-    ends = pc.value_counts(counted["outcome"]).to_pylist()
-    return {
-        "flown": every.num_rows,
-        "counted": counted.num_rows,
-        "outcomes": dict(sorted((each["values"], each["counts"]) for each in ends)),
-        "success": asdict(rate(int(flags(counted, "succeeded").sum()), counted.num_rows)),
-        "quantities": {each.name: _measured(each, counted) for each in QUANTITIES},
-    }
-
-
-def _measured(quantity: _Quantity, counted: pa.Table) -> dict[str, Any]:
-    chosen_ones = counted if quantity.any_end else chosen(counted, succeeded=True)
-    values = known(numbers(chosen_ones, quantity.name))
-    return {
-        "unit": quantity.unit,
-        "median": asdict(interval(values, median, resamples=RESAMPLES)),
-        "mean": asdict(interval(values, resamples=RESAMPLES)),
-        "largest": max(values.tolist(), default=math.nan),
-    }
-
-
-# Two platforms --------------------------------------------------------------------------------
-
-
-def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
-    pairs = paired(first, second, MISSION)
-    test = McNemar.of(*(flags(each, "succeeded") for each in pairs))
-    return {
-        "pairs": test.pairs,
-        "both_succeed": test.both,
-        "success": {**asdict(test), "difference": test.difference},
-        "quantities": {each.name: _changed(each, *pairs) for each in QUANTITIES},
-    }
-
-
-def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> dict[str, Any]:
-    """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
-    if not quantity.any_end:
-        both = pa.array(flags(first, "succeeded") & flags(second, "succeeded"))
-        first, second = first.filter(both), second.filter(both)
-    before, after = (numbers(each, quantity.name).tolist() for each in (first, second))
-    found = changed(
-        first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=RESAMPLES
-    )
-    kind, unit = ("ratio", "ratio") if quantity.ratio else ("difference", quantity.unit)
-    return {"kind": kind, "unit": unit, **asdict(found)}
 
 
 # Descriptions of the platforms ----------------------------------------------------------------

@@ -191,6 +191,8 @@ def _heard(channel: socket.socket) -> Mapping[str, Any] | None:
     return None
 
 
+# What the end of an attempt means --------------------------------------------------------------
+
 FULL_BYTES = 16 << 20  # with less free space a disk counts as full
 # A fault can make a process kill itself by other signals than these; these come from outside.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
@@ -255,6 +257,8 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
     }
     return Verdict(state=ResultState.FLOWN, result=result, reason=reason, run=run)
 
+
+# On dask.distributed --------------------------------------------------------------------------
 
 CONNECT_S, WORKERS_S = 15.0, 60.0
 _BACKLOG = 2  # missions queued for each thread, so that it never waits for us

@@ -183,6 +183,8 @@ def worst_case(
     }
 
 
+# Effects and claims ----------------------------------------------------------------------------
+
 DRAWS = 100_000  # of the three rates in `recovered_share`
 Count = tuple[int, int]  # successes, missions
 

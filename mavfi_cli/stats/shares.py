@@ -224,6 +224,8 @@ def cross_layer(
     }
 
 
+# Clusters ---------------------------------------------------------------------------------------
+
 Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it
 # Sampled clusters of each stratum, those without a run included.
 Sampled = Mapping[Any, int]
