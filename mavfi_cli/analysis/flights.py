@@ -22,6 +22,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
+    PlannedMission,
     ResultState,
     canonical,
     changes_of,
@@ -69,15 +70,14 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     """
     labels = sorted({name for cell in ledger.cells() for name in cell})
     rows = [_row(entry, labels) for entry in ledger.results(among)]
-    names = _names(labels)
+    names = _row(_NOTHING, labels)  # the columns of a ledger without results, too
     return pa.table({name: _column([row[name] for row in rows]) for name in names})
 
 
-def _names(labels: Sequence[str]) -> list[str]:
-    own = ("number", "pair", "labels", *(f"label_{name}" for name in labels), *CONFIG, "level")
-    asked = (*(f"fault_{name}" for name in FAULT), "detector", "protect", "changes")
-    came = ("state", "outcome", "succeeded", "counted", "reason", "injected", "wall_s", "attempts")
-    return [*own, *asked, *came, "path", *measures_of({}), *COSTS]
+_NOTHING = MissionResult(
+    number=0, mission=PlannedMission(config=MissionConfig()), state=ResultState.ERROR, outcome=None,
+    reason="", result={}, injected=None, wall_s=0.0, attempts=0, path=None,
+)  # fmt: skip
 
 
 def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:

@@ -122,16 +122,13 @@ def _plan(options: dict[str, Any]) -> Any:
 
     base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
     named = options["detectors"]
+    same = ("flights", "first_seed", "models", "level", "seed")
     return EvaluationPlan(
         worlds=options["worlds"] or WORLDS,
         detectors=DETECTORS if named is None else names_in(named),
-        flights=options["flights"],
         golden_flights=max(options["golden_flights"], options["flights"]),
-        first_seed=options["first_seed"],
         protect=names_in(options["protect"]),
-        models=options["models"],
-        level=options["level"],
         fields=names_in(options["fields"]),
-        seed=options["seed"],
         base=MissionConfig(**base),
+        **{name: options[name] for name in same},
     )

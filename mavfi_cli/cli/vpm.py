@@ -171,17 +171,11 @@ def _flown(
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.studies.redundancy import fly_and_report
 
+    same = ("missions", "first_seed", "models", "train", "stack")
     plan = RedundancyPlan(
-        vehicles=vehicles,
-        choices=choices,
-        worlds=options["worlds"] or WORLDS,
-        missions=options["missions"],
-        first_seed=options["first_seed"],
-        folder=out,
-        models=options["models"],
-        train=options["train"],
-        stack=options["stack"],
-    )
+        vehicles=vehicles, choices=choices, worlds=options["worlds"] or WORLDS, folder=out,
+        **{name: options[name] for name in same},
+    )  # fmt: skip
     with missions_view(quiet=options["quiet"]) as view:
         return fly_and_report(plan, known, Options(jobs=options["jobs"] or 0), view)
 

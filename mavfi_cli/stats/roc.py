@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import z_of
 
 _HALVINGS = 60
@@ -47,7 +46,9 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, A
     false = len(negative) - np.searchsorted(negative, levels, side="left")
     recall, precision = hits / len(positive), hits / (hits + false)
     below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
-    area = _area(positive, negative)
+    # The probability that a harmful fault scores higher than an error-free flight, ties halved.
+    pairs = [np.searchsorted(negative, positive, side=side) for side in ("left", "right")]
+    area = float((pairs[0] + pairs[1]).sum() / (2.0 * len(positive) * len(negative)))
     low, high = _area_interval(area, len(positive), len(negative))
     return {
         **found,
@@ -61,13 +62,6 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, A
         "average_precision": float((precision * np.diff(recall, prepend=0.0)).sum()),
         "operating_point": (float((negative > 1.0).mean()), float((positive > 1.0).mean())),
     }
-
-
-def _area(positive: FloatArray, negative: FloatArray) -> float:
-    """Probability that a harmful fault scores higher than an error-free flight, ties halved."""
-    below = np.searchsorted(negative, positive, side="left")
-    not_above = np.searchsorted(negative, positive, side="right")
-    return float((below + not_above).sum() / (2.0 * len(positive) * len(negative)))
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
