@@ -139,15 +139,6 @@ def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack:
     return highest / fresh.threshold
 
 
-def samples_of(run: Run, name: str) -> FlightSamples:
-    """The samples of a flight with a trace."""
-    assert run.trace is not None
-    columns, plans = columns_of(run.trace), run.folder.read_plans()
-    return FlightSamples.of_trace(
-        columns, name, run.record.config["seed"], PreprocessParams(), plans
-    )
-
-
 def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:
     """Collect the samples of the error-free flights among the run folders of a folder.
 
@@ -166,7 +157,11 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
         config = run.record.config
         world = config["world"]
         name = run.folder.path.name if (world, config["seed"]) in flights else world
-        flights[name, config["seed"]] = samples_of(run, name)
+        assert run.trace is not None
+        columns, plans = columns_of(run.trace), run.folder.read_plans()
+        flights[name, config["seed"]] = FlightSamples.of_trace(
+            columns, name, config["seed"], PreprocessParams(), plans
+        )
     autopilots = {run.record.config.get("autopilot", OWN_AUTOPILOT) for run in usable}
     return list(flights.values()), len(runs) - len(usable), autopilots
 

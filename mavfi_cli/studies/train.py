@@ -6,22 +6,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.analysis.scores import flown_samples, samples_of
+from mavfi_cli.analysis.scores import flown_samples
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
+from mavfi_cli.campaigns.ledger import RUNS
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.types import Outcome
 from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.fit import check, fit
-from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.offline import Dataset
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
 
-DATASET = "dataset.parquet"
+DATASET, FLIGHTS = "dataset.parquet", "flights"
 
 
 def train(
@@ -35,22 +33,23 @@ def train(
 
     Raises:
         ModelError: too few flights, an unknown kind, or torch is missing; before anything is
-            flown, unless too many flights fail.
+            flown, unless too many flights fail. Or no flight is error-free.
         ConfigError: n sigma is out of range, the folder has the flights of another plan, or nothing
             names the binary of a real autopilot.
         RecordError: a file cannot be written.
     """
     stack = load_stack(plan.base.stack).mark
     if plan.flown is None:
-        check(plan.kinds, len(plan.missions()), plan.n_sigma)
+        missions = plan.missions()
+        check(plan.kinds, len(missions), plan.n_sigma)
         plan = replace(plan, base=plan.base.with_firmware())
-        flights, failed = _fly(plan, folder, options, spectator)
-        autopilots = {plan.base.autopilot}
+        kept = replace(options, keep=Keep.ALL)
+        run_campaign(plan.missions(), folder / FLIGHTS, kept, spectator).close()
+        flights, _, autopilots = flown_samples(folder / FLIGHTS / RUNS, stack)
+        failed = len(missions) - len(flights)
     else:
         flights, failed, autopilots = flown_samples(plan.flown, stack)
         check(plan.kinds, len(flights), plan.n_sigma)
-    if not flights:
-        raise ModelError("no flight reached the goal: there is nothing to fit to", path=folder)
     folder.mkdir(parents=True, exist_ok=True)
     dataset = Dataset(flights=tuple(flights), preprocess=PreprocessParams(), stack=stack)
     dataset.save(folder / DATASET)
@@ -65,17 +64,3 @@ def train(
     for model, path in models.values():  # all of them, or none
         model.save(path)
     return dataset, models, failed
-
-
-def _fly(
-    plan: TrainingPlan, folder: Path, options: Options, spectator: Spectator
-) -> tuple[list[FlightSamples], int]:
-    """Fly the missing flights; return samples of the successful ones, and how many others."""
-    missions, options = plan.missions(), replace(options, keep=Keep.ALL)
-    with run_campaign(missions, folder / "flights", options, spectator) as ledger:
-        flights = [
-            samples_of(load_run(entry.path), entry.mission.config.world)
-            for entry in ledger.results()
-            if entry.outcome == Outcome.SUCCESS.value and entry.path is not None
-        ]
-    return flights, len(missions) - len(flights)
