@@ -2,6 +2,9 @@
 
 The tree is OctoMap's own C++ (pyoctomap), so a fault in it is a fault in OctoMap. Defaults are
 those of MAVBench's octomap_server, except the resolution; see `OccupancyParams`.
+
+A snapshot is OctoMap's binary node stream; see `octree`. A voxel's Morton code interleaves the bits
+of its indices (x lowest), so sorted codes are in the stream's order.
 """
 
 from __future__ import annotations
@@ -13,8 +16,11 @@ import numpy as np
 import pyoctomap
 from numpy.typing import NDArray
 
-from mavfi_cli.autonomy import octree
+from mavfi_cli.autonomy.octree import HALF_RANGE, TREE_DEPTH
+from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.types import FloatArray, PointCloud
+
+Codes = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +58,7 @@ class MapSnapshot:
     @classmethod
     def of_points(cls, points_enu_m: FloatArray, resolution_m: float = 0.2) -> MapSnapshot:
         """Return a snapshot in which exactly the voxels of the points (n, 3) are occupied."""
-        codes = np.empty(len(points_enu_m), np.int64)
-        count = octree.morton_codes(np.asarray(points_enu_m, np.float64), resolution_m, codes)
-        payload = octree.encode(np.unique(codes[:count]))
+        payload = _stream_of(np.unique(_codes_of(points_enu_m, resolution_m)))
         return cls(stamp_s=0.0, resolution_m=resolution_m, payload=payload)
 
     def signed_bytes(self) -> NDArray[np.int8]:
@@ -75,7 +79,7 @@ class OccupancyMap:
     def __init__(self, params: OccupancyParams) -> None:
         self._params = params
         self._stamp_s = -math.inf
-        self._ended_in: octree.Codes = np.empty(0, np.int64)  # sorted
+        self._ended_in: Codes = np.empty(0, np.int64)  # sorted
         self._occupied = np.empty(0, np.bool_)  # one flag for each code in _ended_in
         self._tree = pyoctomap.OcTree(params.resolution_m)
         self._tree.setProbHit(params.probability_hit)
@@ -110,7 +114,7 @@ class OccupancyMap:
         return MapSnapshot(
             stamp_s=self._stamp_s,
             resolution_m=self._params.resolution_m,
-            payload=octree.encode(self._ended_in[self._occupied]),
+            payload=_stream_of(self._ended_in[self._occupied]),
         )
 
     def tree(self) -> bytes:
@@ -125,15 +129,13 @@ class OccupancyMap:
 
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
         """Return True for coordinates in the octree's range less a ray's length; False for NaN."""
-        limit = octree.HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
+        limit = HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
         inside: NDArray[np.bool_] = np.abs(coordinates) < limit
         return inside
 
     def _remember(self, ends: FloatArray) -> None:
         """Add the voxels of ray ends (n, 3) to the voxels that may be occupied."""
-        codes = np.empty(len(ends), np.int64)
-        count = octree.morton_codes(ends, self._params.resolution_m, codes)
-        fresh = np.setdiff1d(codes[:count], self._ended_in)
+        fresh = np.setdiff1d(_codes_of(ends, self._params.resolution_m), self._ended_in)
         if len(fresh):
             places = np.searchsorted(self._ended_in, fresh)
             self._ended_in = np.insert(self._ended_in, places, fresh)
@@ -143,6 +145,95 @@ class OccupancyMap:
         """Look up in the tree all listed voxels in the box from low to high, each (3,)."""
         resolution = self._params.resolution_m
         centres = np.empty((len(self._ended_in), 3))
-        octree.voxel_centres(self._ended_in, resolution, centres)
+        _voxel_centres(self._ended_in, resolution, centres)
         inside = ((centres >= low - resolution) & (centres <= high + resolution)).all(axis=1)
         self._occupied[inside] = self._tree.getLabels(centres[inside]) == 1
+
+
+def _codes_of(points: FloatArray, resolution_m: float) -> Codes:
+    """Return the codes of the voxels of points (n, 3), without points that have none."""
+    codes = np.empty(len(points), np.int64)
+    return codes[: _morton_codes(np.asarray(points, np.float64), resolution_m, codes)]
+
+
+@compiled
+def _morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
+    """Write the codes of the voxels of points (n, 3) and return their number.
+
+    Points that are not finite or outside the octree's range have no code. Coordinates are rounded
+    to single precision first, as in OctoMap.
+    """
+    count = 0
+    factor = 1.0 / resolution
+    for i in range(points.shape[0]):
+        code = 0
+        for axis in range(3):
+            scaled = math.floor(factor * np.float64(np.float32(points[i, axis]))) + HALF_RANGE
+            if not 0 <= scaled < 2 * HALF_RANGE:
+                code = -1
+                break
+            index = int(scaled)
+            for bit in range(TREE_DEPTH):
+                code |= ((index >> bit) & 1) << (3 * bit + axis)
+        if code >= 0:
+            codes[count] = code
+            count += 1
+    return count
+
+
+@compiled
+def _voxel_centres(codes: Codes, resolution: float, centres: FloatArray) -> None:
+    """Write the centres (n, 3), m, of the voxels with the given codes (n,)."""
+    for i in range(codes.shape[0]):
+        for axis in range(3):
+            index = 0
+            for bit in range(TREE_DEPTH):
+                index |= ((codes[i] >> (3 * bit + axis)) & 1) << bit
+            centres[i, axis] = (index - HALF_RANGE + 0.5) * resolution
+
+
+def _stream_of(codes: Codes) -> bytes:
+    """Encode a tree in which exactly these voxels are occupied and all others unknown.
+
+    `codes` (n,) must be sorted and distinct. A fully occupied cube becomes one leaf.
+    """
+    if not len(codes):
+        return b""
+    stream = np.empty(2 * TREE_DEPTH * len(codes), np.uint8)
+    return stream[: _encode(codes, stream)].tobytes()
+
+
+@compiled
+def _encode(codes: Codes, stream: NDArray[np.uint8]) -> int:
+    """Fill `stream` and return the number of bytes."""
+    stack = np.empty((8 * TREE_DEPTH + 8, 3), np.int64)  # first code, end of codes, height
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, len(codes), TREE_DEPTH
+    depth, position = 1, 0
+    ends = np.empty(8, np.int64)
+    while depth > 0:
+        depth -= 1
+        first, end, height = stack[depth, 0], stack[depth, 1], stack[depth, 2] - 1
+        shift = 3 * height
+        full = 1 << shift
+        begin, children = first, 0
+        for child in range(8):
+            last = begin
+            if height == 0:
+                while last < end and (codes[last] & 7) == child:
+                    last += 1
+            else:
+                bound = (((codes[first] >> (shift + 3)) << 3) + child + 1) << shift
+                last = begin + np.searchsorted(codes[begin:end], bound)
+            ends[child] = last
+            if last > begin:
+                kind = 2 if last - begin == full else 3
+                children |= kind << (2 * child)
+            begin = last
+        stream[position], stream[position + 1] = children & 255, children >> 8
+        position += 2
+        for child in range(7, -1, -1):  # last first: the stack gives the first back first
+            if (children >> (2 * child)) & 3 == 3:
+                stack[depth, 0] = ends[child - 1] if child > 0 else first
+                stack[depth, 1], stack[depth, 2] = ends[child], height
+                depth += 1
+    return position

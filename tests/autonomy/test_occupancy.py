@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pyoctomap
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mavfi_cli.autonomy.occupancy import (
     MapSnapshot,
@@ -82,6 +84,19 @@ def test_a_point_in_range_fills_its_voxel_and_one_beyond_fills_none():
     occupancy.insert(cloud_of([[3.05, 0.05, 5.05], [8.0, 0.0, 5.0]]))
     assert voxels(occupancy.snapshot()) == {(15, 0, 25)}
     assert len(voxels(occupancy.snapshot())) == 1
+
+
+indices = st.integers(-30000, 30000)
+
+
+@settings(max_examples=30, deadline=None)
+@given(indices, indices, indices)
+def test_a_voxel_is_found_again_wherever_it_is(i, j, k):
+    """Its code, its centre, and OctoMap's own look-up agree all over the tree's range."""
+    centre = (np.array([i, j, k]) + 0.5) * 0.2
+    occupancy = OccupancyMap(OccupancyParams(z_min_m=-1e4, z_max_m=1e4))
+    occupancy.insert(cloud_of([centre], origin=centre + np.array([1.0, 0.0, 0.0])))
+    assert voxels(occupancy.snapshot()) == {(i, j, k)}
 
 
 def test_rays_through_a_wrong_voxel_clear_it_and_snapshots_stay_as_they_were():
