@@ -284,8 +284,9 @@ class Flight:
         stamp_s = self._take(data) if data else None
         if self._session.telemetry.heard and self.link.rivals:
             self._session.telemetry.unfit = self.link.rivals
-        if stamp_s is not None and not clock.heard:
-            self._take_clock(stamp_s)
+        if stamp_s is not None and not clock.heard:  # adopt its clock, and begin the session anew
+            self.begun_s = self._session.telemetry.now_s = stamp_s
+            self._session = self._new_session(self._session.telemetry)
         if self._tick(stamp_s):
             clock.hear(self.stamp_s)
             self._unspoken_s = 0.0
@@ -326,13 +327,6 @@ class Flight:
         self.link.send(self._session.tick(clock.now_s), clock.now_s)
         if isinstance(self._session.failure, NoAutopilot):
             raise self._session.failure
-
-    def _take_clock(self, stamp_s: float) -> None:
-        """Adopt the foreign vehicle's clock at its first state and restart the session."""
-        self.begun_s = stamp_s
-        telemetry = self._session.telemetry
-        telemetry.now_s = stamp_s
-        self._session = self._new_session(telemetry)
 
     def _tick(self, stamp_s: float | None) -> bool:
         """Run one control tick: publish due outputs, decide, send the setpoint, then compute.

@@ -30,6 +30,8 @@ def test_a_fault_in_a_state_in_words(changes, words):
 
 def test_a_drawn_state_stands_for_the_stage():
     assert FaultConfig(target="planning").words("waypoint_z") == "a bit of waypoint z"
+    queued = FaultConfig(target="queue.waypoint_x")
+    assert queued.words("waypoint_x") == queued.words() == "a bit of waypoint x in control's queue"
 
 
 def test_a_fault_in_an_instruction_in_words():
