@@ -325,26 +325,12 @@ def _least_benign(kernels: Kernels, but: str) -> _Finding:
     return _Finding(effect=shares[least].effect, told=told)
 
 
-MEASURES: Mapping[str, Callable[..., _Finding]] = {
-    "success_lost": _success_lost,
-    "most_lost_kernel": _most_lost_kernel,
-    "harm_difference": _harm_difference,
-    "harmful": _harmful,
-    "loss_difference": _loss_difference,
-    "as_long": _as_long,
-    "worst_as_long": _worst_as_long,
-    "energy_follows_time": _energy_follows_time,
-    "recovered": _recovered,
-    "shortened": _shortened,
-    "control_recovers_most": _control_recovers_most,
-    "all_stages_best": _all_stages_best,
-    "autoencoder_better": _autoencoder_better,
-    "overhead_of": _overhead_of,
-    "gaussian_dearer": _gaussian_dearer,
-    "calibrated": _calibrated,
-    "outcome_beside": _outcome_beside,
-    "least_benign": _least_benign,
-}
+MEASURES: Mapping[str, Callable[..., _Finding]] = {measure.__name__[1:]: measure for measure in (
+    _success_lost, _most_lost_kernel, _harm_difference, _harmful, _loss_difference, _as_long,
+    _worst_as_long, _energy_follows_time, _recovered, _shortened, _control_recovers_most,
+    _all_stages_best, _autoencoder_better, _overhead_of, _gaussian_dearer, _calibrated,
+    _outcome_beside, _least_benign,
+)}  # fmt: skip
 """By the names that claims.toml uses. Each takes flights or kernels, and what a claim gives it."""
 
 # The claims of claims.toml ------------------------------------------------------------------------

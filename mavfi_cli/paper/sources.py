@@ -164,7 +164,7 @@ def _from_ledger(folder: Path) -> CampaignSource:
         plan = FlightsPlan.stored(ledger)
     again = "" if spec is None else shlex.join(["mavfi", "campaign", "run", str(folder)])
     again = again if plan is None else plan.command
-    return _campaign(folder, origin["name"] or folder.name, spec, table, origin, again=again)
+    return _campaign(folder, spec, table, origin, name=origin["name"] or folder.name, again=again)
 
 
 def _from_summary(path: Path) -> _Kernels:
@@ -185,24 +185,18 @@ def _from_export(path: Path) -> CampaignSource:
     spec = _spec_beside(path)
     try:
         origin, digest = provenance(table), file_digest(path)
-        return _campaign(path, path.stem, spec, table, origin, digest=digest)
+        return _campaign(path, spec, table, origin, name=path.stem, digest=digest)
     except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise RecordError(f"{path}: not an export of a campaign ({error})") from None
 
 
 def _campaign(
-    path: Path,
-    name: str,
-    spec: Spec | None,
-    table: pa.Table,
-    origin: Mapping[str, Any],
-    **more: Any,
+    path: Path, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any], **more: Any
 ) -> CampaignSource:
     errors = table["state"].to_pylist().count(ResultState.ERROR.value)
     told = {each: origin[each] for each in ("planned", "versions", "host") if each in origin}
-    return CampaignSource(
-        path=path, name=name, spec=spec, flights=Flights.of(table), errors=errors, **told, **more
-    )
+    more |= {"flights": Flights.of(table), "errors": errors}
+    return CampaignSource(path=path, spec=spec, **told, **more)
 
 
 def _spec_beside(path: Path) -> Spec | None:

@@ -205,15 +205,10 @@ def _link(text: str) -> str:
 
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "percent": _percent,
-    "ends": _ends,
-    "effect": _effect,
-    "p": _p_value,
+    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value, "csv": csv_text,
+    "link": _link, "toml": Spec.to_toml,
     "detector": lambda name: DETECTOR_TITLES.get(name, name) if name else "none",
     "hourly": lambda rates: "{:.2g} ({:.2g} to {:.2g})".format(*rates),
     "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
-    "csv": csv_text,
-    "link": _link,
-    "toml": Spec.to_toml,
-}
+}  # fmt: skip
 """By the names that page.html uses."""

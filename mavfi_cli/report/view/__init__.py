@@ -94,14 +94,14 @@ class ViewedFlight:
         """Colour of vehicle, path and setpoints, as in all pictures."""
         return FLIGHTS[1 if self.run.record.fault else 0]
 
-    def entry(
-        self, name: str, stamp_s: float, kind: str, data: Any, colour: str = "", size_m: Any = None
-    ) -> Entry:
+    def entry(self, name: str, stamp_s: float, kind: str, data: Any, **look: Any) -> Entry:
         """An entry of this name below the flight's."""
-        return Entry(
-            path=f"{self.name}/{name}", stamp_s=stamp_s, kind=kind, data=data, colour=colour,
-            size_m=size_m,
-        )  # fmt: skip
+        return Entry(path=f"{self.name}/{name}", stamp_s=stamp_s, kind=kind, data=data, **look)
+
+    def line(self, name: str, stamp_s: float, points: FloatArray, **look: Any) -> Entry:
+        """A line through points (n, 3), in the flight's colour."""
+        look = {"colour": self.colour, **look}
+        return self.entry(name, stamp_s, "line", _drawable(points), **look)
 
 
 def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
@@ -137,7 +137,9 @@ def _world(record: FlightRecord) -> Iterator[Entry]:
 
 def _plans(flight: ViewedFlight) -> Iterator[Entry]:
     for plan in flight.run.record.plans:
-        yield _line(flight, "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), PLAN, 0.08)
+        yield flight.line(
+            "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), colour=PLAN, size_m=0.08
+        )
 
 
 def _notes(flight: ViewedFlight) -> Iterator[Entry]:
@@ -150,9 +152,8 @@ def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
     for event in flight.run.record.events:
         if event["kind"] == kind and event["position_enu_m"]:
             places.append(event["position_enu_m"])
-            yield flight.entry(
-                f"{kind}s", event["stamp_s"], "marks", np.array(places), _MARKED[kind], _MARK_M
-            )
+            look = {"colour": _MARKED[kind], "size_m": _MARK_M}
+            yield flight.entry(f"{kind}s", event["stamp_s"], "marks", np.array(places), **look)
 
 
 def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
@@ -160,11 +161,11 @@ def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
     for row in trace.drop_columns(["phase"]).to_pylist():
         stamp_s = row.pop("stamp_s")
         position = np.array([row["x_m"], row["y_m"], row["z_m"]])
-        yield flight.entry("vehicle", stamp_s, "pose", (position, row["yaw_rad"]), flight.colour)
+        yield flight.entry("vehicle", stamp_s, "pose", (position, row["yaw_rad"]))
         if row["command_vx"] is not None:
             velocity = np.array([row[f"command_v{axis}"] for axis in "xyz"])
             way = np.stack([position, position + _SETPOINT_S * velocity])
-            yield _line(flight, "setpoint", stamp_s, way, flight.colour, 0.1)
+            yield flight.line("setpoint", stamp_s, way, size_m=0.1)
         yield flight.entry("states", stamp_s, "values", row)
 
 
@@ -174,18 +175,7 @@ def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
     last = len(stamps) - 1
     for row in sorted({*range(0, last, _PATH_EVERY_TICKS), last} - {-1}):
         points = np.concatenate([places[:row:_PATH_STEP_TICKS], places[row : row + 1]])
-        yield _line(flight, "path", float(stamps[row]), points, flight.colour, 0.15)
-
-
-def _line(
-    flight: ViewedFlight,
-    name: str,
-    stamp_s: float,
-    points_enu_m: FloatArray,
-    colour: str,
-    width_m: float,
-) -> Entry:
-    return flight.entry(name, stamp_s, "line", _drawable(points_enu_m), colour, width_m)
+        yield flight.line("path", float(stamps[row]), points, size_m=0.15)
 
 
 def _drawable(points: FloatArray) -> FloatArray:
@@ -205,7 +195,7 @@ def _frames(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
 def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
     for cloud, start_s in orders.get("octomap", ()):
         points = _drawable(cloud.points_enu_m)
-        yield flight.entry("cloud", start_s, "points", points, flight.colour)
+        yield flight.entry("cloud", start_s, "points", points, colour=flight.colour)
 
 
 def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
@@ -218,7 +208,8 @@ def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
             told_s = start_s
             leaves = occupied_leaves(snapshot.payload) * snapshot.resolution_m
             sizes = np.repeat(leaves[:, 3:], 3, axis=1)
-            yield flight.entry("map", start_s, "boxes", leaves[:, :3] + sizes / 2.0, _MAP, sizes)
+            look = {"colour": _MAP, "size_m": sizes}
+            yield flight.entry("map", start_s, "boxes", leaves[:, :3] + sizes / 2.0, **look)
 
 
 # Writing ------------------------------------------------------------------------------------------
