@@ -67,7 +67,7 @@ class Client(Peer):
         super().__init__(transport)
         self._simulation = simulation
         self._preset = preset
-        self._link = simulation.autopilot.open_link(preset)
+        self.link = simulation.autopilot.open_link(preset)
         system = simulation.autopilot.system_id
         self._codec = Codec(system, COMPONENT, signing=signing)
         self._camera_codec = Codec(system, CAMERA, signing=signing)
@@ -77,11 +77,11 @@ class Client(Peer):
 
     def rejoin(self) -> None:
         """Begin again with the preset's streams, after the simulation has restarted."""
-        self._link = self._simulation.autopilot.open_link(self._preset)
+        self.link = self._simulation.autopilot.open_link(self._preset)
 
     def close(self) -> None:
         """Leave the autopilot and release the connection."""
-        self._simulation.autopilot.close_link(self._link)
+        self._simulation.autopilot.close_link(self.link)
         super().close()
 
     def receive(self, timeout_s: float) -> list[Any]:
@@ -102,7 +102,7 @@ class Client(Peer):
                     self._offer_camera(message)
                 elif message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
                     self.overheard.append(bytes(message.get_msgbuf()))
-                self._simulation.autopilot.handle(message, self._link)
+                self._simulation.autopilot.handle(message, self.link)
         return messages
 
     def send_tick(self) -> bool:
@@ -116,22 +116,17 @@ class Client(Peer):
                 for message in self._simulation.camera_due
                 if self._wants_frames or message.get_msgId() not in _FRAMES
             ]
-            return self._send(due, self._simulation.autopilot.collect(self._link))
+            return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> None:
         """Send the streams that are faster than a tick, at a stamp between two ticks."""
         autopilot = self._simulation.autopilot
-        if self._link.is_fast and isinstance(autopilot, Autopilot):
-            self._send([], autopilot.collect_between(self._link, stamp_us))
-
-    @property
-    def is_fast(self) -> bool:
-        """True if the client has asked for more than one message a tick."""
-        return self._link.is_fast
+        if self.link.is_fast and isinstance(autopilot, Autopilot):
+            self._send([], autopilot.collect_between(self.link, stamp_us))
 
     def send_answers(self) -> None:
         """Send answers without waiting for the tick."""
-        self._send([], self._link.take())
+        self._send([], self.link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
         """Send messages of both components; the camera's answers are the first."""
@@ -304,32 +299,23 @@ class _Realtime:
         self._clients.serve(until_s=0.0)
         while not stopped() and not self._clients.over:
             self._clients.each(Client.send_tick)
-            if any(client.is_fast for client in self._clients):
-                self._serve(STEP_US, stopped)
-                self._simulation.advance(partial(self._between, stopped=stopped))
-            else:
-                self._serve(TICK_US, stopped)
-                self._simulation.advance()
-            self._tell_collision()
+            is_fast = any(client.link.is_fast for client in self._clients)
+            self._serve(STEP_US if is_fast else TICK_US, stopped)
+            self._simulation.advance(partial(self._between, stopped=stopped) if is_fast else None)
+            collision = self._simulation.referee.collision
+            if collision is not None and not self._told_collision:
+                self._told_collision = True
+                click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
             if self._simulation.autopilot.restart_asked:
-                self._restart()
+                self._simulation.restart()
+                self._clients.each(Client.rejoin)
+                self._told_collision = False
+                click.echo("restarted")
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
         """Send the fast streams at a stamp within a tick, and wait for the next step."""
         self._clients.each(partial(Client.send_between, stamp_us=stamp_us))
         self._serve(STEP_US, stopped)
-
-    def _restart(self) -> None:
-        self._simulation.restart()
-        self._clients.each(Client.rejoin)
-        self._told_collision = False
-        click.echo("restarted")
-
-    def _tell_collision(self) -> None:
-        collision = self._simulation.referee.collision
-        if collision is not None and not self._told_collision:
-            self._told_collision = True
-            click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
 
     def close(self) -> None:
         self._clients.close()
@@ -357,12 +343,6 @@ class _Realtime:
                 self._clients.each(partial(Client.forward, frame=frame, of=speaker))
 
 
-def _realtime(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    with contextlib.closing(_Realtime(options, simulation)) as server:
-        _announce(options, simulation)
-        server.run(stopped)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `python -m sitl`. Return its exit code."""
     given = sys.argv[1:] if arguments is None else arguments
@@ -379,9 +359,13 @@ def _serve(options: ServerOptions) -> None:
     if options.truth is not None:
         world.write_briefing(profile.camera_mount_flu_m, options.truth)
     simulation = _simulation(options, world, profile, logs=options.truth is not None)
-    run = _lockstep if options.lockstep else _realtime
     try:
-        run(options, simulation, stopped)
+        if options.lockstep:
+            _lockstep(options, simulation, stopped)
+        else:
+            with contextlib.closing(_Realtime(options, simulation)) as server:
+                _announce(options, simulation)
+                server.run(stopped)
     finally:
         simulation.close()
         if options.truth is not None:
@@ -442,10 +426,13 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
     for preset, url in options.links:
         first, *rest = _ways_to(url) or [""]
         links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{each}" for each in rest)]
+    whose = "anyone" + ("" if options.key_file is None else " who signs")
+    if options.trusted:
+        whose = f"system {', '.join(map(str, sorted(options.trusted)))} only"
     lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
         f"system {options.system_id}, {options.speed:g} x real time",
-        f"takes commands from {_commanders(options)}",
+        f"takes commands from {whose}",
         *(line.rstrip() for line in links),
         *_needs_of_firmware(options),
         "Ctrl-C ends it.",
@@ -463,12 +450,6 @@ def _needs_of_firmware(options: ServerOptions) -> list[str]:
         "and needs these parameters:",
         *(f"  {name} {value:.6g}" for name, value in parameters.items()),
     ]
-
-
-def _commanders(options: ServerOptions) -> str:
-    if options.trusted:
-        return f"system {', '.join(map(str, sorted(options.trusted)))} only"
-    return "anyone" + ("" if options.key_file is None else " who signs")
 
 
 def _ways_to(url: str) -> list[str]:

@@ -21,9 +21,7 @@ from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import Quadrotor, Truth
 from sitl.world import World
 
-HOST_FILE = "host.json"
-"""Where this machine's time went; beside the truth, and no part of it."""
-
+HOST_FILE = "host.json"  # where this machine's time went; beside the truth, and no part of it
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
 _GROUND_M = 0.3  # highest centre of a fallen vehicle

@@ -175,11 +175,8 @@ def _edges_squared(
     return nearest
 
 
-CONTACT_M = 1e-4
-"""A smaller distance counts as contact."""
-
-APPROACH_TOLERANCE_M = 1e-3
-"""Accuracy of the nearest approach between two poses."""
+CONTACT_M = 1e-4  # a smaller distance counts as contact
+APPROACH_TOLERANCE_M = 1e-3  # accuracy of the nearest approach between two poses
 
 
 @compiled

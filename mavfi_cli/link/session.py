@@ -20,18 +20,10 @@ from mavfi_cli.link.codec import Message, dialect, text_messages
 from mavfi_cli.link.commands import Commands, Ticket
 from mavfi_cli.link.telemetry import Telemetry
 
-_IGNORED = (
-    dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_Y_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_Z_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
-)
-_NO_ACCELERATION = (
-    dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
-)
-_NO_YAW = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+# POSITION_TARGET_TYPEMASK
+_IGNORED = 0x0807  # position and yaw rate
+_NO_ACCELERATION = 0x01C0
+_NO_YAW = 0x0400
 _CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _LARGEST_FLOAT32 = 3.4028234663852886e38
 

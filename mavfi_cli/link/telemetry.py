@@ -280,9 +280,6 @@ class Telemetry:
         if self.history.add(state):
             self.state = state
 
-    def _attitude_quaternion(self, message: Message) -> None:
-        self._attitude_from(message.q1, message.q2, message.q3, message.q4)
-
     def _attitude(self, message: Message) -> None:
         angles = (message.roll, message.pitch, message.yaw)
         if all(math.isfinite(angle) for angle in angles):
@@ -346,7 +343,9 @@ def _name(enum: str, number: int) -> str:
 _HANDLERS: dict[int, Callable[[Telemetry, Message], None]] = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT: Telemetry._heartbeat,
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Telemetry._local_position,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Telemetry._attitude_quaternion,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda telemetry, message: telemetry._attitude_from(
+        message.q1, message.q2, message.q3, message.q4
+    ),
     dialect.MAVLINK_MSG_ID_ATTITUDE: Telemetry._attitude,
     dialect.MAVLINK_MSG_ID_SYS_STATUS: Telemetry._sys_status,
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Telemetry._extended_sys_state,

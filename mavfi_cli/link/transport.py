@@ -28,17 +28,11 @@ _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 
 
 class Transport(ABC):
-    """Bytes to and from one peer.
+    """Bytes to and from one peer."""
 
-    Attributes:
-        url: URL of the endpoint, for error messages.
-        datagram: True if every `receive` returns whole frames; an argument of `Codec.decode`.
-        address: Address of a network peer, for error messages; "" if unknown.
-    """
-
-    url: str
-    datagram = False
-    address = ""
+    url: str  # of the endpoint, for error messages
+    datagram = False  # every `receive` returns whole frames; an argument of `Codec.decode`
+    address = ""  # of a network peer, for error messages; "" if unknown
 
     @property
     def rival_address(self) -> str:

@@ -73,11 +73,7 @@ class Camera:
         heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
 
-    Attributes:
-        local_origin_enu_m: Origin of LOCAL_POSITION_NED in the world (3,), m.
-
-    Raises:
-        ConfigError: The size, field of view or rate is invalid.
+    Raises ConfigError if the size, field of view or rate is invalid.
     """
 
     def __init__(
@@ -105,7 +101,7 @@ class Camera:
         self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
         self._origin = Origin()
-        self.local_origin_enu_m = np.zeros(3)
+        self.local_origin_enu_m = np.zeros(3)  # of LOCAL_POSITION_NED in the world, m
         self._default_interval_s = 1.0 / rate_hz
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)

@@ -58,8 +58,6 @@ def render_depth(
         columns, rows: Size of the image, at least 1.
         hfov_rad: Horizontal field of view, between 0 and pi.
     """
-    if columns < 1 or rows < 1 or not 0.0 < hfov_rad < math.pi:
-        raise ValueError(f"no camera has {columns} x {rows} pixels and {hfov_rad} rad")
     focal_px = columns / 2.0 / math.tan(hfov_rad / 2.0)
     depth = np.empty((rows, columns))
     image = np.empty((rows, columns), dtype=np.uint8)

@@ -83,17 +83,13 @@ class PoseTracker:
 
     There is a pose at each new attitude. The newest position is extrapolated to its stamp with the
     velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
-
-    Attributes:
-        origin_enu_m: Autopilot's local origin in the world (3,).
-        has_quaternion: True once ATTITUDE_QUATERNION has arrived, which is preferred to ATTITUDE.
     """
 
     def __init__(self, origin_enu_m: Vector) -> None:
-        self.origin_enu_m = np.asarray(origin_enu_m, dtype=np.float64)
+        self.origin_enu_m = np.asarray(origin_enu_m, dtype=np.float64)  # in the world (3,)
         self._position: tuple[float, Vector, Vector] | None = None  # stamp, NED m, NED m/s
         self._attitude: tuple[float, Vector] | None = None
-        self.has_quaternion = False
+        self.has_quaternion = False  # ATTITUDE_QUATERNION has arrived; preferred to ATTITUDE
 
     @property
     def has_position(self) -> bool:

@@ -36,7 +36,6 @@ _FOLLOWING = {  # the mode in which a firmware follows a companion
 }
 _ECHO_LIMIT_S = 0.2
 _SILENCE_US = 60_000_000
-_OUTBOX_LIMIT = 10_000
 
 
 def follows_companion(heartbeat: Any) -> bool:
@@ -195,8 +194,7 @@ class FirmwareAutopilot:
 
     def _broadcast(self, message: Any) -> None:
         for link in self._links:
-            if len(link.outbox) < _OUTBOX_LIMIT:
-                link.outbox.append(message)
+            link.send(message)
 
     def close(self) -> None:
         """Close the link to the firmware."""

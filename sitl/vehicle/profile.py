@@ -211,16 +211,12 @@ class VehicleProfile:
             )
 
     def _check_ranges(self) -> None:
-        if self.limits.tilt_deg > LARGEST_TILT_DEG:
-            raise ConfigError(
-                f"must be at most {LARGEST_TILT_DEG:g}, is {self.limits.tilt_deg:g}",
-                key="limits.tilt_deg",
-            )
-        if self.battery.drive_efficiency > 1.0:
-            raise ConfigError(
-                f"must be at most 1, is {self.battery.drive_efficiency:g}",
-                key="battery.drive_efficiency",
-            )
+        for key, value, most in (
+            ("limits.tilt_deg", self.limits.tilt_deg, LARGEST_TILT_DEG),
+            ("battery.drive_efficiency", self.battery.drive_efficiency, 1.0),
+        ):
+            if value > most:
+                raise ConfigError(f"must be at most {most:g}, is {value:g}", key=key)
         nominal_v = self.battery.cells * self.battery.cell_nominal_v
         if self.rotor.full_throttle_voltage_v > nominal_v:
             raise ConfigError(

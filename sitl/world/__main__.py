@@ -66,7 +66,7 @@ def _make(made: World, as_json: bool, output: Path | None) -> None:
     if output is not None:
         write_text(output, text)
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "file": _name(output)}, indent=1))
+        click.echo(json.dumps({**made.as_json(), "file": output and str(output)}, indent=1))
     elif output is None:
         click.echo(text, nl=False)
     else:
@@ -121,13 +121,9 @@ def _draw(made: World, as_json: bool, output: Path | None, with_path: bool) -> N
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "file": _name(file)}, indent=1))
+        click.echo(json.dumps({**made.as_json(), "file": str(file)}, indent=1))
     else:
         click.echo(f"{file}: {_boxes(made)}")
-
-
-def _name(path: Path | None) -> str | None:
-    return None if path is None else str(path)
 
 
 def _boxes(made: World) -> str:

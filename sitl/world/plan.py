@@ -232,11 +232,11 @@ def _draw_boxes(axes: Axes, world: World) -> None:
 
 def _draw_places(axes: Axes, world: World) -> None:
     start, goal = world.start_enu_m, world.goal_enu_m
-    axes.scatter(
-        [start[0]], [start[1]], s=34, marker="o", facecolor=_START, edgecolor="white",
-        linewidth=0.8, label="start", zorder=5,
-    )  # fmt: skip
-    axes.scatter(
-        [goal[0]], [goal[1]], s=110, marker="*", facecolor=_GOAL, edgecolor="white",
-        linewidth=0.8, label=f"goal, {goal[2]:g} m up", zorder=5,
-    )  # fmt: skip
+    for place, size, marker, colour, label in (
+        (start, 34, "o", _START, "start"),
+        (goal, 110, "*", _GOAL, f"goal, {goal[2]:g} m up"),
+    ):
+        axes.scatter(
+            [place[0]], [place[1]], s=size, marker=marker, facecolor=colour, edgecolor="white",
+            linewidth=0.8, label=label, zorder=5,
+        )  # fmt: skip

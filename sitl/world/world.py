@@ -37,9 +37,7 @@ from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream
 
-CLEAR_RADIUS_M = 3.0
-"""Minimum horizontal distance of an obstacle from start and goal."""
-
+CLEAR_RADIUS_M = 3.0  # minimum horizontal distance of an obstacle from start and goal
 _START_CLEAR_M = 0.5  # distance of a start from a box, as the vehicle must be able to stand there
 _CELL_M = 10.0
 _MARGIN_M = 20.0
