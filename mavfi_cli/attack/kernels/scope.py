@@ -113,6 +113,9 @@ def library_scope(library: str, function: str) -> KernelScope:
 def compiled_scope(kernel: str, function: Any) -> KernelScope:
     """Find entry and scope of a function that numba compiled and that has run in this process.
 
+    Python calls this entry. The compiled object identifies the build, because the code in memory
+    contains addresses of the process.
+
     Args:
         kernel: Name of the kernel.
         function: Compiled with `core.compiled.compiled`.
@@ -120,7 +123,15 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
     Raises:
         FaultError: The function has not run yet.
     """
-    name, entry, region = _compiled_region(function)
+    overloads = list(getattr(function, "overloads", {}).items())
+    if not overloads:
+        raise FaultError(f"{function} has not run yet: it has no machine code")
+    signature, result = overloads[0]
+    wrapper = result.fndesc.llvm_cpython_wrapper_name
+    address = int(result.library.get_pointer_to_function(wrapper))
+    name = f"numba:{function.__name__}"
+    region = _object_region(function, signature, wrapper, address)
+    entry = Location(name, address - region.span.start)
     return KernelScope(kernel=kernel, entry=entry, objects=(name,), regions={name: region})
 
 
@@ -144,15 +155,15 @@ def _whole_request(search: KernelScope) -> KernelScope:
     from mavfi_cli.autonomy.grid import path_free, segment_free
     from mavfi_cli.autonomy.octree import decode_leaves
 
-    reader, begin, reading = _compiled_region(decode_leaves)
-    pieces, piece, testing = _compiled_region(path_free)
-    _, segment, _ = _compiled_region(segment_free)
+    reader = compiled_scope("reader", decode_leaves)
+    pieces = compiled_scope("pieces", path_free)
+    segment = compiled_scope("segment", segment_free).entry
     return replace(
         search,
-        entry=begin,
-        objects=(*search.objects, pieces),
-        regions={**search.regions, pieces: testing, reader: reading},
-        inner=(search.entry, segment, piece, *search.inner),
+        entry=reader.entry,
+        objects=(*search.objects, *pieces.objects),
+        regions={**search.regions, **pieces.regions, **reader.regions},
+        inner=(search.entry, segment, pieces.entry, *search.inner),
     )
 
 
@@ -215,12 +226,12 @@ def _planner(kernel: str) -> KernelScope:
     wanted = (f"ompl9geometric{name}{end}", motion, *_OMPL_SHARED)
     solve = f"_ZN4ompl9geometric{name}5solveERKNS_4base27PlannerTerminationConditionE"
     part = _part(_functions_with(image, library, *wanted))
-    segment, _, region = _compiled_region(segment_free)
+    segment = compiled_scope("segment", segment_free)
     return KernelScope(
         kernel=kernel,
         entry=image.function(solve, [library]),
-        objects=(library, segment),
-        regions={library: part, segment: region},
+        objects=(library, *segment.objects),
+        regions={library: part, **segment.regions},
         inner=_nearest(image, library, motion),
     )
 
@@ -259,26 +270,6 @@ def _part(functions: Iterable[Function]) -> Part:
         elif function.size:
             spans.append(range(start, end))
     return Part(text=tuple(spans))
-
-
-def _compiled_region(dispatcher: Any) -> tuple[str, Location, Region]:
-    """Find name, entry and code of a function that `core.compiled` compiled and that has run.
-
-    Python calls this entry. The compiled object identifies the build, because the code in memory
-    contains addresses of the process.
-
-    Raises:
-        FaultError: the kernel has not run in this process yet.
-    """
-    overloads = list(getattr(dispatcher, "overloads", {}).items())
-    if not overloads:
-        raise FaultError(f"{dispatcher} has not run yet: it has no machine code")
-    signature, result = overloads[0]
-    wrapper = result.fndesc.llvm_cpython_wrapper_name
-    address = int(result.library.get_pointer_to_function(wrapper))
-    name = f"numba:{dispatcher.__name__}"
-    region = _object_region(dispatcher, signature, wrapper, address)
-    return name, Location(name, address - region.span.start), region
 
 
 def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) -> Region:

@@ -7,6 +7,7 @@ A stopped thread is named by its thread id. ptrace obeys only the thread that at
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import platform
 import signal
@@ -234,11 +235,10 @@ class ProcessTimer:
         self, pid: int, number: signal.Signals, *, cpu_s: float | None, wall_s: float | None
     ) -> None:
         self.fired = False
-        self._pid = pid
         self._signal = number
         self._process = os.pidfd_open(pid)
-        self._cpu_end = None if cpu_s is None else cpu_time_s(pid) + cpu_s
-        self._wall_end = None if wall_s is None else time.monotonic() + wall_s
+        clocks = ((functools.partial(cpu_time_s, pid), cpu_s), (time.monotonic, wall_s))
+        self._ends = [(clock, clock() + left) for clock, left in clocks if left is not None]
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -269,9 +269,4 @@ class ProcessTimer:
 
     def _left_s(self) -> float:
         """Lower bound of the time left; CPU time passes no faster than wall time."""
-        left = []
-        if self._cpu_end is not None:
-            left.append(self._cpu_end - cpu_time_s(self._pid))
-        if self._wall_end is not None:
-            left.append(self._wall_end - time.monotonic())
-        return min(left)
+        return min(end_s - clock() for clock, end_s in self._ends)

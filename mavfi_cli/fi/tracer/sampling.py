@@ -8,6 +8,7 @@ in (return, callback, exception) is missed.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -172,40 +173,30 @@ class _Blanket:
     """Covers the code in scope with breakpoint instructions while foreign code runs."""
 
     def __init__(self, tracee: Tracee, scope: Scope) -> None:
-        self._tracee = tracee
-        self._code = [
-            (span.start, tracee.memory.read(span.start, len(span))) for span in scope.spans
-        ]
-        self._scope = scope
+        self._tracee, self._scope = tracee, scope
+        self._code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
         """Run foreign code; False if the program ended or the window's function returned."""
-        tracee = self._tracee
-        guard = tracee.breakpoint_at(int(stop[0])) if self._guarded(stop) else None
-        try:
-            self._write(covered=True)
-            while True:
-                if tracee.resume() is not None:
-                    return False
-                entered = tracee.registers.ip - len(_BREAKPOINT)
+        tracee, registers, returns_to = self._tracee, self._tracee.registers, int(stop[0])
+        with contextlib.ExitStack() as undo:
+            if returns_to > 0 and returns_to not in self._scope:
+                undo.callback(tracee.breakpoint_at(returns_to).close)
+            undo.callback(self._uncover)
+            for start, code in self._code.items():
+                tracee.memory.write(start, _BREAKPOINT * len(code))
+            while tracee.resume() is None:
+                entered = registers.ip - len(_BREAKPOINT)
                 if entered in self._scope:
-                    tracee.registers.write("rip", entered)
+                    registers.write("rip", entered)
                     return True
-                if tracee.registers.ip == stop[0] and tracee.registers.sp > stop[1]:
+                if registers.ip == returns_to and registers.sp > stop[1]:
                     return False
-        finally:
-            if guard is not None:
-                guard.close()
-            if tracee.ended is None:
-                self._write(covered=False)
+            return False
 
-    def _guarded(self, stop: NDArray[np.int64]) -> bool:
-        return int(stop[0]) > 0 and int(stop[0]) not in self._scope
-
-    def _write(self, *, covered: bool) -> None:
-        for start, code in self._code:
-            data = _BREAKPOINT * len(code) if covered else code
-            self._tracee.memory.write(start, data)
+    def _uncover(self) -> None:
+        for start, code in self._code.items() if self._tracee.ended is None else ():
+            self._tracee.memory.write(start, code)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
