@@ -120,18 +120,13 @@ _STOP_S = 10.0  # time after which a worker with a closed channel counts as ende
 
 
 class LocalWorkers:
-    """Keeps up to `jobs` missions flying.
-
-    Attributes:
-        running: process id by mission number; 0 until the worker's guard has sent it.
-    """
+    """Keeps up to `jobs` missions flying."""
 
     def __init__(self, jobs: int, module: str = TASK) -> None:
         self._jobs = jobs
         self._server = ForkServer(module)
         self._selector = selectors.DefaultSelector()
         self._number: dict[socket.socket, int] = {}  # mission number by channel
-        self.running: dict[int, int] = {}
 
     @property
     def free(self) -> int:
@@ -147,7 +142,6 @@ class LocalWorkers:
         channel = self._server.start(changes, out, limit_s)
         self._selector.register(channel, selectors.EVENT_READ)
         self._number[channel] = number
-        self.running[number] = 0
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """Wait for a guard's message or the time-out; return the missions that ended."""
@@ -155,18 +149,15 @@ class LocalWorkers:
         for key, _ in self._selector.select(timeout_s):
             channel = key.fileobj
             assert isinstance(channel, socket.socket)
-            number = self._number[channel]
-            said = _heard(channel)
-            if said is not None and "pid" in said:
-                self.running[number] = said["pid"]
-                continue
-            ended.append(AttemptEnd(number=number, **(said or {})))
-            self._release(channel)
+            said = _heard(channel) or {}
+            if "pid" not in said:  # not the begin of the worker
+                ended.append(AttemptEnd(number=self._number[channel], **said))
+                self._release(channel)
         return ended
 
     def _release(self, channel: socket.socket) -> None:
         self._selector.unregister(channel)
-        del self.running[self._number.pop(channel)]
+        del self._number[channel]
         channel.close()
 
     def close(self) -> None:
