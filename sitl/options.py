@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from sitl.autopilot.telemetry import Preset
-from sitl.command_line import CONTEXT, Positive, Triple, camera_options, signing, world_and_vehicle
+from sitl.command_line import CONTEXT, Positive, camera_options, signing, world_and_vehicle
 
 _FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
@@ -43,11 +43,8 @@ class _Link(click.ParamType[tuple[Preset, str]]):
 class ServerOptions:
     """The parsed options of the user."""
 
-    world: str
-    seed: int
+    of_world: dict[str, Any]  # arguments of `load_world`
     vehicle: str
-    start_enu_m: Triple | None
-    goal_enu_m: Triple | None
     links: Sequence[tuple[Preset, str]]
     fd: int | None
     lockstep: bool
@@ -125,6 +122,9 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))
     kind, lockstep, fd = hil or backend, given["lockstep"], given["fd"]
     links, speed = given.pop("links"), given.pop("speed")
+    of_world = {
+        key: given.pop(key) for key in ("name_or_path", "seed", "start_enu_m", "goal_enu_m")
+    }
     for is_wrong, problem in (
         (hil and backend, "--hil and --json exclude each other"),
         (given["firmware"] and not kind, "--firmware needs --hil or --json"),
@@ -143,4 +143,4 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     elif not lockstep and not links:
         urls = _FIRMWARE_LINKS if kind else _DEFAULT_LINKS
         links = [_Link().convert(url, None, None) for url in urls]
-    return ServerOptions(**given, links=links, speed=speed, firmware_kind=kind)
+    return ServerOptions(**given, of_world=of_world, links=links, speed=speed, firmware_kind=kind)

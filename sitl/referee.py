@@ -117,17 +117,13 @@ class Referee:
             stamp_s: Simulated time.
             position_enu_m, velocity_enu_mps: (3,)
             quaternion_flu_enu: Unit quaternion (4,) w x y z, body forward-left-up to ENU.
-            armed: True if the motors may turn.
-            on_ground: True if the physics reports ground contact.
+            armed, on_ground: The motors may turn; the physics reports ground contact.
             may_land: The flight controller is landing or taking off, so a gentle ground contact is
                 not a crash. A disarmed vehicle may always land.
             power_regression_w, power_propeller_w: Powers for the log.
 
-        Returns:
-            First collision of the flight in the call that detects it, otherwise None.
-
-        Raises:
-            VehicleProcessError: The state is not finite.
+        Returns the first collision of the flight in the call that detects it, otherwise None.
+        Raises VehicleProcessError if the state is not finite.
         """
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)

@@ -352,7 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = stop_on_signals()
-    world, profile = _world(options), load_profile(options.vehicle)
+    world, profile = load_world(**options.of_world), load_profile(options.vehicle)
     if not options.lockstep and not in_cache(control_step):
         click.echo("the first start compiles the vehicle, about half a minute", err=True)
         warm_up()
@@ -379,7 +379,7 @@ def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
     vehicle, the start or the goal cannot be used.
     """
     options = parse(arguments)
-    world, profile = _world(options), load_profile(options.vehicle)
+    world, profile = load_world(**options.of_world), load_profile(options.vehicle)
     world.write_briefing(profile.camera_mount_flu_m, truth_folder)
     return _EmbeddedVehicle(_simulation(options, world, profile, logs=True), truth_folder)
 
@@ -389,15 +389,6 @@ def warm_up() -> None:
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
     for _ in range(2):
         simulation.advance()
-
-
-def _world(options: ServerOptions) -> World:
-    return load_world(
-        options.world,
-        seed=options.seed,
-        start_enu_m=options.start_enu_m,
-        goal_enu_m=options.goal_enu_m,
-    )
 
 
 def _simulation(

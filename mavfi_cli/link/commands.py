@@ -125,19 +125,15 @@ class Commands:
             while lane and lane[0].due_s <= self.now_s:
                 ticket = lane[0]
                 if ticket.sent_since_answer < TRIES:
-                    due.append(self._send(ticket, system))
+                    confirmation = min(ticket.sent, 255)
+                    ticket.sent += 1
+                    ticket.sent_since_answer += 1
+                    ticket.due_s = self.now_s + TIMEOUT_S
+                    command = (system, ticket.component, ticket.command, confirmation)
+                    due.append(dialect.MAVLink_command_long_message(*command, *ticket.parameters))
                     break
                 lane.popleft().accepted = False
         return due
-
-    def _send(self, ticket: Ticket, system: int) -> Message:
-        confirmation = min(ticket.sent, 255)
-        ticket.sent += 1
-        ticket.sent_since_answer += 1
-        ticket.due_s = self.now_s + TIMEOUT_S
-        return dialect.MAVLink_command_long_message(
-            system, ticket.component, ticket.command, confirmation, *ticket.parameters
-        )
 
     # Requests of the present phase
 

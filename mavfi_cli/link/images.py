@@ -54,11 +54,8 @@ class ImageFrame:
     ) -> DepthFrame:
         """Convert to metres and add the pose of the camera at the capture.
 
-        Args:
-            state: Vehicle state at the image's stamp.
-            hfov_rad: Horizontal field of view to use if the image has none.
-            mount_offset_flu_m: Offset (3,) of the optical centre from the vehicle's centre. The
-                camera looks along the vehicle's x axis.
+        The state is that at the image's stamp. The field of view is used if the image has none. The
+        offset (3,) is that of the optical centre; the camera looks along the vehicle's x axis.
         """
         offset_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
         return DepthFrame(

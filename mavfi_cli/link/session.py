@@ -149,15 +149,10 @@ class OffboardSession:
         yaw_enu_rad: float | None = None,
         acceleration_enu_mps2: Sequence[float] | None = None,
     ) -> None:
-        """Set the target from the next tick on.
+        """Set velocity (3,), yaw and feed-forward acceleration (3,) from the next tick on.
 
         A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
-        autopilot decides how to handle a corrupted command.
-
-        Args:
-            velocity_enu_mps: Velocity (3,), m/s.
-            yaw_enu_rad: Yaw, counter-clockwise from east; None keeps the heading.
-            acceleration_enu_mps2: Feed-forward acceleration (3,), m/s^2; None for none.
+        autopilot decides how to handle a corrupted command. Without a yaw the heading is kept.
         """
         mask, yaw, ax, ay, az = _IGNORED, 0.0, 0.0, 0.0, 0.0
         east, north, up = _float32(velocity_enu_mps)

@@ -340,10 +340,6 @@ def _turn(out: Setpoint, heading_rad: float) -> None:
 # Other messages -----------------------------------------------------------------------------------
 
 
-def _attitude_target(autopilot: Autopilot, _message: Any, _link: Link) -> None:
-    autopilot.commander.say(Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported")
-
-
 def _set_mode_message(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
     if message.target_system != autopilot.system_id:
@@ -395,10 +391,6 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
         autopilot.broadcast(store.message(index))
 
 
-def _mission_request_list(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    link.send(dialect.MAVLink_mission_count_message(*_sender(message), 0, message.mission_type))
-
-
 def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Accept to clear the mission, also by an empty upload. No item and no upload exists."""
     result = dialect.MAV_MISSION_ACCEPTED
@@ -417,10 +409,6 @@ def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
         _FTP_FILE_NOT_FOUND,
     ).ljust(251, b"\0")  # fmt: skip
     link.send(dialect.MAVLink_file_transfer_protocol_message(0, *_sender(message), reply))
-
-
-def _log_request_list(_autopilot: Autopilot, _message: Any, link: Link) -> None:
-    link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
 
 
 def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -442,16 +430,22 @@ ADDRESSED: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: _param_request_list,
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ: _param_request_read,
     dialect.MAVLINK_MSG_ID_PARAM_SET: _param_set,
-    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: _mission_request_list,
+    dialect.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: lambda _autopilot, message, link: link.send(
+        dialect.MAVLink_mission_count_message(*_sender(message), 0, message.mission_type)
+    ),
     dialect.MAVLINK_MSG_ID_MISSION_COUNT: _mission_ack,
     dialect.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: _mission_ack,
     dialect.MAVLINK_MSG_ID_MISSION_REQUEST: _mission_ack,
     dialect.MAVLINK_MSG_ID_MISSION_REQUEST_INT: _mission_ack,
     dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: _file_transfer,
-    dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: _log_request_list,
+    dialect.MAVLINK_MSG_ID_LOG_REQUEST_LIST: lambda _autopilot, _message, link: link.send(
+        dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0)  # there are none
+    ),
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: _position_target,
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: _position_target,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: _attitude_target,
+    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: lambda autopilot, *_: autopilot.commander.say(
+        Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported"
+    ),
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: _execute,
     dialect.MAVLINK_MSG_ID_COMMAND_INT: _execute,
 }

@@ -10,7 +10,7 @@ import functools
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, rotation_matrix
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
 from sitl.autopilot.commander import Commander, FlightMode
 from sitl.autopilot.parameters import Parameters
@@ -85,15 +85,10 @@ class Snapshot:
         """Return the altitude above sea level of a local height, m."""
         return self.origin.altitude_amsl_m - down_m
 
-    def in_body(self, vector_ned: Sequence[float]) -> tuple[float, float, float]:
+    def in_body(self, vector_ned: Vector) -> Vector:
         """Turn a vector (3,) from NED into the body's FRD."""
-        w, x, y, z = self.truth.quaternion_frd_ned.tolist()
-        n, e, d = vector_ned
-        return (
-            (1 - 2 * (y * y + z * z)) * n + 2 * (x * y + w * z) * e + 2 * (x * z - w * y) * d,
-            2 * (x * y - w * z) * n + (1 - 2 * (x * x + z * z)) * e + 2 * (y * z + w * x) * d,
-            2 * (x * z + w * y) * n + 2 * (y * z - w * x) * e + (1 - 2 * (x * x + y * y)) * d,
-        )
+        turned: Vector = rotation_matrix(self.truth.quaternion_frd_ned).T @ vector_ned
+        return turned
 
     @property
     def thrust(self) -> float:
@@ -240,11 +235,11 @@ def _position_target_local_ned(s: Snapshot) -> Any:
 
 def _highres_imu(s: Snapshot) -> Any:
     """Specific force and rates in FRD, without a magnetometer."""
-    north, east, down = s.truth.acceleration_ned_mps2.tolist()
+    force_ned = s.truth.acceleration_ned_mps2 - np.array([0.0, 0.0, _GRAVITY_MPS2])
     height = s.amsl_m(float(s.truth.position_ned_m[2]))
     ratio = max(1.0 - 2.25577e-5 * height, 0.0)  # ISA troposphere
     return dialect.MAVLink_highres_imu_message(
-        s.stamp_us, *s.in_body([north, east, down - _GRAVITY_MPS2]),
+        s.stamp_us, *s.in_body(force_ned).tolist(),
         *s.truth.rates_frd_radps.tolist(), 0.0, 0.0, 0.0, _STANDARD_PRESSURE_HPA * ratio**5.25588,
         0.0, height, 25.0, 0x1A3F & ~0x1C0,
     )  # fmt: skip
@@ -296,7 +291,7 @@ def _odometry(s: Snapshot) -> Any:
     return dialect.MAVLink_odometry_message(
         s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD,
         *truth.position_ned_m.tolist(), truth.quaternion_frd_ned.tolist(),
-        *s.in_body(truth.velocity_ned_mps.tolist()), *truth.rates_frd_radps.tolist(),
+        *s.in_body(truth.velocity_ned_mps).tolist(), *truth.rates_frd_radps.tolist(),
         _UNKNOWN_COVARIANCE, _UNKNOWN_COVARIANCE, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100,
     )  # fmt: skip
 

@@ -78,7 +78,7 @@ def _camera(
     MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE. The
     referee judges the same pose, and tells a collision in a STATUSTEXT.
     """
-    world = load_world(of_world.pop("world"), **of_world)
+    world = load_world(**of_world)
     profile = load_profile(vehicle)
     forward, left, up = profile.camera_mount_flu_m if mount is None else mount
     camera = Camera(

@@ -214,12 +214,8 @@ def _refresh(
 class Quadrotor:
     """Deterministic physics and flight controller of one quadrotor.
 
-    Args:
-        profile: Vehicle profile.
-        position_enu_m: Initial position (3,) at rest. A position below the standing height is
-            raised to it: the centre of mass is then `profile.rest_height_m` above the ground.
-        yaw_enu_rad: Yaw, counter-clockwise from east.
-        dt_s: Physics and control step, s.
+    It begins at rest, with a yaw counter-clockwise from east. A position (3,) below the standing
+    height is raised to it: the centre of mass is then `profile.rest_height_m` above the ground.
     """
 
     def __init__(
@@ -252,12 +248,10 @@ class Quadrotor:
         self._refresh(np.zeros(4), 0.0, armed=False)
 
     def step(self, setpoint: Vector, armed: bool) -> None:
-        """Advance physics and flight controller by one step.
+        """Advance physics and flight controller by one step; the motors stop unless `armed`.
 
-        Args:
-            setpoint: Setpoint (11,): x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s,
-                m/s^2, rad, rad/s. Values that are not finite are not controlled.
-            armed: False stops the motors.
+        The setpoint (11,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
+        rad/s. Values that are not finite are not controlled.
         """
         self._state, commands = cascade.control_step(
             self._state, self._flat, setpoint, self._gains, armed

@@ -372,15 +372,12 @@ def _choose(
         to = goal if goal is not None else np.array([*plan[1], scene.flight_height_m])
         drawn = [p for p, known in ((from_, start), (to, goal)) if known is None]
         if least <= float(np.hypot(*(to - from_)[:2])) <= most and all(
-            _is_clear(boxes, bounds, place) for place in drawn
+            _inside(bounds, place)
+            and (distance_to_boxes(boxes, place, plan=True) >= CLEAR_RADIUS_M).all()
+            for place in drawn
         ):
             return from_, to
     raise WorldError(
         f"world {name!r}, seed {seed}: no clear start and goal {least:g} to {most:g} m apart; "
         "give start_enu_m and goal_enu_m"
     )
-
-
-def _is_clear(boxes: Vector, bounds: Vector, place: Vector) -> bool:
-    gaps = distance_to_boxes(boxes, place, plan=True)
-    return _inside(bounds, place) and bool((gaps >= CLEAR_RADIUS_M).all())
