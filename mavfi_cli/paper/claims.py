@@ -1,7 +1,7 @@
 """Every claim of the paper: its words, the number that decides it, and what the paper's n can tell.
 
 claims.toml has the claims. A claim is decided by one number, its effect, and by the range that the
-claim gives for it; `stats.paired.judge` does the rest. A measure finds the effect: it takes a
+claim gives for it; `ClaimVerdict.of` does the rest. A measure finds the effect: it takes a
 stack's flights, and the values of columns that choose some of
 them. Of faults without a detector it counts those that flipped a bit.
 """
@@ -29,8 +29,6 @@ from mavfi_cli.stats.paired import (
     Count,
     McNemar,
     correlation,
-    judge,
-    longest_reaches,
     recovered_share,
 )
 from mavfi_cli.stats.shares import Interval, Share, wilson
@@ -88,7 +86,7 @@ class _Claim:
         return {**{x: getattr(self, x) for x in self.__slots__ if x != "find"}, "cells": cells}
 
     def _cell(self, found: _Finding) -> dict[str, Any]:
-        verdict = judge(found.effect, self.low, self.high)
+        verdict = ClaimVerdict.of(found.effect, self.low, self.high)
         if verdict is ClaimVerdict.NOT_FLOWN and found.told:
             verdict = ClaimVerdict.NOT_JUDGED
         known = found.effect is not None and not math.isnan(found.effect.low)
@@ -172,7 +170,7 @@ def _worst_as_long(flights: Flights, ratio: float, missions: int, **where: Any) 
     beyond = _at_least(ratio, found)
     longest = 100.0 * (found.max() - 1.0)
     return _Finding(
-        effect=longest_reaches(beyond, missions),
+        effect=beyond.longest_reaches(missions),
         told=f"{beyond.counts} as long; longest {longest:+.1f} %",
     )
 

@@ -6,7 +6,8 @@ VII-A and by 87.1 % in Fig. 14: 64.2 / 73.8 = 87.0 %. So the first is in points 
 and the second is a share of the increase. Both are given here.
 
 An effect is one number of a comparison: a difference of two rates, or the share of a loss that
-protection recovers. A claim gives the range in which the effect lies. `judge` compares the two.
+protection recovers. A claim gives the range in which the effect lies. `ClaimVerdict.of` compares
+the two.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.stats.shares import NO_INTERVAL, Interval, Share, z_of
+from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
 _EXACT = 16  # all signs are tried up to this many differences
@@ -198,25 +199,27 @@ class ClaimVerdict(Enum):
     NOT_FLOWN = "not flown"
     NOT_JUDGED = "not judged"  # flown, but no number came of it
 
+    @classmethod
+    def of(
+        cls, effect: Interval | None, low: float = -math.inf, high: float = math.inf
+    ) -> ClaimVerdict:
+        """Compare the interval of an effect with the range that a claim gives.
 
-def judge(effect: Interval | None, low: float = -math.inf, high: float = math.inf) -> ClaimVerdict:
-    """Compare the interval of an effect with the range that a claim gives.
+        The claim is reproduced if the whole interval is in the range, and not reproduced if no part
+        of it is. If the interval has a part on either side, the missions do not tell. The ends of a
+        direction are open: an interval that ends at 0 is not above 0.
 
-    The claim is reproduced if the whole interval is in the range, and not reproduced if no part of
-    it is. If the interval has a part on either side, the missions do not tell. The ends of a
-    direction are open: an interval that ends at 0 is not above 0.
-
-    Args:
-        effect: with its 95 % interval; None, or an interval without ends, if there are no data.
-        low, high: ends of the claimed range. Only finite ends are open.
-    """
-    if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
-        return ClaimVerdict.NOT_FLOWN
-    if low < effect.low and effect.high < high:
-        return ClaimVerdict.REPRODUCED
-    if effect.high <= low or effect.low >= high:
-        return ClaimVerdict.NOT_REPRODUCED
-    return ClaimVerdict.OPEN
+        Args:
+            effect: with its 95 % interval; None, or an interval without ends, if there are no data.
+            low, high: ends of the claimed range. Only finite ends are open.
+        """
+        if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
+            return cls.NOT_FLOWN
+        if low < effect.low and effect.high < high:
+            return cls.REPRODUCED
+        if effect.high <= low or effect.low >= high:
+            return cls.NOT_REPRODUCED
+        return cls.OPEN
 
 
 def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:
@@ -260,22 +263,6 @@ def recovered_share(
     loss = rates[0] - rates[1]
     value = (rates[2] - rates[1]) / loss if loss else math.nan
     return Interval(value=value, low=float(low), high=float(high), count=faulty[1])
-
-
-def longest_reaches(beyond: Share, flights: int) -> Interval:
-    """Probability that the longest of so many flights is at least as long as a given one.
-
-    1 - (1 - p)^n, where p is the share of flights that are as long. The ends are those of p.
-
-    Args:
-        beyond: share of our flights that are as long.
-        flights: number of flights of which the longest is taken.
-    """
-    value, low, high = (
-        -math.expm1(flights * math.log1p(-each)) if each < 1.0 else 1.0
-        for each in (beyond.share, beyond.low, beyond.high)
-    )
-    return Interval(value=value, low=low, high=high, count=beyond.total)
 
 
 def excess_over_mean(golden: Sequence[float], others: Sequence[float]) -> tuple[float, float]:

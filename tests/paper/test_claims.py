@@ -12,7 +12,7 @@ from mavfi_cli.paper import claims, items
 from mavfi_cli.paper.claims import CLAIMS
 from mavfi_cli.paper.flights import WORLDS
 from mavfi_cli.paper.items import BY_NAME, printed
-from mavfi_cli.stats.paired import ClaimVerdict, judge
+from mavfi_cli.stats.paired import ClaimVerdict
 from mavfi_cli.stats.shares import wilson
 
 BY_CLAIM = {claim.name: claim for claim in CLAIMS}
@@ -20,7 +20,7 @@ BY_CLAIM = {claim.name: claim for claim in CLAIMS}
 
 def verdict(name, those):
     claim = BY_CLAIM[name]
-    return judge(claim.find(those).effect, claim.low, claim.high)
+    return ClaimVerdict.of(claim.find(those).effect, claim.low, claim.high)
 
 
 def test_names_are_unique_and_of_the_papers_items():
@@ -39,7 +39,7 @@ def test_a_claim_is_a_sentence_with_a_range_inside_which_something_lies(claim):
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
 def test_nothing_flown_is_no_verdict(claim):
     found = claim.find({} if claim.isolated else flights([]))
-    assert judge(found.effect, claim.low, claim.high) is ClaimVerdict.NOT_FLOWN
+    assert ClaimVerdict.of(found.effect, claim.low, claim.high) is ClaimVerdict.NOT_FLOWN
 
 
 def test_the_papers_numbers_stand_in_their_claims():

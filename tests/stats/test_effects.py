@@ -13,8 +13,6 @@ from mavfi_cli.stats.paired import (
     McNemar,
     correlation,
     excess_over_mean,
-    judge,
-    longest_reaches,
     recovered_share,
 )
 from mavfi_cli.stats.shares import Interval, wilson
@@ -39,7 +37,7 @@ def between(low, high):
     ],
 )
 def test_the_whole_interval_decides(effect, low, high, verdict):
-    assert judge(effect, low, high) is verdict
+    assert ClaimVerdict.of(effect, low, high) is verdict
 
 
 def test_newcombes_interval_of_his_own_example():
@@ -94,11 +92,11 @@ def test_recovered_is_a_ratio_whose_interval_is_wide_at_the_papers_n():
 
 
 def test_the_longest_of_many_flights():
-    found = longest_reaches(wilson(1, 100), 300)
+    found = wilson(1, 100).longest_reaches(300)
     assert found.value == pytest.approx(1.0 - 0.99**300)
     assert found.low < found.value < found.high <= 1.0
-    assert longest_reaches(wilson(0, 10), 300).low == 0.0
-    assert longest_reaches(wilson(10, 10), 3).value == 1.0
+    assert wilson(0, 10).longest_reaches(300).low == 0.0
+    assert wilson(10, 10).longest_reaches(3).value == 1.0
 
 
 def test_a_correlation_is_scipys():
