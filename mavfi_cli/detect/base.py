@@ -217,13 +217,8 @@ def listing(models: Path | None = None) -> list[dict[str, Any]]:
 
 def _row(name: str, path: Path | None) -> dict[str, Any]:
     has_model = path is not None and path.is_file()
-    row: dict[str, Any] = {
-        "name": name,
-        "model": str(path) if has_model else None,
-        "stack": None,
-        "threshold": None,
-        "provenance": None,
-    }
+    nothing = dict.fromkeys(("stack", "threshold", "provenance"))
+    row: dict[str, Any] = {"name": name, "model": str(path) if has_model else None, **nothing}
     try:
         row["threshold"] = find_detector(name, model=path).threshold
         if path is None:
