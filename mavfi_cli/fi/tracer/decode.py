@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,6 +66,17 @@ class MemoryUse:
         """The operand as text, for a record."""
         parts = [part for part in (self.segment, self.base, self.index) if part]
         return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
+
+    def address(self, instruction: Instruction, read: Callable[[str], int]) -> int:
+        """The address before the instruction executes; `read` gives the value of a register."""
+
+        def value(name: str | None) -> int:
+            named = _GENERAL.get(name or "")
+            return 0 if named is None else read(named.full) & low(named.width) << named.shift
+
+        base = instruction.next_address if self.base == "rip" else value(self.base)
+        origin = read(f"{self.segment}_base") if self.segment in ("fs", "gs") else 0
+        return base + value(self.index) * self.scale + self.displacement + origin & _FULL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,28 +192,6 @@ def _stack(found: Any) -> list[MemoryUse]:
             writes=not reads,
         )
     ]
-
-
-def address_of(use: MemoryUse, instruction: Instruction, read: Any) -> int:
-    """Address of a memory operand before the instruction executes.
-
-    Args:
-        read: function that returns the value of a full register.
-    """
-    total = use.displacement
-    if use.base == "rip":
-        total += instruction.next_address
-    else:
-        total += _part(use.base, read)
-    total += _part(use.index, read) * use.scale
-    if use.segment in ("fs", "gs"):
-        total += read(f"{use.segment}_base")
-    return int(total & _FULL)
-
-
-def _part(name: str | None, read: Any) -> int:
-    named = _GENERAL.get(name or "")
-    return 0 if named is None else int(read(named.full)) & low(named.width) << named.shift
 
 
 # -- registers by their names

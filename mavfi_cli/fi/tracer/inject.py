@@ -8,7 +8,7 @@ from enum import Enum
 
 from mavfi_cli.core.errors import FaultError
 from mavfi_cli.fi import bits
-from mavfi_cli.fi.tracer.decode import Instruction, address_of, decode
+from mavfi_cli.fi.tracer.decode import Instruction, decode
 from mavfi_cli.fi.tracer.fault import InstructionCorruption, InstructionFault, Role, Site
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.registers import TRAP_FLAG, VECTOR_BITS, width_of
@@ -113,7 +113,7 @@ def _apply(
     place = instruction.address
     if corruption.site is Site.MEMORY:
         use = instruction.memory[corruption.memory_operand]
-        place = address_of(use, instruction, tracee.registers.read)
+        place = use.address(instruction, tracee.registers.read)
     before = after = 0
     if corruption.role is Role.DESTINATION and clean_step(tracee, instruction) is not None:
         reason = "the program ended in the instruction"
@@ -250,7 +250,7 @@ def _touch_memory(
         for use in current.memory:
             if not (use.reads if reads else use.writes):
                 continue
-            start = address_of(use, current, tracee.registers.read) - place
+            start = use.address(current, tracee.registers.read) - place
             mask = use.mask
             mask = mask << 8 * min(start, 64) if start >= 0 else mask >> min(-8 * start, 1024)
             if mask & remaining:

@@ -17,7 +17,7 @@ from elftools.elf.elffile import ELFFile
 from native_programs import all_registers
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.decode import address_of, decode
+from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.registers import (
     _SLOT,
@@ -76,7 +76,7 @@ class Probe:
 
     def memory_bits(self, use, instruction, values):
         """Bits of a memory operand as bits of the state."""
-        address = address_of(use, instruction, lambda name: values.get(name, 0))
+        address = use.address(instruction, lambda name: values.get(name, 0))
         return use.mask << self.memory_at + 8 * (address - self.start)
 
     def state(self, values, content):

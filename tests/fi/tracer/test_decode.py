@@ -7,7 +7,7 @@ arch = pytest.importorskip("platform")
 if arch.machine() != "x86_64":
     pytest.skip("x86-64 only", allow_module_level=True)
 
-from mavfi_cli.fi.tracer.decode import address_of, decode  # noqa: E402
+from mavfi_cli.fi.tracer.decode import decode  # noqa: E402
 from mavfi_cli.fi.tracer.registers import widest_vector  # noqa: E402
 
 FULL = (1 << 64) - 1
@@ -73,9 +73,9 @@ def test_memory_operands_have_addresses():
     (use,) = load.memory
     registers = {"rcx": 0x2000, "rdx": 0x10}
     assert (use.reads, use.writes, use.size) == (True, False, 4)
-    assert address_of(use, load, registers.get) == 0x200C
+    assert use.address(load, registers.get) == 0x200C
     relative = of("8b0500010000")
-    assert address_of(relative.memory[0], relative, registers.get) == 0x1000 + 6 + 0x100
+    assert relative.memory[0].address(relative, registers.get) == 0x1000 + 6 + 0x100
 
 
 def test_lea_touches_no_memory():
@@ -89,7 +89,7 @@ def test_lea_touches_no_memory():
 def test_push_pop_and_ret_use_the_stack(code, offset, reads):
     instruction = of(code)
     use = instruction.memory[-1]
-    assert address_of(use, instruction, {"rsp": 0x7000}.get) == 0x7000 + offset
+    assert use.address(instruction, {"rsp": 0x7000}.get) == 0x7000 + offset
     assert (use.reads, use.writes) == (reads, not reads)
 
 
