@@ -371,11 +371,12 @@ class Tracee:
         if status.trapped:
             code = _signal_code(self.tid)
             sent = self._expecting_alarm and code <= 0  # by a process
-            return sent or code in _TRACER_TRAPS
-        if self._interrupting and status.event == 0:
-            # A signal came first. It is delivered when the thread goes on; the interrupt is
-            # still pending and would stop the thread again: consume it now.
-            self._pending_signal = status.signal
+            if sent or code in _TRACER_TRAPS:
+                return True
+        if self._interrupting:
+            # Another stop, such as the end of an exec, came first and takes the interrupt's place:
+            # Linux drops that. A signal is delivered when the thread goes on.
+            self._pending_signal = status.signal if status.event == 0 else 0
             self._interrupting = False
             return True
         return False
