@@ -400,9 +400,7 @@ def _simulation(
         heartbeat_hz=options.camera_heartbeat_hz, system=options.system_id,
         mount_offset_flu_m=profile.camera_mount_flu_m,
     )  # fmt: skip
-    settings: dict[str, Any] = {
-        "camera": camera, "system_id": options.system_id, "logs": logs,
-    }  # fmt: skip
+    settings: dict[str, Any] = {"camera": camera, "system_id": options.system_id, "logs": logs}
     if options.firmware_kind is None:
         return Simulation(world, profile, trusted=options.trusted, **settings)
     return FirmwareSimulation(

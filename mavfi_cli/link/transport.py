@@ -281,12 +281,10 @@ class _FirstClient(Transport):
         self.url, self.port = listener.url, listener.port
 
     def _serve(self) -> _Stream | None:
-        if self._client is None:
-            for client in self._listener.accept_ready(patient=True):
-                if self._client is None:
-                    self._client = client
-                else:
-                    client.close()
+        if self._client is None and (clients := self._listener.accept_ready(patient=True)):
+            self._client, *others = clients
+            for client in others:
+                client.close()
         return self._client
 
     def send(self, data: bytes) -> None:

@@ -14,7 +14,7 @@ from sitl.autopilot import services
 from sitl.autopilot.commander import GPS_FIX_US, Commander, FlightMode, Result, Severity
 from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
-from sitl.autopilot.telemetry import Link, Preset, Setpoint, Snapshot, no_setpoint
+from sitl.autopilot.telemetry import Link, Links, Setpoint, Snapshot, no_setpoint
 from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
 
@@ -24,7 +24,7 @@ _STRAIGHT_DOWN_MPS = 0.3
 _TEXTS_A_TICK = 10  # further texts are lost, so that a flood of mistakes is not one of texts
 
 
-class Autopilot:
+class Autopilot(Links):
     """A PX4-like autopilot without sockets or clock.
 
     At each stamp, call `observe` with the vehicle's state, `collect` for the messages of each link,
@@ -37,6 +37,7 @@ class Autopilot:
     """
 
     def __init__(self, truth: Truth, *, system_id: int = 1, trusted: Sequence[int] = ()) -> None:
+        super().__init__()
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
@@ -51,7 +52,6 @@ class Autopilot:
         )
         self.setpoint: Setpoint = no_setpoint()
         self.motors_on = False
-        self._links: list[Link] = []
         self._takeoff_down_m = math.nan
         self._hold: tuple[Vector, float] | None = None  # position and yaw of the next LOITER
         self._flown: FlightMode | None = None
@@ -60,21 +60,6 @@ class Autopilot:
         self._texts_left = _TEXTS_A_TICK
 
     # Links.
-
-    def open_link(self, preset: Preset) -> Link:
-        """Add a client with the streams of a preset."""
-        link = Link(preset)
-        self._links.append(link)
-        return link
-
-    def close_link(self, link: Link) -> None:
-        """Remove a client."""
-        self._links.remove(link)
-
-    def broadcast(self, message: Any) -> None:
-        """Queue a message for every client."""
-        for link in self._links:
-            link.send(message)
 
     def collect(self, link: Link) -> list[Any]:
         """Return all due messages of a link at the newest stamp: answers, then streams."""

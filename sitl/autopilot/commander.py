@@ -88,6 +88,10 @@ _RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended 
 _UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
 _OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
 _OBL_TERMINATE = 6
+_LANDED_STATES: dict[FlightMode, int] = {
+    FlightMode.TAKEOFF: dialect.MAV_LANDED_STATE_TAKEOFF,
+    FlightMode.LAND: dialect.MAV_LANDED_STATE_LANDING,
+}
 
 
 class Commander:
@@ -157,14 +161,9 @@ class Commander:
     @property
     def landed_state(self) -> int:
         """EXTENDED_SYS_STATE.landed_state."""
-        state: int = dialect.MAV_LANDED_STATE_IN_AIR
         if self.landed:
-            state = dialect.MAV_LANDED_STATE_ON_GROUND
-        elif self.mode is FlightMode.TAKEOFF:
-            state = dialect.MAV_LANDED_STATE_TAKEOFF
-        elif self.mode is FlightMode.LAND:
-            state = dialect.MAV_LANDED_STATE_LANDING
-        return state
+            return int(dialect.MAV_LANDED_STATE_ON_GROUND)
+        return int(_LANDED_STATES.get(self.mode, dialect.MAV_LANDED_STATE_IN_AIR))
 
     def is_available(self, mode: FlightMode) -> bool:
         """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""

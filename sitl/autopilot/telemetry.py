@@ -32,11 +32,9 @@ STEP_US = TICK_US // STEPS_A_TICK  # step of the physics, the shortest interval 
 _OUTBOX = 500  # messages that wait for a client; the oldest are dropped first
 _UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repeatable
 
+# Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,); NaN
+# means not controlled.
 Setpoint = Vector
-"""Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,).
-
-NaN means not controlled.
-"""
 
 
 def no_setpoint() -> Setpoint:
@@ -142,8 +140,7 @@ _GRAVITY_MPS2 = 9.80665
 
 
 def _heartbeat(s: Snapshot) -> Any:
-    commander = s.commander
-    mode = commander.mode
+    commander, mode = s.commander, s.commander.mode
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_QUADROTOR, dialect.MAV_AUTOPILOT_PX4,
         mode.base_mode(armed=commander.armed), mode.custom_mode, commander.system_status, 3,
@@ -268,8 +265,7 @@ def _battery_status(s: Snapshot) -> Any:
 
 
 def _estimator_status(s: Snapshot) -> Any:
-    good = s.commander.has_global_position
-    flags = _ESTIMATOR_GOOD if good else _ESTIMATOR_NO_POSITION
+    flags = _ESTIMATOR_GOOD if s.commander.has_global_position else _ESTIMATOR_NO_POSITION
     return dialect.MAVLink_estimator_status_message(
         s.stamp_us, flags, 0.01, 0.01, 0.01, 0.01, 0.0, 0.0, 0.1, 0.1
     )
@@ -504,3 +500,24 @@ class Link:
     def _choose_active(self) -> None:
         self._active = tuple(s for s in self._streams.values() if s.interval_us)
         self._fast = tuple(s for s in self._active if s.interval_us < TICK_US)
+
+
+class Links:
+    """The links of an autopilot, one for each client."""
+
+    def __init__(self) -> None:
+        self._links: list[Link] = []
+
+    def open_link(self, preset: Preset) -> Link:
+        """Add a client with the streams of a preset."""
+        self._links.append(Link(preset))
+        return self._links[-1]
+
+    def close_link(self, link: Link) -> None:
+        """Remove a client."""
+        self._links.remove(link)
+
+    def broadcast(self, message: Any) -> None:
+        """Queue a message for every client."""
+        for link in self._links:
+            link.send(message)

@@ -394,9 +394,8 @@ class Station:
         if self._autopilot is None or self._clock() < self._ask_at_s:
             return
         self._ask_at_s = self._clock() + _ASK_AGAIN_S
-        autopilot, interval = (
-            dialect.MAV_COMP_ID_AUTOPILOT1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
-        )  # fmt: skip
+        autopilot = dialect.MAV_COMP_ID_AUTOPILOT1
+        interval = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
         if not self._tracker.has_quaternion:
             self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
         if not self._tracker.has_position:

@@ -17,7 +17,7 @@ from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.link.codec import Codec, dialect, text_messages
 from mavfi_cli.link.transport import Transport
-from sitl.autopilot.telemetry import Link, Preset
+from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.geodesy import Origin
 from sitl.vehicle.vehicle import Truth
@@ -43,11 +43,11 @@ def follows_companion(heartbeat: Any) -> bool:
     return bool(heartbeat.custom_mode == _FOLLOWING.get(heartbeat.autopilot))
 
 
-class FirmwareAutopilot:
+class FirmwareAutopilot(Links):
     """A firmware behind a MAVLink link, as the autopilot of a simulation.
 
     It asks the firmware for the streams of a flight, and sets its local origin to the world's, so
-    that its positions are world coordinates.
+    that its positions are world coordinates. Clients of any preset get all its `common` messages.
 
     Args:
         echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
@@ -57,6 +57,7 @@ class FirmwareAutopilot:
     restart_asked = False  # a reboot is the firmware's own
 
     def __init__(self, transport: Transport, *, system_id: int = 1, echoes: bool = True) -> None:
+        super().__init__()
         self.system_id = system_id
         self.state_stamp_us = -1  # of the newest LOCAL_POSITION_NED; -1 without one
         self.armed = False  # the motors may turn; the owner sets it
@@ -65,23 +66,12 @@ class FirmwareAutopilot:
         self._echoes = echoes
         self._codec = Codec(system_id, CAMERA)
         self._follows = False
-        self._links: list[Link] = []
         self._to_firmware: list[bytes] = []
         self._prepared = False
         self._heard_us = 0
         self._echo = self._echoed = 0
 
     # Clients.
-
-    def open_link(self, preset: Preset) -> Link:
-        """Add a client. Whatever its preset, it gets all `common` messages of the firmware."""
-        link = Link(preset)
-        self._links.append(link)
-        return link
-
-    def close_link(self, link: Link) -> None:
-        """Remove a client."""
-        self._links.remove(link)
 
     def handle(self, message: Any, _link: Link) -> None:
         """Keep a client's message for the next `deliver`, under the client's own ids."""
@@ -105,7 +95,7 @@ class FirmwareAutopilot:
             return
         self.terminated = True
         for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), 1):
-            self._broadcast(message)
+            self.broadcast(message)
 
     @property
     def commander(self) -> FirmwareAutopilot:
@@ -165,7 +155,7 @@ class FirmwareAutopilot:
             self._follows = follows_companion(message)
             if not self._prepared:
                 self._prepare()
-        self._broadcast(message)
+        self.broadcast(message)
 
     def _prepare(self) -> None:
         """Ask for the streams and set the origin, at each heartbeat until positions arrive."""
@@ -191,10 +181,6 @@ class FirmwareAutopilot:
             self._transport.send(b"".join(frames))
         except LinkLost as error:
             raise VehicleProcessError(str(error)) from None
-
-    def _broadcast(self, message: Any) -> None:
-        for link in self._links:
-            link.send(message)
 
     def close(self) -> None:
         """Close the link to the firmware."""

@@ -24,10 +24,8 @@ from sitl.simulation import Simulation
 from sitl.vehicle.profile import VehicleProfile
 from sitl.world import World
 
-LINKS: Mapping[str, type[Px4Link] | type[ArduPilotLink]] = {
-    "px4": Px4Link, "ardupilot": ArduPilotLink,
-}  # fmt: skip
-"""The simulator links of the firmware that can fly."""
+# The simulator links of the firmware that can fly.
+LINKS: Mapping[str, type[Px4Link | ArduPilotLink]] = {"px4": Px4Link, "ardupilot": ArduPilotLink}
 
 _REMEMBERED_S = 1.0
 _POSITION_LIMIT_US = 120_000_000

@@ -319,8 +319,11 @@ class _StandIn:
             ValueError: The propellers take more shaft power than hover_power_w.
         """
         mass_kg = self.mass_kg or base.mass_kg
-        rotor = _with_pull(base, self.rotor_pull_n or base.max_thrust_n)
-        battery = base.battery
+        faster = math.sqrt((self.rotor_pull_n or base.max_thrust_n) / base.max_thrust_n)
+        rotor, battery = base.rotor, base.battery
+        rotor = dataclasses.replace(
+            rotor, max_rpm=faster * rotor.max_rpm, motor_kv_rpmpv=faster * rotor.motor_kv_rpmpv
+        )
         if self.battery_wh is not None:
             nominal_v = battery.cells * battery.cell_nominal_v
             battery = dataclasses.replace(battery, capacity_ah=self.battery_wh / nominal_v)
@@ -354,15 +357,6 @@ class _StandIn:
         tangent = self.acceleration_mps2 / (LEVEL_SHARE * GRAVITY_MPS2)
         needed_deg = math.degrees(math.atan(tangent))
         return min(max(needed_deg, base.limits.tilt_deg), LARGEST_TILT_DEG)
-
-
-def _with_pull(base: VehicleProfile, pull_n: float) -> _Rotor:
-    faster = math.sqrt(pull_n / base.max_thrust_n)
-    return dataclasses.replace(
-        base.rotor,
-        max_rpm=faster * base.rotor.max_rpm,
-        motor_kv_rpmpv=faster * base.rotor.motor_kv_rpmpv,
-    )
 
 
 PROFILES = Shipped("vehicle", Path(__file__).parent / "profiles")

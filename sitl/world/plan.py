@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 
+# Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi).
 DEFAULT_CLEARANCE_M = 2.0
-"""Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi)."""
-
 _CELL_M = 0.5
 _MOST_CELLS = 1e8  # of the grid, 5 km square
 _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
