@@ -22,7 +22,7 @@ from missions import fly
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.detect import base
 from mavfi_cli.detect.gate import Gate
-from mavfi_cli.mission.measures import detection_cost
+from mavfi_cli.mission.measures import DetectionCost
 from mavfi_cli.spec.detector import DetectorConfig
 
 CALM = ("--stack", "hardened", "--world", "dense")
@@ -106,7 +106,7 @@ def in_flights(flights: int, fault_seed: int) -> None:
         for kind, options in (("golden", ()), ("faulty", fault)):
             flown = [fly(*CALM, "--detector", name, *options).result
                      for _ in range(flights)]  # fmt: skip
-            costs = [cost for cost in map(detection_cost, flown) if cost is not None]
+            costs = [cost for cost in map(DetectionCost.of, flown) if cost is not None]
             check_us = 1e6 * statistics.median(cost.check_host_s for cost in costs)
             share = statistics.median(cost.detection_share for cost in costs)
             print(f"{name:10} {kind:8} {costs[-1].checks / costs[-1].flight_s:9.1f}"

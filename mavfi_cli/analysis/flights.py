@@ -35,7 +35,7 @@ from mavfi_cli.mission.measures import (
     QUALITY,
     RECOMPUTED,
     STRUCK,
-    detection_cost,
+    DetectionCost,
     measures_of,
     record_of,
 )
@@ -86,7 +86,7 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
     level = None if fault is None else "instruction" if config.fault is None else "source"
     injected = None if entry.injected is None else entry.injected.value
     shares: list[float | None] = [None] * len(COSTS)
-    cost = detection_cost(entry.result)
+    cost = DetectionCost.of(entry.result)
     if cost is not None:
         recovery = (cost.recovery_s[stage] / cost.flight_s for stage in RECOMPUTED)
         shares = [cost.detection_share, *recovery]

@@ -19,7 +19,7 @@ from mavfi_cli.analysis.summary import RESAMPLES, Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost, detection_cost
+from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost
 from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval
@@ -53,7 +53,7 @@ def flight_overheads(
     for group in found:
         flown: dict[str, list[DetectionCost]] = {}
         for each in ledger.results(group.codes("number")[group.counted].tolist()):
-            cost = detection_cost(each.result)
+            cost = DetectionCost.of(each.result)
             if cost is not None:
                 flown.setdefault(cost.detector, []).append(cost)
         rows += [_of_setting(group.labels, flown[name], confidence) for name in sorted(flown)]
@@ -140,7 +140,7 @@ class ComputeOverhead:
         counted: dict[str, list[DetectionCost]] = {}
         left_out: Counter[str] = Counter()
         names: dict[str, str] = {}  # platform in a mission -> name
-        for cost in filter(None, map(detection_cost, records)):
+        for cost in filter(None, map(DetectionCost.of, records)):
             if cost.faulty or cost.compute_s <= cost.recovered_s or cost.host_compute_s <= 0.0:
                 continue
             name = names.setdefault(cost.platform, _platform_name(cost.platform))

@@ -341,46 +341,46 @@ class DetectionCost:
         """Ratio of the recomputations' simulated time to the flight time."""
         return self.recovered_s / self.flight_s
 
+    @classmethod
+    def of(cls, result: Mapping[str, Any]) -> DetectionCost | None:
+        """Compute the cost of detection and recovery in a flight.
 
-def detection_cost(result: Mapping[str, Any]) -> DetectionCost | None:
-    """Compute the cost of detection and recovery in a flight.
+        Returns:
+            Cost; None without a detector or without any check.
+        """
+        flight = record_of(result)
+        detection, kernels = flight.detection, flight.kernels
+        walls = flight.host.get("stage_wall_s") or {}
+        checks_host_s = walls.get("gate")
+        if not detection or not checks_host_s:
+            return None
+        checks = sum(detection["checks"].values())
+        flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
+        if not checks or not flight_s:
+            return None
+        # Alarms that are not listed are distributed over the stages like those that are.
+        listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
+        total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
+        again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 
-    Returns:
-        Cost; None without a detector or without any check.
-    """
-    flight = record_of(result)
-    detection, kernels = flight.detection, flight.kernels
-    walls = flight.host.get("stage_wall_s") or {}
-    checks_host_s = walls.get("gate")
-    if not detection or not checks_host_s:
-        return None
-    checks = sum(detection["checks"].values())
-    flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
-    if not checks or not flight_s:
-        return None
-    # Alarms that are not listed are distributed over the stages like those that are.
-    listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
-    total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
-    again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
+        def mean_s(kernel: Mapping[str, Any] | None) -> float:
+            """Return the mean latency of an invocation, s."""
+            if not kernel or not kernel["invocations"]:
+                return 0.0
+            return float(kernel["busy_s"] / kernel["invocations"])
 
-    def mean_s(kernel: Mapping[str, Any] | None) -> float:
-        """Return the mean latency of an invocation, s."""
-        if not kernel or not kernel["invocations"]:
-            return 0.0
-        return float(kernel["busy_s"] / kernel["invocations"])
-
-    return DetectionCost(
-        detector=detection["detector"],
-        checks=checks,
-        checks_host_s=checks_host_s,
-        flight_s=flight_s,
-        recomputations=again,
-        recovery_s={
-            stage: math.fsum(again[stage] * mean_s(kernels.get(name)) for name in names)
-            for stage, names in RECOMPUTED.items()
-        },
-        compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
-        host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
-        platform=str(flight.config.get("platform", "an unknown platform")),
-        faulty=bool(flight.fault),
-    )
+        return cls(
+            detector=detection["detector"],
+            checks=checks,
+            checks_host_s=checks_host_s,
+            flight_s=flight_s,
+            recomputations=again,
+            recovery_s={
+                stage: math.fsum(again[stage] * mean_s(kernels.get(name)) for name in names)
+                for stage, names in RECOMPUTED.items()
+            },
+            compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
+            host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
+            platform=str(flight.config.get("platform", "an unknown platform")),
+            faulty=bool(flight.fault),
+        )

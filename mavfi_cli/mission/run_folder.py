@@ -29,7 +29,7 @@ from mavfi_cli.core.types import (
 )
 from mavfi_cli.mission.measures import FlightRecord, record_of
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import measured_factor
+from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import FIRST
 
 if TYPE_CHECKING:
@@ -317,7 +317,7 @@ class Run:
             why = "an interrupted flight does not repeat"
         elif record.config.get("link") is not None:
             why = "a flight of a foreign autopilot does not repeat"
-        elif measured_factor(record.config.get("platform", "")) is not None:
+        elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times does not repeat"
         for name, digest in record.files.items():
             if not why and file_digest(name) != digest:

@@ -9,7 +9,7 @@ from typing import Any
 
 from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.tracer.image import short_name
-from mavfi_cli.mission.measures import DetectionCost, FlightRecord, detection_cost, record_of
+from mavfi_cli.mission.measures import DetectionCost, FlightRecord, record_of
 from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.report.columns import WIDTH
 
@@ -54,7 +54,7 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
         lines.append(f"Referee     on {pose}")
     lines += _fault_lines(flight.fault)
     lines += _node_lines(flight.nodes)
-    lines += _detection_lines(flight.detection, detection_cost(result))
+    lines += _detection_lines(flight.detection, DetectionCost.of(result))
     response = flight.response_time_s
     if response.get("median") is not None:
         lines.append(

@@ -14,7 +14,7 @@ from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
-from mavfi_cli.spec.platform import KERNELS, measured_factor
+from mavfi_cli.spec.platform import KERNELS, PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 
 FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}
@@ -174,7 +174,7 @@ class MissionConfig:
                 raise ConfigError("has no meaning with --link unless --eyes is given", key=name)
 
     def _check_platform(self) -> None:
-        if measured_factor(self.platform) is None:
+        if PlatformProfile.factor_of(self.platform) is None:
             return
         if not self.realtime and self.link is None:
             raise ConfigError(

@@ -65,6 +65,29 @@ class PlatformProfile:
             raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
         check_hardware(self)
 
+    @staticmethod
+    def factor_of(name: str) -> float | None:
+        """Return the factor of a platform `measured:FACTOR`; None for any other.
+
+        Raises:
+            ConfigError: The factor is not a number or is out of range.
+        """
+        kind, colon, text = name.partition(":")
+        if kind != MEASURED or not colon:
+            return None
+        low, high = FACTORS
+        try:
+            factor = float(text)
+        except ValueError:
+            factor = math.nan
+        if not low <= factor <= high:
+            raise ConfigError(
+                f"the factor of {MEASURED}:FACTOR must be a number within {low:g} and {high:g}, "
+                f"got {text!r}",
+                key="platform",
+            )
+        return factor
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelEntry:
@@ -145,7 +168,7 @@ def load_platform(name_or_path: str) -> PlatformProfile:
         UnknownName: No shipped platform has this name, and it is not a path to a TOML file.
         ConfigError: The file or the factor cannot be used.
     """
-    if (factor := measured_factor(name_or_path)) is not None:
+    if (factor := PlatformProfile.factor_of(name_or_path)) is not None:
         return _measured(factor)
     if not name_or_path.endswith(".toml") and name_or_path not in PLATFORMS.names:
         raise UnknownName("platform", name_or_path, [*PLATFORMS.names, f"{MEASURED}:FACTOR"])
@@ -162,29 +185,6 @@ def load_platform(name_or_path: str) -> PlatformProfile:
         return PlatformProfile(**given)
     except ValueError as error:
         raise ConfigError(str(error), path=path) from None
-
-
-def measured_factor(name: str) -> float | None:
-    """Return the factor of a platform `measured:FACTOR`; None for any other.
-
-    Raises:
-        ConfigError: The factor is not a number or is out of range.
-    """
-    kind, colon, text = name.partition(":")
-    if kind != MEASURED or not colon:
-        return None
-    low, high = FACTORS
-    try:
-        factor = float(text)
-    except ValueError:
-        factor = math.nan
-    if not low <= factor <= high:
-        raise ConfigError(
-            f"the factor of {MEASURED}:FACTOR must be a number within {low:g} and {high:g}, "
-            f"got {text!r}",
-            key="platform",
-        )
-    return factor
 
 
 def _measured(factor: float) -> PlatformProfile:

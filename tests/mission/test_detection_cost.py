@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.mission.measures import detection_cost
+from mavfi_cli.mission.measures import DetectionCost
 from mavfi_cli.spec.detector import DetectorConfig
 
 RECORD = {
@@ -35,7 +35,7 @@ RECORD = {
 
 def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels():
     """Four of eight recomputations are listed: one, two and one, so they are two, four and two."""
-    cost = detection_cost(RECORD)
+    cost = DetectionCost.of(RECORD)
     assert (cost.detector, cost.checks) == ("gad", 1000)
     assert cost.check_host_s == pytest.approx(5e-6)
     assert cost.detection_share == pytest.approx(0.005 / 20.0)
@@ -48,7 +48,7 @@ def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels()
 
 
 def test_without_a_flight_time_the_whole_mission_counts():
-    cost = detection_cost(RECORD | {"quality_of_flight": {"flight_time_s": None}})
+    cost = DetectionCost.of(RECORD | {"quality_of_flight": {"flight_time_s": None}})
     assert cost.detection_share == pytest.approx(0.005 / 32.0)
 
 
@@ -62,13 +62,13 @@ def test_without_a_flight_time_the_whole_mission_counts():
     ],
 )
 def test_a_flight_in_which_nothing_was_checked_has_no_cost(changes):
-    assert detection_cost(RECORD | changes) is None
-    assert detection_cost({"outcome": "hang"}) is None
+    assert DetectionCost.of(RECORD | changes) is None
+    assert DetectionCost.of({"outcome": "hang"}) is None
 
 
 def test_a_real_record_has_what_it_takes(fly_short):
     result = json.loads(fly_short(detector=DetectorConfig(name="aad")).result.read_text())
-    cost = detection_cost(result)
+    cost = DetectionCost.of(result)
     assert cost.checks_host_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert cost.flight_s == result["quality_of_flight"]["flight_time_s"]
     assert 50.0 < cost.checks / cost.flight_s < 100.0  # a tick is 20 ms

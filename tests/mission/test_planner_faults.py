@@ -17,7 +17,6 @@ from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission.instruction.injection import (
     Rehearsal,
     draw_invocation,
-    profile_invocation,
 )
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
@@ -100,7 +99,7 @@ def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the
     assert set(objects) == {OMPL, SEGMENT, PIECES}
     assert objects[OMPL] > 1000
 
-    sampled = profile_invocation(*searching, 2, 1, np.random.default_rng(1))
+    sampled = Rehearsal.profile_invocation(*searching, 2, 1, np.random.default_rng(1))
     assert not sampled.complete
     assert {stratum.marker.object for stratum in sampled.strata} == {OMPL, SEGMENT, PIECES}
     counts = Counter()

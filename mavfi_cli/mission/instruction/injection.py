@@ -94,7 +94,7 @@ def _plan_fault(
     profiling = Stream.FAULT.generator(config.seed, "profile", kernel, drawn.number)
     found: TargetProfile = _kept(
         folder / f"profile-{kernel}-{drawn.number}.pickle",
-        lambda: profile_invocation(
+        lambda: Rehearsal.profile_invocation(
             setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
         ),
     )
@@ -262,30 +262,35 @@ class Rehearsal:
         several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
         return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
 
+    @classmethod
+    def profile_invocation(
+        cls,
+        setup: Setup,
+        orders: Sequence[_Order],
+        entry: int,
+        earlier: int,
+        rng: np.random.Generator,
+    ) -> TargetProfile:
+        """Profile one invocation of a node's kernel in the last of the orders.
+
+        Args:
+            orders: the orders up to the one with the invocation.
+            entry: number of the kernel's entries when it begins, itself included.
+            earlier: number of them in the earlier orders.
+            rng: draws the sample, if only a sample is stepped.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            WindowTooLong: the invocation is too long to be stepped.
+            TargetError: nothing in scope executes.
+        """
+        with contextlib.closing(cls(setup, orders, entry - earlier)) as place:
+            found = TracerThread(lambda _armed: place.profile(rng)).result()
+        return found.after(CountedStop(place.scope_of_node.entry, entry))
+
     def close(self) -> None:
         """End the node."""
         self._spawned.kill()
-
-
-def profile_invocation(
-    setup: Setup, orders: Sequence[_Order], entry: int, earlier: int, rng: np.random.Generator
-) -> TargetProfile:
-    """Profile one invocation of a node's kernel in the last of the orders.
-
-    Args:
-        orders: the orders up to the one with the invocation.
-        entry: number of the kernel's entries when it begins, itself included.
-        earlier: number of them in the earlier orders.
-        rng: draws the sample, if only a sample is stepped.
-
-    Raises:
-        TracingForbidden: the operating system refuses.
-        WindowTooLong: the invocation is too long to be stepped.
-        TargetError: nothing in scope executes.
-    """
-    with contextlib.closing(Rehearsal(setup, orders, entry - earlier)) as place:
-        found = TracerThread(lambda _armed: place.profile(rng)).result()
-    return found.after(CountedStop(place.scope_of_node.entry, entry))
 
 
 # Flight -------------------------------------------------------------------------------------------
