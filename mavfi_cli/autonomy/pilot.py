@@ -386,7 +386,7 @@ class Pilot:
         if self.mode not in _DONE:
             if self.mode is PilotMode.TURNING and self._look_s >= TURN_S:
                 self.mode, self._look_started_s = PilotMode.WAITING, None
-            if stamp_s >= self._stop_s:
+            if not stamp_s < self._stop_s:
                 self._stop_s = math.inf
                 if self.active.trajectory is not None:
                     self.abandon(state)
