@@ -16,8 +16,9 @@ from mavfi_cli.cli.grouped import (
     given_options,
     names_in,
     refuse_given,
+    spelling,
 )
-from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.errors import ConfigError, FaultSpecError
 
 if TYPE_CHECKING:
     from mavfi_cli.spec.detector import DetectorConfig
@@ -213,7 +214,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
 
     Raises:
         ConfigError: the file or an option is not valid.
-        UsageError: options do not fit together.
+        UsageError: options do not fit together, or a key within one is not valid.
     """
     from mavfi_cli.core.config import load_toml
     from mavfi_cli.spec.mission import MissionConfig
@@ -222,6 +223,10 @@ def _mission_of(path: Path | None) -> MissionConfig:
     try:
         return _replaced(base, given_options())
     except FaultSpecError as error:
+        raise click.UsageError(str(error)) from None
+    except ConfigError as error:  # the command itself names an option
+        if error.path is not None or spelling(error.key) != error.key:
+            raise
         raise click.UsageError(str(error)) from None
 
 

@@ -79,6 +79,8 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
         (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
         (("--start", "1,inf,2"), "--start: must be three finite numbers"),
+        (("--stack", "mavbench:foo=3"), "foo: unknown key; known: "),
+        (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: expected true or false"),
     ],
 )
 def test_a_number_out_of_its_range_names_the_option(refused, arguments, said):
