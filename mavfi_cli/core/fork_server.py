@@ -318,8 +318,10 @@ def _end_children() -> None:
 
 
 def _children() -> list[int]:
-    """Return the children of this process, which has one thread."""
-    return [*map(int, Path("/proc/thread-self/children").read_text().split())]
+    """Return the children of this process, which has one thread; none if Linux does not tell."""
+    with contextlib.suppress(OSError):  # of a kernel without CONFIG_PROC_CHILDREN
+        return [*map(int, Path("/proc/thread-self/children").read_text().split())]
+    return []
 
 
 if __name__ == "__main__":

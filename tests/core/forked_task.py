@@ -5,13 +5,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 
 from mavfi_cli.core.errors import WorldError
+
+
+def _refuse(path):
+    raise FileNotFoundError(path)
 
 
 def prepare():
     if os.environ.get("MAVFI_TEST_UNPREPARED"):
         sys.exit("no")
+    if os.environ.get("MAVFI_TEST_CHILDLESS"):  # as a kernel without CONFIG_PROC_CHILDREN
+        Path.read_text = _refuse
 
 
 def perform(task, folder):

@@ -91,6 +91,12 @@ def test_workers_are_fresh_and_a_killed_server_is_started_again(server, tmp_path
     assert heard(server.start({}, tmp_path / "three", LONG_S))[-1]["exit"] == 0
 
 
+def test_a_kernel_that_does_not_list_children_is_enough(server, tmp_path, monkeypatch):
+    monkeypatch.setenv("MAVFI_TEST_CHILDLESS", "1")
+    _, ended = heard(server.start({}, tmp_path, LONG_S))
+    assert (ended["exit"], ended["report"]) == (0, {"folder": "left"})
+
+
 def test_a_server_that_cannot_load_its_module_says_so(server, tmp_path, monkeypatch):
     monkeypatch.setenv("MAVFI_TEST_UNPREPARED", "1")
     with pytest.raises(MavfiError, match="could not start"):
