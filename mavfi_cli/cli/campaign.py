@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _what = partial(click.option, cls=GroupedOption, group="Missions")
 _execution = partial(click.option, cls=GroupedOption, group="Execution")
+_size = partial(click.option, cls=GroupedOption, group="Sample size")
 _output = partial(click.option, cls=GroupedOption, group="Output")
 _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
              help="Replace a factor of the preset or file, as in world=dense. May be repeated. "
@@ -223,23 +224,23 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
 @campaign.command(cls=GroupedCommand)
 @click.argument("what", metavar="[WHAT]", required=False)
-@click.option("--scale", type=float, help="Fraction of the repetitions to run.")
+@_what("--scale", type=float, help="Fraction of the repetitions to run.")
 @_SET
-@click.option("--margin", type=float,
+@_size("--margin", type=float,
               help="Print the number of missions per setting for a confidence interval of this "
                    "half-width.")  # fmt: skip
-@click.option("--expect", "expected", default=0.5, show_default=True,
+@_size("--expect", "expected", default=0.5, show_default=True,
               help="With --margin: expected success rate.")  # fmt: skip
-@click.option("--difference", type=float,
+@_size("--difference", type=float,
               help="Print the number of pairs that detects this difference of success "
                    "rates.")  # fmt: skip
-@click.option("--discordant", default=0.2, show_default=True,
+@_size("--discordant", default=0.2, show_default=True,
               help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
-@click.option("--power", default=0.8, show_default=True,
+@_size("--power", default=0.8, show_default=True,
               help="With --difference: probability of detecting it.")  # fmt: skip
-@click.option("--confidence", default=0.95, show_default=True,
+@_size("--confidence", default=0.95, show_default=True,
               help="Confidence level.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@_output("--json", "as_json", is_flag=True, help="Print as JSON.")
 def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
     """List the missions of a campaign without flying, or compute a sample size.
 

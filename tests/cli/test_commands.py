@@ -44,6 +44,12 @@ def test_the_vehicle_s_help_has_the_command_s_name(command_line):
     assert command_line("sitl", "--help")[1].startswith("Usage: mavfi sitl ")
 
 
+def test_help_has_a_plan_in_groups(command_line):
+    told = command_line("campaign", "plan", "--help")[1].splitlines()
+    heads = [line for line in told if line.endswith(":") and not line.startswith(" ")]
+    assert heads == ["Missions:", "Sample size:", "Output:"]
+
+
 @pytest.mark.parametrize("command", [("fly",), ("world", "make"), ("sitl",)])
 def test_help_says_what_another_goal_does_to_a_generated_world(command_line, command):
     told = " ".join(command_line(*command, "--help")[1].split())
