@@ -30,7 +30,7 @@ NOTHING = 255  # pixel value where nothing was in range
 _OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
 _FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
 _COPY = 4  # largest number of messages from a packet to its copy
-_STRAY = 8  # messages of others among those of a frame without a checksum
+_STRAY = 8  # messages of others among those of a frame
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
 _REMEMBERED = 64  # indices of frames that are done with
@@ -217,10 +217,14 @@ class ImageReceiver:
     def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
         """Return the pixels of the nearest or else the newest packets that match the checksum."""
         newest = [self._packets[place][-1] for place in range(shape.packets)]
-        nearest = [
-            min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])[1]
+        found = [
+            min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])
             for place in range(shape.packets)
         ]
+        early = frame.due <= self._count < frame.due + shape.packets - 1
+        if early and frame.trials_left <= _TRIALS // 2 and max(off for off, _ in found) > _STRAY:
+            return None  # of a frame that lost some: half of the trials wait for this one's packets
+        nearest = [packet for _, packet in found]
         for packets in (nearest,) if nearest == newest else (nearest, newest):
             frame.trials_left -= 1
             data = b"".join([data[: shape.payload] for _, data in packets])

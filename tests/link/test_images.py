@@ -46,7 +46,11 @@ def _handshake(rows: int = ROWS, columns: int = COLUMNS, **changes: int) -> Mess
 
 
 def _frame(index: int, rows: int = ROWS, columns: int = COLUMNS) -> list[Message]:
-    data = _pixels(index, rows, columns).tobytes()
+    return _sent(index, _pixels(index, rows, columns))
+
+
+def _sent(index: int, pixels: NDArray[np.uint8]) -> list[Message]:
+    (rows, columns), data = pixels.shape, pixels.tobytes()
     packets = [
         dialect.MAVLink_encapsulated_data_message(
             k, list(data[at : at + PAYLOAD].ljust(PAYLOAD, b"\0"))
@@ -66,6 +70,15 @@ def _check(frames: list[ImageFrame]) -> list[int]:
         assert np.array_equal(frame.pixels, _pixels(frame.index))
         assert frame.stamp_s == frame.index / 10
     return [frame.index for frame in frames]
+
+
+def test_a_packet_that_a_large_picture_lost_costs_no_other_picture() -> None:
+    pictures = np.random.default_rng(1).integers(0, 255, (9, 120, 160), dtype=np.uint8)
+    sent = [_sent(index, pixels) for index, pixels in enumerate(pictures)]
+    del sent[1][4], sent[4][40], sent[6][-2]
+    frames = _feed(ImageReceiver(), [message for each in sent for message in each])
+    assert [frame.index for frame in frames] == [0, 2, 3, 5, 7, 8]
+    assert all(np.array_equal(each.pixels, pictures[each.index]) for each in frames)
 
 
 def test_frames_come_out_as_they_were_sent_over_the_wire() -> None:
