@@ -36,7 +36,7 @@ def main() -> None:
             vehicle.step(setpoint, armed=True)
         whole = median_us(lambda vehicle=vehicle: vehicle.step(setpoint, armed=True))
         control = median_us(
-            lambda v=vehicle: control_step(v._state, v._measurement, setpoint, v._gains, True)  # noqa: FBT003
+            lambda v=vehicle: control_step(v._state, v._flat, setpoint, v._gains, True)  # noqa: FBT003
         )
         commands = vehicle.truth.motor_commands.copy()
         physics = median_us(lambda v=vehicle, c=commands: v._physics.advance(c))

@@ -83,6 +83,7 @@ class _Announced:
     checksum: int | None
     due: int  # count of messages at which its first packet is due
     trials_left: int = _TRIALS
+    waits_until: int = 0  # count of messages before which it is not tried
 
 
 _Packet = tuple[int, bytes]  # count of messages at its arrival, data
@@ -201,7 +202,8 @@ class ImageReceiver:
             shape = self._shape
             if shape is None or len(self._packets) < shape.packets:
                 break
-            image = self._solve(frame, shape) if frame.trials_left > 0 else None
+            tried = frame.trials_left > 0 and self._count >= frame.waits_until
+            image = self._solve(frame, shape) if tried else None
             if image is None:
                 continue
             self._close(frame)
@@ -221,8 +223,10 @@ class ImageReceiver:
             min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])
             for place in range(shape.packets)
         ]
-        early = frame.due <= self._count < frame.due + shape.packets - 1
+        end = frame.due + shape.packets - 1
+        early = frame.due <= self._count < end
         if early and frame.trials_left <= _TRIALS // 2 and max(off for off, _ in found) > _STRAY:
+            frame.waits_until = end - _STRAY
             return None  # of a frame that lost some: half of the trials wait for this one's packets
         nearest = [packet for _, packet in found]
         for packets in (nearest,) if nearest == newest else (nearest, newest):
