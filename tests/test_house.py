@@ -153,3 +153,8 @@ def test_a_record_is_read_in_one_module():
     """Others take sections and measures from `mission.measures`."""
     reads = r"\bresult(\[|\.get\()[\"']"
     assert mentions(reads) == {"mavfi_cli.mission.run_folder"}  # upgrades older records
+
+
+def test_a_source_is_one_that_a_reader_can_find():
+    """Notes that the repository does not hold are no source."""
+    assert mentions(r"\bfacts, sections?\b|\b(design|style|libraries)\.md\b") == set()

@@ -3,7 +3,8 @@
 Messages are frozen records in SI units, ENU world frame and FLU body frame. A state is a scalar, or
 one component of a vector, that one kernel passes to the next. fi, detect and report iterate over
 the table. All reads and writes of a state go through it, so that no other module knows its place.
-Source of the list: paper, section IV-C and V-A; reference facts, sections 1.3 and 1.4.
+Source of the list: the paper, sections IV-C and V-A, and the messages of its released code
+(MAVBench/MAV_apps, branch mavfi).
 """
 
 from __future__ import annotations
