@@ -135,7 +135,7 @@ def store_plan(
     Args:
         append: missions that are not among the stored ones are added; those that are only there
             stay.
-        differing: phrases that say in what another list differs.
+        differing: phrases that say in what another list differs; without, its first missions do.
         can_append: how to have new missions added, told where no stored one is gone.
 
     Raises:
@@ -152,7 +152,9 @@ def store_plan(
         else:
             new.append(mission)
     if stored and not append and (new or left.total()):
-        found = [*differing]
+        firsts = {"new": [each.stored for each in new], "gone": [*+left]}
+        shown = [f"the first {how} one is {a[0][0]} {a[0][2]}" for how, a in firsts.items() if a]
+        found = [*differing] or shown
         found.append(f"{stored} missions there, {len(missions)} here, of which {len(new)} are new")
         remedy = "choose another folder"
         if left.total():
