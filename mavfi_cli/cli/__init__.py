@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import click
 
+from mavfi_cli.core.caches import choose_caches
 from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 
 # name -> (module, what it does); the help page must not import the modules. One of the vehicle's
@@ -94,6 +95,7 @@ def main() -> NoReturn:
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
+    choose_caches()
     try:  # not standalone: click hands back the code of an Exit instead of leaving with it
         code = cli.main(prog_name="mavfi", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mavfi_cli.core.caches import choose_caches
 from mavfi_cli.core.files import folder_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -45,6 +46,7 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 def _numba() -> Any:
     """Import numba without BLAS: no kernel multiplies matrices, and finding it takes 0.14 s."""
+    choose_caches()  # before numba reads the environment
     import numba
 
     if "numba.np.arraymath" not in sys.modules and _BLAS not in sys.modules:
