@@ -12,9 +12,7 @@ import shutil
 import signal
 import stat
 import subprocess
-import tempfile
 import time
-import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -42,7 +40,7 @@ from mavfi_cli.attack.target import (
     signal_name,
 )
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.core.files import writing
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.linux import ProcessTimer
@@ -191,9 +189,8 @@ class _Workplace:
         self.context = target.context
         self._golden: Golden | None = None
         self._watched: Watched | None = None
-        with writing(Path(tempfile.gettempdir())):
-            scratch = Path(tempfile.mkdtemp(prefix="mavfi-kernels-"))
-        self.close = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self._scratch = ScratchFolder("kernels")
+        self.close, scratch = self._scratch.close, self._scratch.path
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
         self._counts = scratch / "counts"
         self._folder = scratch / "run"

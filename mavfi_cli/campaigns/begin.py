@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from mavfi_cli.core.errors import (
     UnknownName,
     VehicleProcessError,
 )
-from mavfi_cli.core.files import write_text
+from mavfi_cli.core.files import ScratchFolder, write_text
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.mission import MissionConfig
@@ -301,9 +300,9 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector needs a detector")
     if start:
-        with tempfile.TemporaryDirectory(prefix="mavfi-") as folder:
+        with ScratchFolder("vehicle") as folder:
             try:
-                VehicleInProcess(config, Path(folder)).end()
+                VehicleInProcess(config, folder).end()
             except MavfiError as error:
                 raise VehicleProcessError(str(error), error.exit_code) from None
 

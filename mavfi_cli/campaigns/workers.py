@@ -6,7 +6,6 @@ worker with n threads flies n missions at a time.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import queue
@@ -14,7 +13,6 @@ import selectors
 import shutil
 import signal
 import socket
-import tempfile
 import threading
 import time
 import uuid
@@ -29,6 +27,7 @@ from urllib.parse import urlsplit
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.types import Outcome
@@ -397,10 +396,10 @@ def _fly(
     differing = version_differences(versions, _worker_versions())
     if differing:
         return "; ".join(differing)
-    place = _scratch() / f"{number}-{threading.get_ident()}"
+    place = _scratch().path / f"{number}-{threading.get_ident()}"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
-    (place / ".profiles").symlink_to(_scratch() / "profiles")
+    (place / ".profiles").symlink_to(_scratch().path / "profiles")
     try:
         workers = _workers(task)
         workers.start(number, changes, place, limit_s)
@@ -420,11 +419,10 @@ def _workers(task: str) -> LocalWorkers:
 
 
 @cache
-def _scratch() -> Path:
+def _scratch() -> ScratchFolder:
     """A folder of this worker, until it ends; profiles of instruction-level faults stay in it."""
-    folder = Path(tempfile.mkdtemp(prefix="mavfi-worker-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    (folder / "profiles").mkdir()
+    folder = ScratchFolder("worker")
+    (folder.path / "profiles").mkdir()
     return folder
 
 

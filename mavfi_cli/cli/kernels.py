@@ -7,7 +7,6 @@ import json
 import math
 import os
 import shlex
-import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import ScratchFolder
 
 if TYPE_CHECKING:
     from mavfi_cli.attack.campaign import Plan
@@ -146,7 +146,7 @@ def _attack(options: dict[str, Any]) -> None:
         if options["program"] is not None:
             folder, targets = out, [_program(options)]
         else:
-            folder = out or Path(leaving.enter_context(tempfile.TemporaryDirectory()))
+            folder = out or leaving.enter_context(ScratchFolder("kernels"))
             targets = _kernels(options, folder)
         with runs_view([target.name for target in targets], plan.runs) as view:
             campaign = run_campaign(

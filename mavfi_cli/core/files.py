@@ -1,4 +1,4 @@
-"""Files: atomic writes, and digests of source code.
+"""Files: atomic writes, scratch folders, and digests of source code.
 
 A kill leaves the old file or the new one, never a partial one.
 """
@@ -6,9 +6,14 @@ A kill leaves the old file or the new one, never a partial one.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
+import shutil
+import stat
+import tempfile
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -57,6 +62,78 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
+
+
+_SCRATCH, _OWNED = "mavfi-", ".mavfi-scratch"
+
+
+class ScratchFolder:
+    """A private temporary folder, which is removed whatever ends the process.
+
+    `close`, the end of the object or the end of the process removes it. A killed process leaves
+    it behind; then the next process that makes a scratch folder in the same place removes it. A
+    lock on a file in the folder shows that the process, or a fork of it, is still running. A fork
+    never removes the folder of its parent.
+
+    As a context manager it gives the path.
+
+    Args:
+        what: One word of its name, `mavfi-WHAT-...`.
+        parent: The place, by default the temporary directory. In any other the name is hidden.
+
+    Attributes:
+        path: The folder.
+        close: Removes the folder. May be called repeatedly.
+
+    Raises:
+        RecordError: It cannot be made.
+    """
+
+    def __init__(self, what: str, parent: Path | None = None) -> None:
+        place, hidden = (parent, ".") if parent is not None else (Path(tempfile.gettempdir()), "")
+        with writing(place):
+            _remove_abandoned(place)
+            self.path, lock = _locked_folder(place, f"{hidden}{_SCRATCH}{what}-")
+        self.close = weakref.finalize(self, _remove_scratch, self.path, lock, os.getpid())
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+
+def _locked_folder(place: Path, prefix: str) -> tuple[Path, int]:
+    """Make a scratch folder; return it with the locked descriptor of the file in it."""
+    while True:
+        path = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+        lock = os.open(path / _OWNED, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if os.fstat(lock).st_nlink:
+            return path, lock
+        os.close(lock)  # another process took it for an abandoned one before it was locked
+
+
+def _remove_scratch(path: Path, lock: int, owner: int) -> None:
+    if os.getpid() == owner:
+        shutil.rmtree(path, ignore_errors=True)
+        os.close(lock)
+
+
+@cache
+def _remove_abandoned(place: Path) -> None:
+    """Remove this user's scratch folders of killed processes, once in the life of this process."""
+    for path in [*place.glob(f"{_SCRATCH}*"), *place.glob(f".{_SCRATCH}*")]:
+        with contextlib.suppress(OSError):  # none of ours, or its process is running
+            about = path.lstat()
+            if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
+                continue
+            lock = os.open(path / _OWNED, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(path, ignore_errors=True)
+            finally:
+                os.close(lock)
 
 
 def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.core.errors import ConfigError, TargetError
-from mavfi_cli.core.files import writing
+from mavfi_cli.core.files import ScratchFolder, writing
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.run import fly_golden
@@ -77,8 +76,8 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
 
 def _flown(config: MissionConfig) -> Recorder:
     recorder = Recorder()
-    with tempfile.TemporaryDirectory(prefix="mavfi-golden-") as scratch:
-        flight = fly_golden(config, Path(scratch), recorder).record
+    with ScratchFolder("golden") as scratch:
+        flight = fly_golden(config, scratch, recorder).record
     if not flight.succeeded:
         problem = f"ended with {flight.outcome}: {flight.reason}"
         raise TargetError(_flight_name(config), problem)

@@ -11,13 +11,13 @@ import platform
 import shutil
 import socket
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def _loopback() -> Check:
 
 def _physics() -> Check:
     """Start the vehicle's process, which loads JSBSim and its compiled kernels."""
-    with tempfile.TemporaryDirectory() as folder:
+    with ScratchFolder("doctor") as folder:
         run = subprocess.run(
             [*PYTHON, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
             timeout=120.0, check=False,
@@ -161,8 +161,8 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
     from mavfi_cli.fi.tracer.registers import widest_vector
     from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 
-    with tempfile.TemporaryDirectory(prefix="mavfi-doctor-") as folder:
-        output = Path(folder) / "output"
+    with ScratchFolder("doctor") as folder:
+        output = folder / "output"
         try:
             command = Program.of(["true"], environment=dict(os.environ))
             tracee = spawn(command, stdout=output, stderr=output, mechanism=mechanism)

@@ -8,7 +8,6 @@ import os
 import platform as host_platform
 import resource
 import shutil
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,14 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import Protection
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
-from mavfi_cli.core.files import file_digest, write_json, write_parquet, write_text, writing
+from mavfi_cli.core.files import (
+    ScratchFolder,
+    file_digest,
+    write_json,
+    write_parquet,
+    write_text,
+    writing,
+)
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome, Reaction
@@ -307,8 +313,8 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
         software or the machine differs.
     """
     recorder = Recorder()
-    with tempfile.TemporaryDirectory(prefix="mavfi-again-") as scratch:
-        again = fly_again(run, Path(scratch), recorder=recorder)
+    with ScratchFolder("again") as scratch:
+        again = fly_again(run, scratch, recorder=recorder)
         same = file_digest(again.folder.trace) == file_digest(run.folder.trace)
     return recorder, same
 
@@ -329,11 +335,8 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
         return golden
     kept = run.folder.golden
     note(f"flying the golden pair: {config.world}, seed {config.seed}")
-    with (
-        writing(kept),
-        tempfile.TemporaryDirectory(dir=run.folder.path, prefix=".golden-") as parent,
-    ):
-        flown = fly_to_end(config, Path(parent))
+    with writing(kept), ScratchFolder("golden", run.folder.path) as parent:
+        flown = fly_to_end(config, parent)
         if kept.is_dir():
             shutil.rmtree(kept)
         shutil.move(flown.folder.path, kept)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import select
-import shutil
 import signal
 import socket
 import subprocess
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import MavfiError, VehicleProcessError, described
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FloatArray
@@ -254,9 +254,8 @@ def other_end(
         with contextlib.closing(open_transport(config.link, **signed)) as link:
             yield link, None
         return
-    folder = Path(tempfile.mkdtemp(prefix="mavfi-"))
     with contextlib.ExitStack() as leaving:
-        leaving.callback(shutil.rmtree, folder, ignore_errors=True)
+        folder = leaving.enter_context(ScratchFolder("flight"))
         vehicle = (_EyesProcess if config.eyes else launch)(config, folder)
         leaving.callback(vehicle.end)
         yield vehicle.link, vehicle

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
@@ -258,8 +258,8 @@ class _KernelRuns:
             kernel_targets,
         )
 
-        with tempfile.TemporaryDirectory(prefix="mavfi-kernels-") as scratch:
-            targets = kernel_targets(select([_QUICKEST]), kernel_flight(), Path(scratch))
+        with ScratchFolder("kernels") as scratch:
+            targets = kernel_targets(select([_QUICKEST]), kernel_flight(), scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
         run_s = (measured.wall_s - measured.prepare_s) / _QUICK_RUNS
         of_each = self.missing() / len(select(()))

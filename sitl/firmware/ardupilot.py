@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import socket
 import struct
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
 from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.sensors import Sensors
@@ -96,9 +96,9 @@ class ArduPilotLink:
     ) -> FirmwareProcess:
         """Start ArduCopter's SITL binary, which calls this link. See `Px4Link.start`."""
         program, origin = FirmwareProcess.program(binary), Origin()
-        folder = Path(tempfile.mkdtemp(prefix="mavfi-ardupilot-"))
+        scratch = ScratchFolder("ardupilot")
         lines = [f"{name} {value:.6g}\n" for name, value in parameters.items()]
-        (folder / "vehicle.parm").write_text("".join(lines))
+        (scratch.path / "vehicle.parm").write_text("".join(lines))
         home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, heading_deg)
         arguments = [
             "--model", f"JSON:{_LOOPBACK}", "--wipe", "--speedup", "100",
@@ -109,7 +109,7 @@ class ArduPilotLink:
             "--serial0", f"udpclient:{_LOOPBACK}:{mavlink_port}", "--serial1", "none:",
             "--serial2", "none:",
         ]  # fmt: skip
-        return FirmwareProcess(program, arguments, folder, {})
+        return FirmwareProcess(program, arguments, scratch, {})
 
     @property
     def port(self) -> int:

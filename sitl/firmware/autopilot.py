@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import shutil
 import signal
 import subprocess
 import time
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.link.codec import Codec, dialect, text_messages
 from mavfi_cli.link.transport import Transport
@@ -198,9 +198,13 @@ class FirmwareProcess:
     """
 
     def __init__(
-        self, binary: Path, arguments: Sequence[str], folder: Path, environment: Mapping[str, str]
+        self,
+        binary: Path,
+        arguments: Sequence[str],
+        scratch: ScratchFolder,
+        environment: Mapping[str, str],
     ) -> None:
-        self._binary, self._folder = binary, folder
+        self._binary, self._scratch, folder = binary, scratch, scratch.path
         try:
             with (folder / _OUTPUT).open("wb") as output:
                 self._process = subprocess.Popen(
@@ -214,7 +218,7 @@ class FirmwareProcess:
                     preexec_fn=functools.partial(die_with, os.getpid()),
                 )
         except OSError as error:
-            self._remove_folder()
+            self._scratch.close()
             raise VehicleProcessError(f"{binary} is not a firmware: {error.strerror}") from None
 
     @staticmethod
@@ -234,7 +238,7 @@ class FirmwareProcess:
         code = self._process.poll()
         if code is None:
             return
-        lines = (self._folder / _OUTPUT).read_text(errors="replace").split("\n")
+        lines = (self._scratch.path / _OUTPUT).read_text(errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]
         last = f": {said[-1]}" if said else ""
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
@@ -245,7 +249,4 @@ class FirmwareProcess:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        self._remove_folder()
-
-    def _remove_folder(self) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._scratch.close()

@@ -11,7 +11,6 @@ import contextlib
 import math
 import os
 import socket
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.core.errors import LinkError, LinkLost, VehicleProcessError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
@@ -137,7 +137,8 @@ class Px4Link:
         startup = program.parent.parent / "etc"
         if not (startup / "init.d-posix" / "rcS").is_file():
             raise VehicleProcessError(f"{binary} is not PX4: it has no startup files in {startup}")
-        folder = Path(tempfile.mkdtemp(prefix="mavfi-px4-"))
+        scratch = ScratchFolder("px4")
+        folder = scratch.path
         instance = self.port - PORT
         settings = [
             f"param set {name} {value:.6g}"
@@ -152,7 +153,7 @@ class Px4Link:
             "PATH": f"{folder}:{program.parent}:{os.environ.get('PATH', '')}",
         }
         arguments = ["-d", "-i", str(instance), "-w", str(folder), str(startup)]
-        return FirmwareProcess(program, arguments, folder, environment)
+        return FirmwareProcess(program, arguments, scratch, environment)
 
     def heard(self, timeout_s: float) -> bool:
         """Return True once PX4 has sent a message, waiting at most `timeout_s`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from string import Template
@@ -11,6 +10,7 @@ from string import Template
 import jsbsim
 
 from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
 from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
 
@@ -131,8 +131,8 @@ class Physics:
     ) -> None:
         jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
         try:
-            with tempfile.TemporaryDirectory(prefix="mavfi-vehicle-") as folder:
-                self._fdm = _load(profile, Path(folder), dt_s)
+            with ScratchFolder("vehicle") as folder:
+                self._fdm = _load(profile, folder, dt_s)
         except (OSError, jsbsim.BaseError) as error:
             problem = f"cannot make the model of vehicle {profile.name!r}: {error}"
             raise VehicleProcessError(problem) from None

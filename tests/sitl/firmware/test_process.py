@@ -12,6 +12,7 @@ import pytest
 from live_processes import gone
 
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
+from mavfi_cli.core.files import ScratchFolder
 from sitl.firmware import px4
 from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.px4 import Px4Link
@@ -76,11 +77,11 @@ def test_a_program_that_ends_is_no_firmware(tmp_path: Path, script: str, told: s
         firmware.close()
 
 
-def test_the_end_takes_children_and_folder_along(tmp_path: Path) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
+def test_the_end_takes_children_and_folder_along() -> None:
+    scratch = ScratchFolder("test")
+    folder = scratch.path
     script = "import os, time; os.fork(); print(os.getpid(), flush=True); time.sleep(600)"
-    process = FirmwareProcess(Path(sys.executable), ["-c", script], folder, {})
+    process = FirmwareProcess(Path(sys.executable), ["-c", script], scratch, {})
     output = folder / "output.txt"
     while len(output.read_text().split()) < 2:
         process.require_running()
