@@ -70,6 +70,7 @@ class Options:
         task: module that does the work.
         errors: fly missions again that could not begin.
         cluster: address of a scheduler of dask.distributed, instead of workers on this machine.
+        cluster_key: folder of its keys (`cluster_keys.make_keys`), for an address with tls://.
         only: numbers of the missions to fly; None flies all.
         kept: numbers of missions whose run folders are kept whatever `keep` says.
     """
@@ -80,12 +81,16 @@ class Options:
     task: str = TASK
     errors: bool = False
     cluster: str | None = None
+    cluster_key: Path | None = None
     only: frozenset[int] | None = None
     kept: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit_s < math.inf:
             raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
+        if (self.cluster or "").startswith("tls://") != (self.cluster_key is not None):
+            problem = "an address with tls:// needs --cluster-key, and no other has keys"
+            raise ConfigError(problem, key="cluster")
 
 
 def run_campaign(
@@ -312,7 +317,7 @@ class _Run:
         if options.cluster is None:
             fleet = LocalWorkers(self._jobs, options.task)
         else:
-            fleet = Cluster(options.cluster, options.keep, options.task)
+            fleet = Cluster(options.cluster, options.keep, options.task, options.cluster_key)
         with contextlib.closing(fleet) as workers:
             while len(asked) < 2:
                 self._fill(workers, asked)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
@@ -259,15 +260,19 @@ class Cluster:
     """The workers of one scheduler.
 
     Args:
-        address: address of the scheduler, such as tcp://host:8786.
+        address: address of the scheduler, such as tls://host:8786.
         keep: the campaign's policy; other run folders are sent without their traces.
+        keys: folder with the keys of the cluster; needed for tls://.
 
     Raises:
         CampaignStopped: dask is not installed, the scheduler does not answer, no worker connects,
             or a worker has another version of something that results depend on.
+        ConfigError: the keys cannot be used.
     """
 
-    def __init__(self, address: str, keep: Keep, task: str = TASK) -> None:
+    def __init__(
+        self, address: str, keep: Keep, task: str = TASK, keys: Path | None = None
+    ) -> None:
         self._keep, self._task = keep, task
         self._versions = installed_versions()
         self._token = uuid.uuid4().hex[:8]  # tells this run's results from others
@@ -275,7 +280,7 @@ class Cluster:
         self._futures: dict[int, tuple[Future, Path]] = {}
         self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._threads, self._looked_s = 0, 0.0
-        self._client = _connect(address)
+        self._client = _connect(address, keys)
         with contextlib.ExitStack() as undo:
             undo.callback(self._client.close)
             _require_workers(self._client, address, self._versions)
@@ -330,7 +335,7 @@ class Cluster:
         self._client.close()
 
 
-def _connect(address: str) -> Client:
+def _connect(address: str, keys: Path | None) -> Client:
     try:
         from distributed import Client
     except ImportError:
@@ -344,13 +349,15 @@ def _connect(address: str) -> Client:
         usable = False
     if not usable:  # dask would retry for half a minute, and then raise a traceback
         raise CampaignStopped(
-            f"{address}: expected the scheduler's address, such as tcp://host:8786"
+            f"{address}: expected the scheduler's address, such as tls://host:8786"
         )
+    secure = {} if keys is None else {"security": security(keys)}
     try:
-        return Client(address, timeout=CONNECT_S, set_as_default=False)
+        return Client(address, timeout=CONNECT_S, set_as_default=False, **secure)
     except (OSError, ValueError, TimeoutError) as error:
         first = str(error).partition("\n")[0]
-        raise CampaignStopped(f"no scheduler at {address}: {first}") from None
+        others = "" if keys is None else f" with the keys of {keys}"
+        raise CampaignStopped(f"no scheduler{others} at {address}: {first}") from None
 
 
 def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:

@@ -32,6 +32,10 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
 _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` with which it prints everything.
 _FULL = {"full", "by", "confidence", "quality", "overhead", "failures"}
+_OPEN_CLUSTER = (
+    "warning: {} has no TLS: any user who can connect to it, and that is every user of its host, "
+    "can run programs as you there, on the workers and here (docs/how-to/cluster.md)"
+)
 
 
 @click.group(cls=GroupOfCommands)
@@ -56,7 +60,9 @@ def campaign() -> None:
 @_execution("--jobs", type=click.IntRange(min=1),
             help="Number of parallel missions  [one per core].")  # fmt: skip
 @_execution("--cluster", metavar="URL",
-            help="Fly on a dask.distributed scheduler, such as tcp://host:8786.")  # fmt: skip
+            help="Fly on a dask.distributed scheduler, such as tls://host:8786.")  # fmt: skip
+@_execution("--cluster-key", type=_FOLDER, metavar="DIR",
+            help="Keys of the cluster, made by `mavfi campaign keys`.")  # fmt: skip
 @_execution("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
             show_default=True,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
@@ -77,14 +83,18 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.progress import missions_view
 
+    cluster, keys = options["cluster"], options["cluster_key"]
     spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
     flying = Options(
         jobs=options["jobs"] or 0,
         keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
         limit_s=options["limit_s"],
         errors=options["retry_errors"],
-        cluster=options["cluster"],
+        cluster=cluster,
+        cluster_key=keys,
     )
+    if cluster is not None and keys is None:
+        click.echo(_OPEN_CLUSTER.format(cluster), err=True)
     with (
         missions_view(quiet=quiet) as view,
         begin(
@@ -274,6 +284,20 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
     if not told:
         raise click.UsageError("name a campaign, --margin or --difference")
     click.echo(json.dumps(told, indent=2) if as_json else "\n".join(lines))
+
+
+@campaign.command()
+@click.argument("folder", metavar="DIR", type=_FOLDER)
+def keys(folder: Path) -> None:
+    """Make the keys of a cluster in DIR, for `mavfi campaign run --cluster tls://...`.
+
+    Whoever can read the keys can run programs as you on the cluster. Existing keys are not
+    replaced.
+    """
+    from mavfi_cli.campaigns.cluster_keys import CERTIFICATE, KEY, make_keys
+
+    make_keys(folder)
+    click.echo(f"{folder / CERTIFICATE} and {folder / KEY}: only you can read them")
 
 
 def _planned(
