@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ from mavfi_cli.attack.target import (
     judged,
     signal_name,
 )
+from mavfi_cli.attack.work_folder import WorkFolder
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.fi.tracer import linux
@@ -47,28 +48,6 @@ from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.spawn import Program, Watched, run_to_entry, spawn, watch
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
-
-
-def absolute_arguments(
-    argv: Iterable[str], directory: Path, written: Iterable[str]
-) -> Iterator[str]:
-    """Make arguments that name files absolute: the program runs in a folder of its own.
-
-    An argument that names an existing file is changed, and one with a slash that names a folder.
-
-    Args:
-        directory: the folder that they are relative to.
-        written: files that the program writes; their names stay, so the user's are not overwritten.
-    """
-    own = {str(PurePosixPath(name)) for name in written}
-    for argument in argv:
-        path = directory / argument
-        # Unlike Path's, these two take any text, however long.
-        named = os.path.isfile(path) or ("/" in argument and os.path.isdir(path))
-        if str(PurePosixPath(argument)) in own or argument.startswith("/") or not named:
-            yield argument
-        else:
-            yield str(path.resolve())
 
 
 def _require_attackable(path: Path) -> None:
@@ -111,6 +90,8 @@ class ProgramTarget:
     objects: tuple[str, ...] = ()  # file names in scope; by default the program itself
     function: str | None = None  # hit only calls of this function
     folder: Path | None = None  # each run works in a copy of it; None: in an empty folder
+    # Copied too: files and folders of the user, by their place relative to the program's folder.
+    files: Mapping[str, Path] = field(default_factory=dict)
     limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
 
@@ -142,12 +123,15 @@ class ProgramTarget:
 
     def known(self) -> dict[str, Any]:
         """Everything that its results depend on."""
-        return self.context() | {
+        told = self.context() | {
             "comparison": self.comparison.to_json(),
             "environment": dict(self.command.environment),
             "memory_bytes": self.command.memory_bytes,
             "folder": None if self.folder is None else str(self.folder),
         }
+        if self.files:
+            told["files"] = {place: str(source) for place, source in self.files.items()}
+        return told
 
     @classmethod
     def of_plan(cls, plan: Mapping[str, Any]) -> ProgramTarget:
@@ -164,6 +148,7 @@ class ProgramTarget:
             objects=tuple(plan["scope"]),
             function=plan["function"],
             folder=None if plan["folder"] is None else Path(plan["folder"]),
+            files={place: Path(source) for place, source in plan.get("files", {}).items()},
         )
 
     def open(self) -> _Workplace:
@@ -177,7 +162,8 @@ class _Workplace:
     Nothing outside it is ever removed.
 
     Raises:
-        TargetError: the program is of a kind that cannot be attacked.
+        TargetError: the program is of a kind that cannot be attacked, or its files cannot be
+            copied.
         RecordError: the scratch folder cannot be made.
     """
 
@@ -193,8 +179,8 @@ class _Workplace:
         self.close, scratch = self._scratch.close, self._scratch.path
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
         self._counts = scratch / "counts"
-        self._folder = scratch / "run"
-        self._command = replace(target.command, directory=self._folder)
+        self._folder = WorkFolder(scratch, target.folder, target.files, self.name)
+        self._command = replace(target.command, directory=self._folder.path)
 
     def start(self) -> Tracee:
         """Start the program, stopped at its entry point.
@@ -202,7 +188,7 @@ class _Workplace:
         Raises:
             TargetError: the program ends before its entry point.
         """
-        self._renew_folder()
+        self._folder.renew()
         tracee = spawn(
             self._command, stdout=self._stdout, stderr=self._stderr, mechanism=self.target.mechanism
         )
@@ -212,18 +198,6 @@ class _Workplace:
             raise TargetError(self._command.argv[0], problem)
         return tracee
 
-    def _renew_folder(self) -> None:
-        try:
-            if self._folder.exists():
-                shutil.rmtree(self._folder)  # follows no link
-            if self.target.folder is None:
-                self._folder.mkdir()
-            else:
-                shutil.copytree(self.target.folder, self._folder, symlinks=True)
-        except OSError as error:
-            problem = f"its folder cannot be made anew for the next run: {error}"
-            raise TargetError(self.name, problem) from None
-
     def image(self, tracee: Tracee) -> Image:
         return Image(tracee.pid)
 
@@ -231,7 +205,12 @@ class _Workplace:
         return image.scope(self.target.scope_objects)
 
     def _parts(self) -> dict[str, bytes | None]:
-        return self.target.comparison.parts(self._folder, self._stdout)
+        """The compared outputs of the last run, by name; None for a file that it did not write."""
+        parts = self.target.comparison.parts(self._folder.path, self._stdout)
+        for name in self.target.comparison.files:
+            if parts[name] is not None and not self._folder.wrote(name):
+                parts[name] = None
+        return parts
 
     def profile(
         self, rng: np.random.Generator, *, windows: int = 16, watch: Watch | None = None
@@ -278,7 +257,7 @@ class _Workplace:
     def _counted(self, rng: np.random.Generator, watch: Watch | None) -> TargetProfile:
         """Count the executions of a whole run by callgrind, and check some of them."""
         begun = time.perf_counter()
-        self._renew_folder()
+        self._folder.renew()
         code = _run_counted(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
             wall_s=self._known_golden().wall_s, tell=watch or (lambda _: None),
@@ -348,9 +327,10 @@ class _Workplace:
         problem = self._failure(ended)
         for name, data in parts.items():
             if data is None:
+                before = ", which was there before," if self._folder.had(name) else ""
                 problem = problem or (
-                    f"writes no file {name} in the folder in which it runs, so there is nothing to "
-                    "compare"
+                    f"writes no file {name}{before} in the folder in which it runs, so there is "
+                    "nothing to compare"
                 )
             elif len(data) > LARGEST_BYTES:
                 what = "prints" if name == STDOUT else f"writes to {name}"
@@ -383,7 +363,9 @@ class _Workplace:
         return f" ({lines[-1][:200]})" if lines else ""
 
     def _notices(self) -> Iterator[str]:
-        outside = [p for p in self._watch().written if not Path(p).is_relative_to(self._folder)]
+        outside = [
+            p for p in self._watch().written if not Path(p).is_relative_to(self._folder.tree)
+        ]
         if outside:
             more = f" and {len(outside) - 1} more" if len(outside) > 1 else ""
             yield (

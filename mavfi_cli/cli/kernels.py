@@ -183,7 +183,8 @@ def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
 
 def _program(options: dict[str, Any]) -> AttackTarget:
     from mavfi_cli.attack.comparison import OutputComparison
-    from mavfi_cli.attack.program import ProgramTarget, absolute_arguments
+    from mavfi_cli.attack.program import ProgramTarget
+    from mavfi_cli.attack.work_folder import copied_arguments
     from mavfi_cli.fi.tracer.spawn import Program
 
     comparison = OutputComparison.of(
@@ -193,8 +194,10 @@ def _program(options: dict[str, Any]) -> AttackTarget:
         arguments = shlex.split(options["args"] or "")
     except ValueError as error:
         raise ConfigError(str(error), key="args") from None
+    folder = None if options["folder"] is None else options["folder"].resolve()
+    arguments, files = copied_arguments(arguments, Path.cwd(), folder)
     command = Program.of(
-        [options["program"], *absolute_arguments(arguments, Path.cwd(), comparison.files)],
+        [options["program"], *arguments],
         variables=dict(map(_variable, options["env"])),
         stdin=(options["stdin_file"] or Path(os.devnull)).resolve(),
         memory_bytes=round(options["memory"] * (1 << 30)),
@@ -202,7 +205,8 @@ def _program(options: dict[str, Any]) -> AttackTarget:
     return ProgramTarget(
         command=command,
         comparison=comparison,
-        folder=None if options["folder"] is None else options["folder"].resolve(),
+        folder=folder,
+        files=files,
         objects=tuple(options["scope"]),
         function=options["function"],
     )

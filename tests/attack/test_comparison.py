@@ -9,10 +9,7 @@ from click.testing import CliRunner
 
 from mavfi_cli.attack.attacker import golden_run
 from mavfi_cli.attack.comparison import OutputComparison
-from mavfi_cli.attack.program import (
-    ProgramTarget,
-    absolute_arguments,
-)
+from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.attack.target import RunOutcome
 from mavfi_cli.cli.kernels import kernels
 from mavfi_cli.core.errors import ConfigError, TargetError
@@ -113,25 +110,11 @@ def test_an_argument_that_names_a_compared_file_is_the_programs_own(command, tmp
     assert (tmp_path / "out.txt").read_text() == "mine\n"
 
 
-def test_an_argument_may_be_longer_than_any_file_name(tmp_path):
-    assert list(absolute_arguments(["x" * 5000, "a/" * 5000], tmp_path, [])) == [
-        "x" * 5000,
-        "a/" * 5000,
-    ]
-
-
 @pytest.mark.parametrize(("option", "value"), [("--memory", "inf"), ("--tolerance", "nan")])
 def test_sizes_are_finite(command, option, value):
     done = command(option, value)
     assert done.exit_code == 2
     assert f"{option}: must be a finite number" in done.stderr
-
-
-def test_other_arguments_that_name_files_still_do(tmp_path):
-    (tmp_path / "in.txt").write_text("")
-    (tmp_path / "out.txt").write_text("")
-    found = absolute_arguments(["in.txt", "./out.txt", "out.txt", "5"], tmp_path, ["out.txt"])
-    assert list(found) == [str(tmp_path / "in.txt"), "./out.txt", "out.txt", "5"]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
