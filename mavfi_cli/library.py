@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, is_dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,16 @@ class Campaign:
 
     folder: Path
     table: pa.Table
+
+    def __repr__(self) -> str:
+        return f"Campaign({str(self.folder)!r}, missions={self.table.num_rows})"
+
+    def _repr_html_(self) -> str | None:
+        """Return the table, which a notebook shows; None without pandas."""
+        if find_spec("pandas") is None:
+            return None
+        shown: str = self.to_pandas()._repr_html_()
+        return shown
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the table as a pandas data frame.

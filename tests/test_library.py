@@ -1,7 +1,11 @@
 """`import mavfi_cli as mavfi`: what a library's user gets."""
 
+import base64
+import json
+import shutil
 import subprocess
 import sys
+from html.parser import HTMLParser
 
 import pytest
 from pyarrow import parquet
@@ -101,3 +105,53 @@ def test_without_pandas_one_line_says_what_to_install(flown_campaign, monkeypatc
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MavfiError, match=r"pip install 'mavfi\[pandas\]'"):
         read.to_pandas()
+
+
+class Images(HTMLParser):
+    """The pictures and all other elements of HTML."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.sources, self.others = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.sources.append(dict(attrs)["src"])
+        else:
+            self.others.append(tag)
+
+
+def test_a_notebook_shows_summary_and_picture_of_a_run(short_flight):
+    run = mavfi.load_run(short_flight.path)
+    assert repr(run) == f"Run('{short_flight.path}', outcome='success')"
+    shown = run._repr_html_()
+    assert "SUCCESS: reached the goal" in shown
+    (source,) = Images(shown).sources
+    kind, _, data = source.partition(",")
+    assert kind == "data:image/svg+xml;base64"
+    assert "farm, seed 5: success" in base64.b64decode(data).decode()
+
+
+def test_a_notebook_executes_nothing_from_a_foreign_run(short_flight, tmp_path):
+    shutil.copytree(short_flight.path, tmp_path / "run")
+    (tmp_path / "run" / "flight.svg").write_text("<svg onload='alert(1)'/>")
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    result["reason"] = "</pre><script>alert(1)</script>"
+    result["config"]["world"] = "<img src=x onerror=alert(1)>"
+    (tmp_path / "run" / "result.json").write_text(json.dumps(result))
+    shown = mavfi.load_run(tmp_path / "run")._repr_html_()
+    found = Images(shown)
+    assert found.others == ["pre"]
+    (source,) = found.sources
+    picture = base64.b64decode(source.partition(",")[2]).decode()
+    assert "alert" not in picture.replace("&lt;img src=x onerror=alert(1)&gt;", "")
+
+
+def test_a_notebook_shows_a_campaign_as_a_data_frame(flown_campaign, monkeypatch):
+    campaign = mavfi.campaign(flown_campaign)
+    assert repr(campaign) == f"Campaign('{flown_campaign}', missions=1)"
+    assert campaign._repr_html_() == campaign.to_pandas()._repr_html_()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.setattr(library, "find_spec", lambda name: None)
+    assert campaign._repr_html_() is None

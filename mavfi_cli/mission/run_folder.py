@@ -291,6 +291,15 @@ class Run:
     result: dict[str, Any]
     trace: pa.Table | None
 
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder.path)!r}, outcome={self.record.outcome!r})"
+
+    def _repr_html_(self) -> str:
+        """Return the summary and the picture, which a notebook shows."""
+        from mavfi_cli.report.summary import run_html
+
+        return run_html(self)
+
     @property
     def record(self) -> FlightRecord:
         """The sections of the result."""

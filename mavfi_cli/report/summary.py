@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -177,6 +179,22 @@ def folder_lines(run: Run, picture: Path | None) -> list[str]:
         *([f"Traceback   {run.folder.crash}"] if run.folder.crash.is_file() else []),
         *([f"Picture     {picture}"] if picture is not None and not inside else []),
     ]
+
+
+def run_html(run: Run) -> str:
+    """Return summary and picture as HTML, without markup from the record, which may be foreign.
+
+    The picture is drawn from the record, as an image of its own: a browser runs no script in it.
+    """
+    from mavfi_cli.report.drawing import svg
+    from mavfi_cli.report.top_view import draw_top_view
+
+    text = html.escape("\n".join([*summary_lines(run.result), *folder_lines(run, None)]))
+    data = base64.b64encode(svg(draw_top_view(run)).encode()).decode()
+    return (
+        f'<pre style="white-space: pre-wrap">{text}</pre><img alt="the flight from above" '
+        f'style="max-width: 100%; background: white" src="data:image/svg+xml;base64,{data}">'
+    )
 
 
 def event_lines(result: dict[str, Any]) -> list[str]:

@@ -1,5 +1,6 @@
 """The documents: commands run, examples work, links lead somewhere."""
 
+import html
 import json
 import os
 import re
@@ -14,6 +15,7 @@ import click
 import pytest
 from fake_autopilot import FakePX4
 from pyarrow.parquet import read_schema
+from test_code_blocks import WIDEST
 
 from mavfi_cli import cli
 from mavfi_cli.analysis.flights import EXPORTED
@@ -137,6 +139,17 @@ def build(builder, folder):
     assert done.returncode == 0, done.stderr
 
 
+# What Python shows of an object that no reader knows.
+OBJECT = re.compile(r"Sentinel|\w+ object at 0x|&lt;(?:function |lambda&gt;|class ')|PosixPath")
+
+
+def wide_lines(page):
+    """The lines of code of a built page that scroll."""
+    blocks = re.findall(r"<pre>(.*?)</pre>", page, flags=re.DOTALL)
+    lines = html.unescape(re.sub(r"<[^>]+>", "", "\n".join(blocks))).splitlines()
+    return [line for line in lines if len(line) > WIDEST]
+
+
 @pytest.mark.slow
 def test_the_pages_build_without_a_warning(tmp_path):
     """A warning is a dead link, a page that no other lists, or a name that no longer exists."""
@@ -146,6 +159,12 @@ def test_the_pages_build_without_a_warning(tmp_path):
     assert "--allow-unsigned" in told  # of `mavfi sitl`, whose help is its own
     commands = cli.cli.list_commands(click.Context(cli.cli))
     assert [name for name in commands if f'id="mavfi-{name}"' not in told] == []
+    texts = {str(path): path.read_text() for path in (tmp_path / "html").rglob("*.html")}
+    assert {name: OBJECT.findall(text) for name, text in texts.items() if OBJECT.search(text)} == {}
+    assert {name: wide for name, text in texts.items() if (wide := wide_lines(text))} == {}
+    index = (tmp_path / "html" / "searchindex.js").read_text()
+    entries = json.loads(index.removeprefix("Search.setIndex(").removesuffix(")"))["indexentries"]
+    assert "golden run" in entries  # a search for it begins with the glossary
     settings = (tmp_path / "html" / "reference" / "settings.html").read_text()
     assert [each.name for each in fields(MissionConfig) if each.name not in settings] == []
     build("man", tmp_path)

@@ -16,7 +16,7 @@ from test_code_blocks import ROOT, blocks
 
 pytestmark = pytest.mark.slow
 RECIPES = [
-    block.text.splitlines()
+    block.text.replace("\\\n", " ").splitlines()
     for block in blocks(ROOT / "docs" / "how-to" / "eyes.md")
     if "test_recipes.py" in block.notes.get("not run", "")
 ]

@@ -1,10 +1,11 @@
 """Every example runs as a program, and says what it promises."""
 
-import json
 import runpy
 import sys
 from pathlib import Path
 
+import nbclient
+import nbformat
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -40,9 +41,23 @@ def test_an_example_runs(name, run):
     assert SAYS[name] in run(EXAMPLES / f"{name}.py")
 
 
+def prints(notebook):
+    """What the cells print, and the kinds of what they show."""
+    outputs = [each for cell in notebook.cells for each in cell.get("outputs", ())]
+    texts = [each.text for each in outputs if each.output_type == "stream"]
+    return texts, [sorted(each.data) for each in outputs if "data" in each]
+
+
 @pytest.mark.parametrize("path", list(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_the_code_of_a_notebook_runs(path, run, tmp_path):
-    cells = json.loads(path.read_text())["cells"]
-    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    (tmp_path / "notebook.py").write_text(code)
-    assert "success" in run("notebook.py")
+def test_a_notebook_prints_what_it_is_stored_with(path, tmp_path, monkeypatch):
+    for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "IPYTHONDIR"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    stored = nbformat.read(path, as_version=4)
+    flown = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(
+        flown, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    assert prints(flown) == prints(stored)
+    texts, shown = prints(stored)
+    assert any("success" in text for text in texts)
+    assert shown == [["image/png", "text/plain"], ["text/html", "text/plain"]]
