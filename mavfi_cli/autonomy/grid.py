@@ -26,6 +26,10 @@ Blocked = NDArray[np.uint8]
 MAX_VOXELS = 60_000_000  # limits the memory for a corrupted map or bound
 
 
+class GridTooLarge(ValueError):
+    """The obstacles of a map lie too far apart for one grid."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObstacleGrid:
     """Blocked voxels in a box around the obstacles. The rest of `bounds_enu_m` is free."""
@@ -40,7 +44,8 @@ class ObstacleGrid:
     def build(cls, snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> Self:
         """Build the grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
 
-        Occupied voxels outside the bounds count if their dilation reaches inside.
+        Occupied voxels outside the bounds count if their dilation reaches inside. Raises
+        GridTooLarge beyond MAX_VOXELS.
         """
         resolution = snapshot.resolution_m
         reach = math.ceil(radius_m / resolution) + 1
@@ -109,7 +114,7 @@ def _extent(
     high = np.minimum(high, np.ceil(bounds[3:] / resolution).astype(np.int64) + reach)
     size = np.maximum(high - low, 0)
     if float(np.prod(size.astype(np.float64))) > MAX_VOXELS:
-        raise ValueError(f"obstacle grid of {size.tolist()} voxels is too large")
+        raise GridTooLarge(f"obstacle grid of {size.tolist()} voxels is too large")
     return low, size
 
 

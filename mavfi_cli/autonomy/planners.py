@@ -23,7 +23,7 @@ from ompl import geometric as og
 from ompl import util as ou
 
 from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
-from mavfi_cli.autonomy.grid import ObstacleGrid, segment_free
+from mavfi_cli.autonomy.grid import GridTooLarge, ObstacleGrid, segment_free
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
@@ -145,9 +145,12 @@ def plan(
         snapshot: Newest map.
         bounds_enu_m: Allowed volume (6,), xmin ymin zmin xmax ymax zmax.
     """
-    problem = PlanningProblem.pose(
-        snapshot, request.position_enu_m, request.goal_enu_m, bounds_enu_m, params
-    )
+    try:
+        problem = PlanningProblem.pose(
+            snapshot, request.position_enu_m, request.goal_enu_m, bounds_enu_m, params
+        )
+    except GridTooLarge:
+        return PlanFailure(stamp_s=request.stamp_s, reason="obstacles too far apart for a map")
     result = planner.plan(problem, seed)
     if not result.found:
         return PlanFailure(stamp_s=request.stamp_s, reason=result.reason)

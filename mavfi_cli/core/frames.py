@@ -9,12 +9,20 @@ Each conversion is its own inverse.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
+
+# Limits of positions and velocities that arrive from a link, along each axis. A map ends at 6.5 km.
+FARTHEST_M, FASTEST_MPS = 1e4, 1e3
+
+
+def is_within(limit: float, values: Iterable[float]) -> bool:
+    """Return True if no value is NaN or beyond a limit."""
+    return all(abs(value) <= limit for value in values)
 
 
 def enu_from_ned(vector: Vector) -> Vector:

@@ -27,6 +27,7 @@ MAX_PIXELS = 1 << 20
 DEPTH_UNIT_M = 0.1
 NOTHING = 255  # pixel value where nothing was in range
 
+_NARROWEST_RAD, _WIDEST_RAD = 0.005, 3.13  # believed field of view
 _OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
 _FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
 _COPY = 4  # largest number of messages from a packet to its copy
@@ -130,9 +131,11 @@ class ImageReceiver:
         return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
-        """Take 2 atan(sensor width / 2 focal length) of a CAMERA_INFORMATION."""
-        if message.focal_length > 0.0 and 0.0 < message.sensor_size_h < math.inf:
-            self.hfov_rad = 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
+        """Take 2 atan(sensor width / 2 focal length) of a CAMERA_INFORMATION, within limits."""
+        if message.focal_length > 0.0:
+            hfov_rad = 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
+            if _NARROWEST_RAD <= hfov_rad <= _WIDEST_RAD:
+                self.hfov_rad = hfov_rad
         return []
 
     def _captured(self, message: Message) -> list[ImageFrame]:

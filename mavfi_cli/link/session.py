@@ -18,13 +18,12 @@ from mavfi_cli.core.frames import ned_yaw_from_enu
 from mavfi_cli.core.types import VehicleState
 from mavfi_cli.link.codec import Message, dialect, text_messages
 from mavfi_cli.link.commands import Commands, Ticket
-from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.telemetry import AUTOPILOT, CAMERA, Telemetry
 
 # POSITION_TARGET_TYPEMASK
 _IGNORED = 0x0807  # position and yaw rate
 _NO_ACCELERATION = 0x01C0
 _NO_YAW = 0x0400
-_CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _LARGEST_FLOAT32 = 3.4028234663852886e38
 
 _HEARD = (
@@ -180,7 +179,7 @@ class OffboardSession:
         """Request a frame of the camera every `interval_s` without end."""
         self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
-            component=_CAMERA, unused=math.nan, refusals=3,
+            component=CAMERA, unused=math.nan, refusals=3,
         )  # fmt: skip
 
     def request_land(self) -> None:
@@ -191,10 +190,13 @@ class OffboardSession:
     # Received messages --------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:
-        """Handle a received message. Messages for other receivers are ignored."""
-        self.telemetry.handle(message)
-        number = type(message).id
+        """Handle a received message. Only the autopilot and its camera are heard."""
+        telemetry, number = self.telemetry, type(message).id
+        telemetry.handle(message)
         if number not in _HEARD:
+            return
+        of_camera = telemetry.is_from(message, CAMERA)
+        if not (of_camera or telemetry.is_from(message, AUTOPILOT)):
             return
         reply = None
         if number == dialect.MAVLINK_MSG_ID_TIMESYNC:
@@ -204,10 +206,10 @@ class OffboardSession:
             if message.target_system == message.target_component == 0:
                 asker = (message.get_srcSystem(), message.get_srcComponent())
                 reply = dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
-        elif self.telemetry.heard and message.get_srcSystem() == self.telemetry.system:
+        else:
             if number == dialect.MAVLINK_MSG_ID_COMMAND_ACK:
                 self._commands.acknowledge(message)
-            if message.get_srcComponent() == _CAMERA:
+            if of_camera:
                 self._hear_camera(number, message)
         if reply is not None and len(self._answers) < _MAX_ANSWERS:
             self._answers.append(reply)
@@ -215,8 +217,8 @@ class OffboardSession:
     def _hear_camera(self, number: int, message: Message) -> None:
         """Handle what the camera says, which has the referee of a foreign autopilot."""
         if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET:
-            origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
-            if np.isfinite(origin).all():
+            if self.phase is Phase.CONNECTING:  # later, the origin would move a flying vehicle
+                origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
                 self.telemetry.move_origin(origin)
         elif number == dialect.MAVLINK_MSG_ID_STATUSTEXT:
             self.telemetry.take_text(message)
@@ -232,7 +234,7 @@ class OffboardSession:
         if self._settings.needs_camera:
             wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
         request = dialect.MAV_CMD_REQUEST_MESSAGE
-        self._origin_asked = self._commands.submit(request, wanted, component=_CAMERA)
+        self._origin_asked = self._commands.submit(request, wanted, component=CAMERA)
 
     # Sent messages ------------------------------------------------------------------------------
 

@@ -18,7 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.frames import flu_enu_from_frd_ned, quaternion_from_euler, yaw_from_quaternion
+from mavfi_cli.core.frames import (
+    FARTHEST_M,
+    FASTEST_MPS,
+    flu_enu_from_frd_ned,
+    is_within,
+    quaternion_from_euler,
+    yaw_from_quaternion,
+)
 from mavfi_cli.core.types import FloatArray, VehicleState
 from mavfi_cli.link.codec import CHUNK_LENGTH, Message, dialect
 from mavfi_cli.link.endpoint import TWO_AUTOPILOTS
@@ -61,6 +68,8 @@ _COPTERS = (
     dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR, dialect.MAV_TYPE_TRICOPTER,
     dialect.MAV_TYPE_DODECAROTOR, dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_GENERIC_MULTIROTOR,
 )  # fmt: skip
+AUTOPILOT: int = dialect.MAV_COMP_ID_AUTOPILOT1
+CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _KEPT = 512
 _REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
 
@@ -190,7 +199,8 @@ class _TextCollector:
 
     def _emit(self, severity: int, text: str) -> _Text:
         self.total += 1
-        self.texts.append(_Text(severity, text.strip()))
+        shown = "".join(c if c.isprintable() else "\ufffd" for c in text.strip())
+        self.texts.append(_Text(severity, shown))
         return self.texts[-1]
 
 
@@ -235,18 +245,22 @@ class Telemetry:
         handler = _HANDLERS.get(type(message).id)
         if handler is None:
             return
-        header = message.get_header()
-        if header.srcComponent != dialect.MAV_COMP_ID_AUTOPILOT1:
-            return
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._adopt(message)
-        if self.system and header.srcSystem == self.system:
+        if self.is_from(message, AUTOPILOT):
             handler(self, message)
+
+    def is_from(self, message: Message, component: int) -> bool:
+        """Return True if a component of the autopilot's system has sent a message."""
+        header = message.get_header()
+        return bool(header.srcComponent == component and header.srcSystem == self.system != 0)
 
     def _adopt(self, message: Message) -> None:
         """Follow the first autopilot that sends a HEARTBEAT and can be flown."""
         system, profile = message.get_srcSystem(), _PROFILES.get(message.autopilot)
-        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID or system == self.system:
+        if message.get_srcComponent() != AUTOPILOT or system == self.system:
+            return
+        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID:
             return
         if self.heard:
             self.unfit = f"two autopilots are on this link, systems {self.system} and {system}"
@@ -265,7 +279,9 @@ class Telemetry:
     def _local_position(self, message: Message) -> None:
         position = (message.y, message.x, -message.z)
         velocity = (message.vy, message.vx, -message.vz)
-        if self._quaternion is None or not math.isfinite(sum(position) + sum(velocity)):
+        if not (is_within(FARTHEST_M, position) and is_within(FASTEST_MPS, velocity)):
+            return
+        if self._quaternion is None:
             return
         place = np.array(position, dtype=np.float64)
         if self.origin_enu_m is not None:
@@ -295,7 +311,7 @@ class Telemetry:
         self.ready = bool(message.onboard_control_sensors_health & _PREARM)
         if message.voltage_battery != 0xFFFF:
             self.battery_voltage_v = message.voltage_battery / 1e3
-        if message.battery_remaining >= 0:
+        if 0 <= message.battery_remaining <= 100:
             self.battery_remaining = message.battery_remaining / 100.0
 
     def _extended_sys_state(self, message: Message) -> None:
@@ -311,7 +327,12 @@ class Telemetry:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
     def move_origin(self, origin_enu_m: FloatArray) -> None:
-        """Set the origin of the positions (3,). States with another one are forgotten."""
+        """Set the origin of the positions (3,). States with another one are forgotten.
+
+        An origin beyond all sense is ignored.
+        """
+        if not is_within(FARTHEST_M, origin_enu_m):
+            return
         before = np.zeros(3) if self.origin_enu_m is None else self.origin_enu_m
         if np.array_equal(origin_enu_m, before):
             return

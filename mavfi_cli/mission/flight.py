@@ -8,7 +8,9 @@ process of its own simulates the next tick while the heavy kernels run.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -29,7 +31,7 @@ from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.images import IMAGE_MESSAGES, ImageFrame, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
-from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.telemetry import AUTOPILOT, CAMERA, Telemetry
 from mavfi_cli.link.tlog import RecordedLink
 from mavfi_cli.link.transport import Transport
 from mavfi_cli.mission.progress import FlightLogger, Recorder, Watcher
@@ -41,7 +43,8 @@ SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts
 BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
-_POSITION, _AUTOPILOT = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, dialect.MAV_COMP_ID_AUTOPILOT1
+_WAITING_FRAMES = 16  # of a camera that sends before the companion flies
+_POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _PACE_AFTER_S = 1.0  # wall time after which the pace of a foreign vehicle is known
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
@@ -66,8 +69,19 @@ class ForeignClock:
         self._first = (0.0, 0.0)  # stamp and wall time of the first state
         self._waited_s = 0.0
         self._pace = 1.0
+        self._doubted_s = math.inf
         self.stamp_s = 0.0
         self.heard = False
+
+    def believes(self, stamp_s: float, limit_s: float) -> bool:
+        """Return False for the stamp of a state that is not newer, or that leaps beyond a limit.
+
+        A clock has leapt if a second state follows the first within the limit.
+        """
+        leaps = stamp_s > self.stamp_s + limit_s
+        follows = self._doubted_s < stamp_s <= self._doubted_s + limit_s
+        self._doubted_s = stamp_s if leaps else math.inf
+        return follows or (self.stamp_s < stamp_s and not leaps)
 
     def hear(self, stamp_s: float) -> None:
         """Note a new state."""
@@ -117,7 +131,7 @@ class Flight:
         )
         self._session = self._new_session()
         self.images = ImageReceiver()
-        self._frames: list[ImageFrame] = []
+        self._frames: deque[ImageFrame] = deque(maxlen=_WAITING_FRAMES)
         self._camera_asked = False
         self._seen_s = 0.0  # when the newest frame arrived, or frames were asked for
         self._clock = None if config.link is None else ForeignClock()
@@ -299,21 +313,28 @@ class Flight:
 
     def _take(self, data: bytes) -> float | None:
         """Handle the messages in the data. Return the stamp of the newest state, s, or None."""
-        stamp_ms = None
+        newest_s, telemetry = None, self._session.telemetry
         with self.wall.measure("link"):
             for message in self.link.messages(data, self.stamp_s):
                 number = type(message).id
                 if number in IMAGE_MESSAGES:  # most of all
-                    if frames := self.images.feed(message):
+                    if telemetry.is_from(message, CAMERA) and (frames := self.images.feed(message)):
                         self._frames += frames
                         self._seen_s = self.stamp_s
                     continue
+                if number == _POSITION and telemetry.is_from(message, AUTOPILOT):
+                    stamp_s = message.time_boot_ms / 1e3
+                    if not self._believes(stamp_s):
+                        continue
+                    newest_s = stamp_s
                 self._session.handle(message)
-                if number == _POSITION:
-                    known, system = self._session.telemetry.system, message.get_srcSystem()
-                    if system == (known or system) and message.get_srcComponent() == _AUTOPILOT:
-                        stamp_ms = message.time_boot_ms
-        return None if stamp_ms is None else stamp_ms / 1e3
+        return newest_s
+
+    def _believes(self, stamp_s: float) -> bool:
+        """Return False for a stamp that a foreign vehicle's clock cannot have in flight."""
+        if self._clock is None or not self._airborne():
+            return True
+        return self._clock.believes(stamp_s, self._config.loss_limit_s)
 
     def _go_without(self, clock: ForeignClock, waited_s: float) -> None:
         clock.wait(waited_s)

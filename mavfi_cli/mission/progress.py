@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mavfi_cli.companion.pipeline import Companion
 
 _PROGRESS_EVERY_S = 1.0
+_MOST_TEXTS = 1000  # of the autopilot in a record
 _MODES = {  # kind and text of the event with which a mode of the pilot begins
     PilotMode.SLOWING: ("slow", "slows down before an obstacle"),
     PilotMode.STOPPING: ("stop", "stops before an obstacle"),
@@ -76,7 +77,7 @@ class FlightLogger:
         self._watcher = watcher
         self._phase: Phase | None = None
         self._mode: PilotMode | None = None
-        self._texts = 0
+        self._texts = self._noted_texts = 0
         self._losses = 0
         self._next_progress_s = 0.0
 
@@ -104,7 +105,11 @@ class FlightLogger:
             self.note(stamp_s, "phase", phase.value, state)
         texts = session.telemetry.texts
         for each in texts.since(self._texts):
-            self.note(stamp_s, "autopilot", each.text.strip(), state)
+            if self._noted_texts <= _MOST_TEXTS:
+                last = self._noted_texts == _MOST_TEXTS
+                text = "further texts are not recorded" if last else each.text
+                self.note(stamp_s, "autopilot", text, state)
+                self._noted_texts += 1
         self._texts = texts.total
         for text in injection.news():
             self.note(stamp_s, "fault", text, state)

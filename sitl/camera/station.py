@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, quaternion_from_euler
+from mavfi_cli.core.frames import (
+    FARTHEST_M,
+    FASTEST_MPS,
+    Vector,
+    enu_from_ned,
+    flu_enu_from_frd_ned,
+    is_within,
+    quaternion_from_euler,
+)
 from mavfi_cli.link.codec import Codec, Signing, dialect, text_messages
 from mavfi_cli.link.endpoint import TWO_AUTOPILOTS, SenderSlot, parse_endpoint
 from mavfi_cli.link.transport import Transport
@@ -73,6 +81,7 @@ _ASK_AGAIN_S = 2.0
 _POSE_INTERVAL_US = 20_000.0
 _ANNOUNCE_S = 1.0
 _PLACE_S = 1.0
+_MOST_HELD = 64  # commands that wait until the camera knows its place
 _POSE = "the autopilot's own pose"
 _ACCELERATION_S = 0.2  # time over which velocities are differentiated
 _GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
@@ -102,13 +111,13 @@ class PoseTracker:
         return None if self._attitude is None else self._attitude[0]
 
     def take(self, message: Any) -> bool:
-        """Handle a message with finite values. Return True if there is a new pose."""
+        """Handle a message. Return True if there is a new pose. Impossible values are ignored."""
         kind = message.get_type()
         if kind == "LOCAL_POSITION_NED":
             position = np.array([message.x, message.y, message.z], dtype=np.float64)
             velocity = np.array([message.vx, message.vy, message.vz], dtype=np.float64)
-            if np.isfinite(position).all():
-                velocity = np.nan_to_num(velocity, nan=0.0, posinf=0.0, neginf=0.0)
+            if is_within(FARTHEST_M, position):
+                velocity[~(np.abs(velocity) <= FASTEST_MPS)] = 0.0
                 self._position = (message.time_boot_ms / 1e3, position, velocity)
             return False
         quaternion = self._quaternion(kind, message)
@@ -124,7 +133,10 @@ class PoseTracker:
             quaternion = np.array([message.q1, message.q2, message.q3, message.q4])
             self.has_quaternion = True
         elif kind == "ATTITUDE" and not self.has_quaternion:
-            quaternion = quaternion_from_euler(message.roll, message.pitch, message.yaw)
+            angles = message.roll, message.pitch, message.yaw
+            if not all(map(math.isfinite, angles)):
+                return None
+            quaternion = quaternion_from_euler(*angles)
         else:
             return None
         length = float(np.linalg.norm(quaternion))
@@ -316,7 +328,9 @@ class Station:
         component = message.get_srcComponent()
         if component == COMPONENT_ID and message.get_srcSystem() == self._autopilot:
             if isinstance(message, dialect.MAVLink_local_position_ned_system_global_offset_message):
-                self._place_at(enu_from_ned(np.array([message.x, message.y, message.z])))
+                origin_enu_m = enu_from_ned(np.array([message.x, message.y, message.z]))
+                if is_within(FARTHEST_M, origin_enu_m):
+                    self._place_at(origin_enu_m)
             return False
         if self._is_autopilot(message):
             if self._witness is not None:
@@ -331,7 +345,10 @@ class Station:
         return not for_camera
 
     def _hold(self, command: Any) -> None:
-        self._held[command.get_srcSystem(), command.get_srcComponent(), command.command] = command
+        key = command.get_srcSystem(), command.get_srcComponent(), command.command
+        if key not in self._held and len(self._held) >= _MOST_HELD:
+            return
+        self._held[key] = command
         progress = dialect.MAV_RESULT_IN_PROGRESS
         sender = command.get_srcSystem(), command.get_srcComponent()
         self._send([dialect.MAVLink_command_ack_message(command.command, progress, 0, 0, *sender)])
@@ -382,7 +399,7 @@ class Station:
             self._place_at(self._tracker.origin_enu_m)
 
     def _place_at(self, origin_enu_m: Vector) -> None:
-        if not self._placed and np.isfinite(origin_enu_m).all():
+        if not self._placed:
             self._placed = True
             held, self._held = self._held, {}
             self._tracker.origin_enu_m = self.camera.local_origin_enu_m = origin_enu_m

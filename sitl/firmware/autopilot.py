@@ -34,6 +34,7 @@ _FOLLOWING = {  # the mode in which a firmware follows a companion
     dialect.MAV_AUTOPILOT_PX4: 6 << 16,  # OFFBOARD
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: 4,  # GUIDED
 }
+_AUTOPILOT: int = dialect.MAV_COMP_ID_AUTOPILOT1
 _ECHO_LIMIT_S = 0.2
 _SILENCE_US = 60_000_000
 
@@ -149,12 +150,14 @@ class FirmwareAutopilot(Links):
         if number == dialect.MAVLINK_MSG_ID_TIMESYNC and message.ts1 == self._echo and message.tc1:
             self._echoed = self._echo
             return
-        if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
-            self.state_stamp_us = message.time_boot_ms * 1000
-        elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            self._follows = follows_companion(message)
-            if not self._prepared:
-                self._prepare()
+        header = message.get_header()
+        if header.srcSystem == self.system_id and header.srcComponent == _AUTOPILOT:
+            if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+                self.state_stamp_us = message.time_boot_ms * 1000
+            elif number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+                self._follows = follows_companion(message)
+                if not self._prepared:
+                    self._prepare()
         self.broadcast(message)
 
     def _prepare(self) -> None:

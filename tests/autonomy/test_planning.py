@@ -35,10 +35,10 @@ def request(velocity=(0.0, 0.0, 0.0), goal=(20.0, 0.0, 5.0)):
     )
 
 
-def plan(planner, asked, seed=1):
-    params = planners.PlanningParams()
+def plan(planner, asked, seed=1, snapshot=None, bounds=BOUNDS):
+    params, snapshot = planners.PlanningParams(), snapshot or blocks()
     return planners.plan(
-        planners.find(planner), asked, blocks(), bounds_enu_m=BOUNDS, seed=seed, params=params
+        planners.find(planner), asked, snapshot, bounds_enu_m=bounds, seed=seed, params=params
     )
 
 
@@ -55,6 +55,14 @@ def test_plans_pass_the_collision_check_at_rest_and_in_motion():
         assert checked.time_to_collision_s == math.inf
         assert found.trajectory_seq == 5
         assert np.ptp(found.waypoints[:, 1:3]) > 0.5  # it goes round the blocks
+
+
+def test_a_map_whose_obstacles_lie_too_far_apart_gives_no_plan():
+    """As one that was seen from a position that is not the vehicle's."""
+    ends = MapSnapshot.of_points(np.array([[-900.0, -900.0, 0.0], [900.0, 900.0, 10.0]]))
+    huge = np.array([-1e3, -1e3, -10.0, 1e3, 1e3, 20.0])
+    refused = plan("rrtstar", request(), snapshot=ends, bounds=huge)
+    assert refused.reason == "obstacles too far apart for a map"
 
 
 def test_a_blocked_goal_is_refused_with_its_reason():

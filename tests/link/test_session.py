@@ -321,6 +321,12 @@ def test_a_reported_collision() -> None:
     assert flight.session.telemetry.texts.texts[-1].severity == 0
 
 
+def test_a_text_cannot_write_on_the_terminal() -> None:
+    session = _heard()
+    session.handle(_from(1, 1, dialect.MAVLink_statustext_message(2, b"a\x1b[2J\nb\xff\t")))
+    assert session.telemetry.texts.texts[-1].text == "a\ufffd[2J\ufffdb\ufffd"
+
+
 def test_the_setpoint_in_ned() -> None:
     session = OffboardSession()
     session.set_target([1.0, 2.0, 3.0], 0.0, [0.1, 0.2, 0.3])
@@ -361,25 +367,34 @@ def _from(system: int, component: int, message: Message) -> Message:
     return decoded
 
 
-def test_requests_for_time_and_ping_are_answered() -> None:
+def _heard() -> OffboardSession:
     session = OffboardSession()
+    session.handle(_from(1, 1, dialect.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3)))
+    return session
+
+
+def test_requests_for_time_and_ping_are_answered() -> None:
+    session = _heard()
     session.tick(2.0)
+    for stranger in ((1, 190), (7, 1)):
+        session.handle(_from(*stranger, dialect.MAVLink_timesync_message(0, 99)))
+        session.handle(_from(*stranger, dialect.MAVLink_ping_message(99, 9, 0, 0)))
     session.handle(_from(1, 1, dialect.MAVLink_timesync_message(0, 1234)))
     session.handle(_from(1, 1, dialect.MAVLink_ping_message(55, 6, 0, 0)))
     session.handle(_from(1, 1, dialect.MAVLink_timesync_message(99, 1234)))  # an answer
     session.handle(_from(1, 1, dialect.MAVLink_ping_message(55, 6, 1, 191)))  # an answer
-    sync, ping, setpoint = session.tick(2.02)
+    sync, ping, *_, setpoint = session.tick(2.02)
     assert (sync.tc1, sync.ts1) == (2_000_000_000, 1234)
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (55, 6, 1, 1)
     assert setpoint.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
 
 
 def test_a_flood_of_requests_is_answered_in_bounds() -> None:
-    session = OffboardSession()
+    session = _heard()
     request = _from(1, 1, dialect.MAVLink_timesync_message(0, 1))
     for _ in range(10_000):
         session.handle(request)
-    assert len(session.tick(0.0)) < 100
+    assert 50 < len(session.tick(0.0)) < 100
 
 
 def test_our_own_heartbeat_once_a_second() -> None:
@@ -451,7 +466,7 @@ def test_states_are_found_again_by_stamp() -> None:
 NUMBERS = [0, 1, 4, 30, 31, 32, 33, 77, 111, 147, 242, 245, 253, 259, 271]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(
         st.tuples(

@@ -20,6 +20,14 @@ def heard(clock, wall, pace, duration_s, first_s=50.0):
         clock.hear(first_s + 0.1 * step * pace)
 
 
+def test_a_clock_has_leapt_if_a_second_state_says_so():
+    clock = ForeignClock(Wall())
+    clock.hear(50.0)
+    stamps = [50.0, 49.0, 54.0, 4e6, 54.0, 3e6, 4e6, 4e6 + 0.1]
+    believed = [clock.believes(stamp_s, limit_s=5.0) for stamp_s in stamps]
+    assert believed == [False, False, True, False, True, False, False, True]
+
+
 @pytest.mark.parametrize(("pace", "silent_s"), [(1.0, 6.0), (1 / 3, 2.0), (20.0, 6.0)])
 def test_silence_counts_when_it_has_passed_on_both_clocks(pace, silent_s):
     wall = Wall()

@@ -61,6 +61,10 @@ def test_values_that_are_none_are_skipped() -> None:
     assert not tracker.take(attitude(10, math.nan))
     zero = dialect.MAVLink_attitude_quaternion_message(10, 0, 0, 0, 0, 0, 0, 0)
     assert not tracker.take(zero)
+    fresh = PoseTracker(np.zeros(3))
+    assert not fresh.take(dialect.MAVLink_attitude_message(10, math.inf, 0, math.nan, 0, 0, 0))
+    fresh.take(position(0, north=3e38))
+    assert not fresh.has_position
 
 
 def test_after_a_reboot_the_old_position_is_forgotten() -> None:

@@ -40,6 +40,20 @@ def test_its_messages_reach_every_client(
     assert autopilot.state_stamp_us == 14_004_000
 
 
+@pytest.mark.parametrize("stranger", [(1, 190), (7, 1)])
+def test_a_stranger_on_its_link_tells_neither_position_nor_mode(
+    wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth, stranger: tuple[int, int]
+) -> None:
+    autopilot, theirs = wired
+    (heartbeat,) = Codec(1, 1).decode(PX4_HEARTBEAT)
+    (position,) = Codec(1, 1).decode(PX4_POSITION)
+    heartbeat.custom_mode = 6 << 16
+    codec = Codec(*stranger)
+    theirs.sendall(codec.encode(heartbeat) + codec.encode(position))
+    autopilot.observe(20_000, resting)
+    assert (autopilot.state_stamp_us, autopilot.may_touch_ground) == (-1, True)
+
+
 def test_its_origin_is_that_of_the_world(
     wired: tuple[FirmwareAutopilot, socket.socket], resting: Truth
 ) -> None:
