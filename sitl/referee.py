@@ -13,7 +13,7 @@ import numpy as np
 
 from mavfi_cli.core.errors import RecordError, VehicleProcessError
 from mavfi_cli.core.files import write_atomically, write_json
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, norm
 from sitl.sweep import clearance, sweep
 from sitl.world.world import World
 
@@ -184,7 +184,7 @@ class Referee:
         self.collision = Collision(
             stamp_s=before.stamp_s + share * (now.stamp_s - before.stamp_s),
             position_enu_m=(float(place[0]), float(place[1]), float(place[2])),
-            speed_mps=float(np.linalg.norm(now.velocity)),
+            speed_mps=norm(now.velocity),
             box_index=int(box) if box >= 0 else None,
         )
         return self.collision

@@ -10,7 +10,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.files import write_json
-from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
+from mavfi_cli.core.frames import Vector, dot, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.telemetry import STEP_US, STEPS_A_TICK, TICK_US
@@ -163,5 +163,5 @@ class Simulation:
         is_down = truth.on_ground or place[2] > -_GROUND_M
         if self._wreck is None and commander.terminated and is_down:
             self._wreck = truth.wreck()
-        if not (place @ place < _FARTHEST_M**2 and rates @ rates < _FASTEST_RADPS**2):
+        if not (dot(place, place) < _FARTHEST_M**2 and dot(rates, rates) < _FASTEST_RADPS**2):
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")

@@ -30,6 +30,30 @@ UNCALLED = {
     "checkMotion": "OMPL calls it",
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
 }
+# Rooms whose numbers reach a mission, a fault's draw or the model; training is none of them.
+FLOWN = (
+    "core",
+    "autonomy",
+    "companion",
+    "detect",
+    "fi",
+    "link",
+    "spec",
+    "attack",
+    "mission",
+    "vpm",
+)
+TRAINING = ("mavfi_cli.detect.fit", "mavfi_cli.detect.offline")
+# Functions of numpy whose last digit depends on the processor: it has versions for AVX-512 of the
+# first (numpy/_core/src/umath), and gives the second to BLAS. Equal elements come in the order of
+# the third, unless it is stable. `math`, compiled kernels and `np.hypot` call libm, and norms
+# along an axis add squares up, without BLAS.
+BY_PROCESSOR = re.compile(
+    r"np\.(?:random\.)?(a?(sin|cos|tan)h?|arc(sin|cos|tan)h?|arctan2|exp2?|expm1|log(2|10|1p)?|power"
+    r"|float_power|cbrt|logspace|geomspace|sinc|v?dot|inner|matmul|tensordot|einsum|convolve"
+    r"|correlate|cov|corrcoef|linalg(?!\.norm\(.*axis=)|polyfit|arg(sort|partition)(?!.*stable)"
+    r"|partition)\b"
+)
 COMMANDS = ("mavfi_cli/cli/",)  # functions that click calls by decorator
 
 
@@ -153,6 +177,29 @@ def test_a_record_is_read_in_one_module():
     """Others take sections and measures from `mission.measures`."""
     reads = r"\bresult(\[|\.get\()[\"']"
     assert mentions(reads) == {"mavfi_cli.mission.run_folder"}  # upgrades older records
+
+
+def by_processor(module):
+    """Calls of a module whose last digit depends on the processor."""
+    inside = [
+        node
+        for each in ast.walk(tree(module))
+        if isinstance(each, ast.FunctionDef)
+        and any(ast.unparse(name) == "compiled" for name in each.decorator_list)
+        for node in ast.walk(each)
+    ]
+    for node in ast.walk(tree(module)):
+        text = ast.unparse(node) if isinstance(node, ast.Call | ast.BinOp) else ""
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+            yield text
+        elif isinstance(node, ast.Call) and node not in inside and BY_PROCESSOR.match(text):
+            yield text
+
+
+def test_no_last_digit_of_a_mission_depends_on_the_processor():
+    rooms = [f"mavfi_cli.{room}." for room in FLOWN] + ["sitl."]
+    flown = [m for m in SOURCES if f"{m}.".startswith(tuple(rooms)) and m not in TRAINING]
+    assert [(m, text) for m in flown for text in by_processor(m)] == []
 
 
 def test_a_source_is_one_that_a_reader_can_find():

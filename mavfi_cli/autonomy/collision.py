@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.tracking import locate, reference_waypoint
 from mavfi_cli.core.compiled import compiled
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory
 
 MAX_SAMPLES = 4096
@@ -170,8 +171,8 @@ def _within(vector: FloatArray, limit: float) -> FloatArray:
     if largest <= limit / 2.0:
         return vector
     unit = vector / largest
-    norm = float(np.linalg.norm(unit))
-    return vector if largest * norm <= limit else unit * (limit / norm)
+    share = norm(unit)
+    return vector if largest * share <= limit else unit * (limit / share)
 
 
 class _SphereProbe:
@@ -208,7 +209,7 @@ def _first_contact(
             continue
         if not escaping:
             return index
-        if float(np.linalg.norm(point - points[0])) > 2.0 * params.radius_m:
+        if norm(point - points[0]) > 2.0 * params.radius_m:
             return index
         body = body or _SphereProbe(snapshot, math.hypot(params.body_radius_m, padding_m))
         if body.touches(point):

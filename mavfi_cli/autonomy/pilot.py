@@ -18,7 +18,7 @@ from enum import Enum
 import numpy as np
 
 from mavfi_cli.autonomy.tracking import TrackingInputs, reference_waypoint, waypoint_index
-from mavfi_cli.core.frames import wrap_angle
+from mavfi_cli.core.frames import norm, wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
 
@@ -189,7 +189,7 @@ class _ActivePlan:
         """Return the planned speed at the present point at rate 1, limited to v_max."""
         if self.trajectory is None:
             return 0.0
-        speed, limit = float(np.linalg.norm(self.reference()[4:7])), self._params.v_max_mps
+        speed, limit = norm(self.reference()[4:7]), self._params.v_max_mps
         return min(speed, limit) if math.isfinite(speed) else limit
 
     def stopping_s(self) -> float:
@@ -422,7 +422,7 @@ class Pilot:
         return 0.0 if self._look_started_s is None else self._stamp_s - self._look_started_s
 
     def _has_arrived(self, state: VehicleState) -> bool:
-        distance_m = float(np.linalg.norm(state.position_enu_m - self.goal_enu_m))
+        distance_m = norm(state.position_enu_m - self.goal_enu_m)
         if not distance_m <= self.params.goal_tolerance_m:
             return False
         return not self.params.arrives_at_rest or (
@@ -430,7 +430,7 @@ class Pilot:
         )
 
     def _at_rest(self, state: VehicleState) -> bool:
-        return float(np.linalg.norm(state.velocity_enu_mps)) <= self.params.rest_mps
+        return norm(state.velocity_enu_mps) <= self.params.rest_mps
 
     def _hover(self, state: VehicleState) -> None:
         """Drop the trajectory and hover here, or where the vehicle comes to rest."""
@@ -494,7 +494,7 @@ class Pilot:
         if self.active.trajectory is None or not self.params.guards_tracking:
             return
         reference_enu_m = self.active.reference()[0:3]
-        error_m = float(np.linalg.norm(state.position_enu_m - reference_enu_m))
+        error_m = norm(state.position_enu_m - reference_enu_m)
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
 
@@ -563,5 +563,5 @@ class Pilot:
 
     def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
         """Return True if a position (3,), possibly corrupted, is near enough to begin a plan."""
-        distance_m = float(np.linalg.norm(place_enu_m - state.position_enu_m))
+        distance_m = norm(place_enu_m - state.position_enu_m)
         return distance_m <= self.params.start_error_max_m

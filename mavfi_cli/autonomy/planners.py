@@ -27,6 +27,7 @@ from mavfi_cli.autonomy.grid import GridTooLarge, ObstacleGrid, segment_free
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.installed import PlugIns
 from mavfi_cli.core.types import FloatArray, Trajectory
 
@@ -180,7 +181,7 @@ def _subdivided(path_enu_m: FloatArray, spacing_m: float) -> FloatArray:
     """Subdivide a path into vertices (m, 3) at most `spacing_m` apart."""
     pieces = [path_enu_m[:1]]
     for start, end in itertools.pairwise(path_enu_m):
-        count = max(1, int(np.ceil(np.linalg.norm(end - start) / spacing_m)))
+        count = max(1, math.ceil(norm(end - start) / spacing_m))
         shares = np.arange(1, count + 1)[:, None] / count
         pieces.append(start + shares * (end - start))
     return np.vstack(pieces)

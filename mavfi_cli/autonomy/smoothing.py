@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from mavfi_cli.autonomy.grid import ObstacleGrid
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.core.frames import wrap_angle
+from mavfi_cli.core.frames import norm, wrap_angle
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 SHORTEST_M = 0.3  # minimum horizontal distance that defines a direction
@@ -83,7 +83,7 @@ def smooth(
     path = np.asarray(path_enu_m, np.float64)
     vertices, free = _with_run_out(path, velocity, grid, params)
     line, period, a = _Polyline(vertices, params), params.sample_period_s, params.acceleration_mps2
-    speed = float(np.linalg.norm(velocity))
+    speed = norm(velocity)
     before = path[0] - 0.5 * period * velocity
     # squared speeds that cut each corner by `corner_cut_m` at most
     caps = 2.0 * a * params.corner_cut_m / np.maximum(line.half_sines, 1e-6) ** 2
@@ -107,7 +107,7 @@ def _cut(velocity: FloatArray, limit: float) -> FloatArray:
     largest = float(np.abs(velocity).max())
     if not np.isfinite(velocity).all() or largest == 0.0:
         return np.zeros(3)
-    speed = largest * float(np.linalg.norm(velocity / largest))
+    speed = largest * norm(velocity / largest)
     if speed < NEGLIGIBLE_MPS:
         return np.zeros(3)
     return velocity if speed <= limit else velocity / largest * (limit * largest / speed)
@@ -122,7 +122,7 @@ def _with_run_out(
     path leads to the farthest path vertex in line of sight, or back to the start of the path if
     none is in sight.
     """
-    speed = float(np.linalg.norm(velocity))
+    speed = norm(velocity)
     if speed == 0.0:
         return path, True
     begin = path[0] + 0.5 * params.sample_period_s * velocity
@@ -141,7 +141,7 @@ class _Polyline:
     def __init__(self, path: FloatArray, params: SmoothingParams) -> None:
         kept = [path[0]]
         for vertex in path[1:]:
-            if np.linalg.norm(vertex - kept[-1]) > 1e-3:
+            if norm(vertex - kept[-1]) > 1e-3:
                 kept.append(vertex)
         self.vertices = np.array(kept)  # (n, 3)
         steps = np.diff(self.vertices, axis=0)
@@ -295,7 +295,7 @@ def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _
         if i + 1 < len(line.directions):
             if q[i + 1] > 0.0:
                 turn = speeds[i + 1] * (line.directions[i + 1] - direction)
-                lasting = float(np.linalg.norm(turn)) / a
+                lasting = norm(turn) / a
                 if lasting > 0.0:
                     found.add(lasting, speeds[i + 1] * direction, turn / lasting, i + 1)
             else:

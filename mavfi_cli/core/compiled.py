@@ -1,8 +1,14 @@
-"""Compile Python functions with numba, which is imported on first use only."""
+"""Compile Python functions with numba, which is imported on first use only.
+
+The machine code is that of x86-64-v3 on every processor that has it. An instruction-level fault
+then strikes the same instruction on a processor with AVX-512 and on one without.
+"""
 
 from __future__ import annotations
 
+import functools
 import inspect
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +19,13 @@ from mavfi_cli.core.files import folder_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
 _BLAS = "scipy.linalg.cython_blas"
+_LEVELS = {  # what each level of x86-64 adds, as Linux names it: System V ABI, section 3.1.1
+    "x86-64-v2": "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3",
+    "x86-64-v3": "abm avx avx2 bmi1 bmi2 f16c fma movbe xsave",
+    "x86-64-v4": "avx512f avx512bw avx512cd avx512dq avx512vl",
+}
+TARGET = "x86-64-v3"
+"""Level of x86-64 that kernels are compiled for."""
 
 
 def compiled(function: F) -> F:
@@ -35,6 +48,22 @@ def compiled(function: F) -> F:
     return kernel
 
 
+@functools.cache
+def processor_level() -> str:
+    """Return the level of x86-64 that this processor has, such as "x86-64-v3", or "" if unknown."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    flags = next((line.split(":")[1].split() for line in lines if line.startswith("flags")), [])
+    level = "x86-64" if "lm" in flags else ""
+    for name, added in _LEVELS.items():
+        if not level or not {*added.split()} <= {*flags}:
+            break
+        level = name
+    return level
+
+
 def in_cache(kernel: Callable[..., Any]) -> bool:
     """Return True if a call of a compiled function would load its machine code from disk.
 
@@ -49,6 +78,8 @@ def _numba() -> Any:
     choose_caches()  # before numba reads the environment
     import numba
 
+    if "NUMBA_CPU_NAME" not in os.environ and processor_level() >= TARGET:
+        numba.config.CPU_NAME, numba.config.CPU_FEATURES = TARGET, ""
     if "numba.np.arraymath" not in sys.modules and _BLAS not in sys.modules:
         sys.modules[_BLAS] = None  # type: ignore[assignment]  # makes its import fail
         try:

@@ -25,6 +25,31 @@ def is_within(limit: float, values: Iterable[float]) -> bool:
     return all(abs(value) <= limit for value in values)
 
 
+def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
+    """Return the scalar product of two vectors (n,), added up in their order.
+
+    numpy gives `@`, `dot` and `linalg.norm` to BLAS, whose last digit depends on the processor.
+    """
+    total = 0.0
+    for x, y in zip(_floats(a), _floats(b), strict=True):
+        total += x * y
+    return total
+
+
+def norm(vector: Vector | Sequence[float]) -> float:
+    """Return the Euclidean length of a vector (n,)."""
+    return math.sqrt(dot(vector, vector))
+
+
+def rotate(rotation: Vector, vector: Vector | Sequence[float]) -> Vector:
+    """Return rotation @ vector, (3,), of a matrix (3, 3) and a vector (3,)."""
+    return np.array([dot(row, vector) for row in rotation])
+
+
+def _floats(vector: Vector | Sequence[float]) -> Sequence[float]:
+    return vector.tolist() if isinstance(vector, np.ndarray) else vector
+
+
 def enu_from_ned(vector: Vector) -> Vector:
     """Convert NED components (..., 3), in any unit, to ENU components (..., 3), or back."""
     swapped = vector[..., [1, 0, 2]].copy()

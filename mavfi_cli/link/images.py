@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.core.frames import rotation_matrix
+from mavfi_cli.core.frames import rotate, rotation_matrix
 from mavfi_cli.core.types import DepthFrame, FloatArray, VehicleState
 from mavfi_cli.link.codec import Message, dialect
 
@@ -58,7 +58,7 @@ class ImageFrame:
         The state is that at the image's stamp. The field of view is used if the image has none. The
         offset (3,) is that of the optical centre; the camera looks along the vehicle's x axis.
         """
-        offset_m = rotation_matrix(state.quaternion) @ np.asarray(mount_offset_flu_m, np.float64)
+        offset_m = rotate(rotation_matrix(state.quaternion), mount_offset_flu_m)
         return DepthFrame(
             stamp_s=self.stamp_s,
             depth_m=_DEPTH_M.take(self.pixels),

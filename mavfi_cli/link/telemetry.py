@@ -21,8 +21,10 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.frames import (
     FARTHEST_M,
     FASTEST_MPS,
+    dot,
     flu_enu_from_frd_ned,
     is_within,
+    norm,
     quaternion_from_euler,
     yaw_from_quaternion,
 )
@@ -111,10 +113,10 @@ class _StateHistory:
 def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
     """Interpolate position and velocity linearly, the quaternion by normalised shortest lerp."""
     share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
-    sign = -1.0 if float(np.dot(before.quaternion, after.quaternion)) < 0.0 else 1.0
+    sign = -1.0 if dot(before.quaternion, after.quaternion) < 0.0 else 1.0
     quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion
-    norm = float(np.linalg.norm(quaternion))
-    quaternion = quaternion / norm if norm > 0.0 else before.quaternion
+    length = norm(quaternion)
+    quaternion = quaternion / length if length > 0.0 else before.quaternion
     return VehicleState(
         stamp_s=stamp_s,
         position_enu_m=(1.0 - share) * before.position_enu_m + share * after.position_enu_m,

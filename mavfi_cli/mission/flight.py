@@ -26,6 +26,7 @@ from mavfi_cli.core.errors import (
     LinkLost,
     NoAutopilot,
 )
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.link.codec import dialect
@@ -195,7 +196,7 @@ class Flight:
             protection = Protection(config.detector, config.stack, self.wall)
         if config.fault is not None:
             takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, config.takeoff_height_m))
-            way_m = float(np.linalg.norm(briefing.goal_enu_m - takeoff))
+            way_m = norm(briefing.goal_enu_m - takeoff)
             way_m = max(0.0, way_m - self.stack.goal_tolerance_m)
             turn_s = TURN_S if self.stack.turns_before_departure else 0.0
             shortest_s = way_m / config.v_max_mps + turn_s  # no flight takes less

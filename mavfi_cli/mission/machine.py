@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mavfi_cli.core.compiled import TARGET, processor_level
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
@@ -107,8 +108,11 @@ def _processor() -> Check:
         remedy = "wheels exist for Linux on x86-64"
     elif machine == "aarch64":
         remedy = "jsbsim and pyoctomap have no wheel here: build them"
+    level = processor_level()
+    if machine == "x86_64" and not level >= TARGET:
+        remedy = f"records are equal from {TARGET} up: compare with flights of this computer only"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    found = f"{system} {machine}, {cores} core{'s' if cores != 1 else ''} usable"
+    found = f"{system} {level or machine}, {cores} core{'s' if cores != 1 else ''} usable"
     return _check("Processor", found, remedy=remedy)
 
 

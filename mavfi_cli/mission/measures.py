@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.fi import bits
 from mavfi_cli.spec.platform import KERNELS
@@ -54,7 +55,7 @@ def quality_of(
         "distance_m": distance_m,
         "mean_speed_mps": distance_m / flight_time_s,
         "max_speed_mps": float(np.linalg.norm(flown["velocity_enu_mps"], axis=1).max()),
-        "goal_distance_m": float(np.linalg.norm(positions[-1] - goal_enu_m)),
+        "goal_distance_m": norm(positions[-1] - goal_enu_m),
     }
     if "clearance_m" in flown:
         found["min_clearance_m"] = float(flown["clearance_m"].min())

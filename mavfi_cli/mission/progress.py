@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mavfi_cli.autonomy.pilot import PilotMode
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 
@@ -118,15 +117,13 @@ class FlightLogger:
         if state is not None and stamp_s >= self._next_progress_s:
             self._next_progress_s = stamp_s + _PROGRESS_EVERY_S
             pilot = None if companion is None else companion.pilot
-            goal_m = (
-                None if pilot is None else np.linalg.norm(state.position_enu_m - pilot.goal_enu_m)
-            )
+            goal_m = None if pilot is None else norm(state.position_enu_m - pilot.goal_enu_m)
             self._watcher.on_progress(
                 FlightProgress(
                     stamp_s=stamp_s,
                     phase=pilot.mode.value if pilot and phase is Phase.OFFBOARD else phase.value,
-                    speed_mps=float(np.linalg.norm(state.velocity_enu_mps)),
-                    goal_distance_m=None if goal_m is None else float(goal_m),
+                    speed_mps=norm(state.velocity_enu_mps),
+                    goal_distance_m=goal_m,
                     replans=0 if pilot is None else pilot.counters.replans,
                 )
             )

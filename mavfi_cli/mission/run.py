@@ -21,6 +21,7 @@ from mavfi_cli.autonomy import planners, warm
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import Protection
+from mavfi_cli.core.compiled import processor_level
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import (
     ScratchFolder,
@@ -157,6 +158,7 @@ def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dic
     walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": told.get("stage_wall_s")}
     return {
         "machine": host_platform.machine(),
+        "level": processor_level(),
         "cores": os.cpu_count(),
         "isolated": list(config.isolate),
         "memory_mb": {

@@ -11,6 +11,7 @@ import numpy as np
 
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, FloatArray
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
@@ -284,11 +285,11 @@ class MissionConfig:
         start, goal = briefing.start_enu_m, briefing.goal_enu_m
         takeoff = np.add(start, (0.0, 0.0, self.takeoff_height_m))
         problem = ""
-        if float(np.linalg.norm(goal - takeoff)) <= tolerance_m:
+        if norm(goal - takeoff) <= tolerance_m:
             problem = f"is within {tolerance_m:g} m of the take-off point"
         elif not LOWEST_M <= float(goal[2]) <= HIGHEST_M:
             problem = f"is {goal[2]:g} m high; flight levels are {LOWEST_M:g} to {HIGHEST_M:g} m"
-        elif float(np.linalg.norm(goal[:2] - start[:2])) > FARTHEST_M:
+        elif norm(goal[:2] - start[:2]) > FARTHEST_M:
             problem = f"is farther than {FARTHEST_M:g} m away"
         if problem:
             raise ConfigError(f"the goal {problem}", key="goal")

@@ -18,6 +18,7 @@ from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.core.errors import ConfigError, LinkLost, ModelError
+from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import FloatArray, Stage
 from mavfi_cli.detect import base
 from mavfi_cli.detect.base import Detector, FittedDetector
@@ -245,7 +246,7 @@ def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
     tree = fcl.CollisionObject(fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes()))
     smallest = np.inf
     for start, end in itertools.pairwise(path):
-        steps = max(2, int(np.linalg.norm(end - start) / 0.05))
+        steps = max(2, int(norm(end - start) / 0.05))
         for share in np.linspace(0, 1, steps):
             point = fcl.Transform(start + share * (end - start))
             probe = fcl.CollisionObject(fcl.Sphere(1e-3), point)

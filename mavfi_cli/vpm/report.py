@@ -39,7 +39,7 @@ RATIOS = {
     "energy_ratio": "energy_j",
     "missions_ratio": "missions",
 }
-_CURVE_HZ = np.logspace(-1.0, 3.0, 161)
+_CURVE_HZ = np.array([10.0**exponent for exponent in np.linspace(-1.0, 3.0, 161).tolist()])
 _COMMAND = "command line"
 _FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # units of what a calibration sets
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, dot, norm
 from sitl.autopilot.commander import FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.telemetry import Setpoint, Snapshot
@@ -47,7 +47,7 @@ def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> V
 
     It is the minimum of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
     """
-    distance = math.sqrt(float(delta @ delta))
+    distance = norm(delta)
     if distance < 1e-6:
         return np.zeros_like(delta)
     stopping = math.sqrt(acceleration_mps2 * distance)
@@ -79,7 +79,7 @@ class _Anchor:
         axes = self._axes
         if self._place is None:
             velocity = now.truth.velocity_ned_mps[axes]
-            if float(velocity @ velocity) > _STOPPED_MPS**2:
+            if dot(velocity, velocity) > _STOPPED_MPS**2:
                 out[3:6][axes] = 0.0
                 return
             self._place = np.array(now.truth.position_ned_m[axes])
@@ -94,7 +94,7 @@ def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guid
         out[9] = yaw_rad
         if target_ned_m is not None:
             delta = target_ned_m - now.truth.position_ned_m
-            if float(delta @ delta) > _ARRIVED_M**2:
+            if dot(delta, delta) > _ARRIVED_M**2:
                 _go(now, out, delta)
                 return
         anchor.hold(now, out)

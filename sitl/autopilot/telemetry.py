@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.frames import Vector, rotation_matrix
+from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
 from sitl.autopilot.commander import Commander, FlightMode
 from sitl.autopilot.parameters import Parameters
@@ -85,8 +85,7 @@ class Snapshot:
 
     def in_body(self, vector_ned: Vector) -> Vector:
         """Turn a vector (3,) from NED into the body's FRD."""
-        turned: Vector = rotation_matrix(self.truth.quaternion_frd_ned).T @ vector_ned
-        return turned
+        return rotate(rotation_matrix(self.truth.quaternion_frd_ned).T, vector_ned)
 
     @property
     def thrust(self) -> float:

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned, rotation_matrix
+from mavfi_cli.core.frames import (
+    Vector,
+    enu_from_ned,
+    flu_enu_from_frd_ned,
+    rotate,
+    rotation_matrix,
+)
 from mavfi_cli.link.codec import Message, dialect
 from sitl.autopilot.telemetry import int32
 from sitl.camera.depth import render_depth
@@ -141,7 +147,7 @@ class Camera:
         beats = self._heartbeat is not None and self._heartbeat.due(stamp_s)
         due = [_heartbeat()] if beats else []
         if self._frames is not None and self._frames.due(stamp_s):
-            offset_m = rotation_matrix(quaternion_flu_enu) @ self.mount_offset_flu_m
+            offset_m = rotate(rotation_matrix(quaternion_flu_enu), self.mount_offset_flu_m)
             due += self._take_frame(position_enu_m + offset_m, quaternion_flu_enu)
         return due
 

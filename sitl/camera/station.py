@@ -19,6 +19,7 @@ from mavfi_cli.core.frames import (
     enu_from_ned,
     flu_enu_from_frd_ned,
     is_within,
+    norm,
     quaternion_from_euler,
 )
 from mavfi_cli.link.codec import Codec, Signing, dialect, text_messages
@@ -139,7 +140,7 @@ class PoseTracker:
             quaternion = quaternion_from_euler(*angles)
         else:
             return None
-        length = float(np.linalg.norm(quaternion))
+        length = norm(quaternion)
         return quaternion / length if math.isfinite(length) and length > 0.5 else None
 
     def pose(self) -> tuple[float, Vector, Vector, Vector]:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector, rotation_matrix
+from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.vehicle import Truth
@@ -54,12 +54,12 @@ class Sensors:
         noise = self._noise.standard_normal(6)
         rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
         felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
-        force: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ felt_ned
+        force = rotate(rotation_matrix(truth.quaternion_frd_ned).T, felt_ned)
         return rates, force + ACCELEROMETER_MPS2 * noise[3:]
 
     def magnetic_field(self, truth: Truth) -> Vector:
         """Return the magnetic field (3,), body FRD, gauss."""
-        field: Vector = rotation_matrix(truth.quaternion_frd_ned).T @ FIELD_NED_GAUSS
+        field = rotate(rotation_matrix(truth.quaternion_frd_ned).T, FIELD_NED_GAUSS)
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
     def barometer(self, truth: Truth) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, dot
 from sitl.vehicle import cascade
 from sitl.vehicle.cascade import THRUST_RESERVE
 from sitl.vehicle.physics import INFLOW_SLOPE
@@ -142,7 +142,7 @@ class RateLoops:
             yaw_nm=thrust_n * float(gains[cascade.G_TORQUE_PER_THRUST]),
             tilt_p=float(gains[cascade.G_TILT_P]) * _REDUCED,
             hover_share=profile.total_mass_kg * GRAVITY_MPS2 / thrust_n,
-            curve=float(bend @ (shares - commands) / (bend @ bend)),  # fitted by least squares
+            curve=dot(bend, shares - commands) / dot(bend, bend),  # fitted by least squares
         )
 
     def parameters(

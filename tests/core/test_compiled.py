@@ -1,7 +1,13 @@
 """The cache of machine code: used when nothing changed, dropped when a callee did."""
 
+import platform
 import subprocess
 import sys
+
+import numpy as np
+import pytest
+
+from mavfi_cli.core.compiled import TARGET, compiled, processor_level
 
 CALLEE = (
     "from mavfi_cli.core.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
@@ -32,3 +38,23 @@ def test_an_edited_callee_is_compiled_anew(tmp_path, monkeypatch):
     assert run() == ["2.0", "1", "True"]
     (tmp_path / "callee_module.py").write_text(CALLEE.format(5.0))
     assert run() == ["6.0", "0", "False"]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="levels are those of x86-64")
+def test_the_level_of_the_processor_agrees_with_numpy():
+    features = np._core._multiarray_umath.__cpu_features__
+    assert (processor_level() >= "x86-64-v3") == (features["AVX2"] and features["FMA3"])
+    assert (processor_level() == "x86-64-v4") == features["AVX512_SKX"]
+
+
+@pytest.mark.skipif(processor_level() < TARGET, reason="kernels are compiled for the processor")
+def test_kernels_have_the_same_instructions_on_every_processor():
+    @compiled
+    def scale(values, factor):
+        for i in range(len(values)):
+            values[i] *= factor
+
+    scale(np.ones(64), 2.0)
+    code = "".join(scale.inspect_asm().values())
+    assert "ymm" in code
+    assert "zmm" not in code

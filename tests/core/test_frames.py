@@ -57,3 +57,15 @@ def test_quaternion_change_of_frames_equals_rotating_in_ned(roll, pitch, yaw, bo
 def test_yaw_of_a_quaternion(roll, pitch, yaw):
     quaternion = frames.quaternion_from_euler(roll, pitch, yaw)
     assert frames.yaw_from_quaternion(quaternion) == pytest.approx(yaw, abs=1e-9)
+
+
+def test_sums_of_products_are_added_in_their_order():
+    a, b = np.array([1e16, 1.0, -1e16]), np.array([1.0, 1.0, 1.0])
+    assert frames.dot(a, b) == frames.dot([*a], b) == (1e16 + 1.0) - 1e16 == 0.0
+    assert frames.norm(np.array([3.0, 4.0])) == 5.0
+    assert frames.norm(np.array([np.inf, 0.0])) == np.inf
+    assert np.isnan(frames.norm(np.array([np.nan, 0.0])))
+    turn = frames.rotation_matrix(frames.quaternion_from_euler(0.1, -0.2, 2.0))
+    np.testing.assert_allclose(frames.rotate(turn, a), turn @ a, rtol=1e-14)
+    with pytest.raises(ValueError, match="shorter"):
+        frames.dot(a, b[:2])

@@ -21,7 +21,7 @@ from typing import Any
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.tracer.registers import FLAG_BITS, GENERAL, widest_vector
+from mavfi_cli.fi.tracer.registers import FLAG_BITS, GENERAL
 from mavfi_cli.fi.tracer.vectors import (
     ALL,
     VECTOR,
@@ -231,11 +231,14 @@ _GENERAL = _general_names()
 
 @functools.cache
 def _named(name: str) -> _Named | None:
-    """None for flags, which are named bit by bit, and for segments and control words."""
+    """None for flags, which are named bit by bit, and for segments and control words.
+
+    A vector register has its 512-bit name on every processor, so that records are equal.
+    """
     if name in _GENERAL:
         return _GENERAL[name]
     if match := VECTOR.match(name):
-        return _Named(f"{widest_vector()}{match[2]}", 0, {"x": 128, "y": 256, "z": 512}[match[1]])
+        return _Named(f"zmm{match[2]}", 0, {"x": 128, "y": 256, "z": 512}[match[1]])
     if match := _X87.match(name):
         return _Named(f"st{match[1]}", 0, 80)
     return _Named(name, 0, 64) if re.match(r"(k|mm)\d$", name) else None
@@ -452,6 +455,7 @@ _LACKING_READS = {
     **dict.fromkeys(("rcl", "rcr", "cmc"), ("cf",)), "lahf": ("cf", "pf", "af", "zf", "sf"),
 }  # fmt: skip
 _LACKING_WRITES = {**dict.fromkeys(("lzcnt", "tzcnt", "cmc"), ("cf",))}
+_UNDEFINED = {"imul": ("sf",)}  # Intel writes it, AMD keeps it
 _HOW = ("TEST", "MODIFY", "RESET", "SET", "UNDEFINED")
 _FLAGS = {
     (name, how): getattr(x86, f"X86_EFLAGS_{how}_{name.upper()}", 0)
@@ -477,5 +481,6 @@ def _flags(found: Any, all_of: _Operands, vector: bool) -> None:
         if "TEST" in how or name in _LACKING_READS.get(mnemonic, ()):
             all_of.flag(name, reads=True, defined=True, clears=False)
         if how - {"TEST"} or name in _LACKING_WRITES.get(mnemonic, ()):
-            defined = "UNDEFINED" not in how or name in _LACKING_WRITES.get(mnemonic, ())
+            undefined = "UNDEFINED" in how or name in _UNDEFINED.get(mnemonic, ())
+            defined = not undefined or name in _LACKING_WRITES.get(mnemonic, ())
             all_of.flag(name, reads=False, defined=defined, clears=not by_count)

@@ -104,15 +104,16 @@ def width_of(name: str) -> int:
 
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:
+    """The parts of a vector register that this processor has."""
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
     offsets = _xsave_offsets()
     if index >= 16:
         base = offsets[ZMM_UPPER] + 64 * index - 1024
         return [_Span(ZMM_UPPER, base, {"xmm": 16, "ymm": 32, "zmm": 64}[kind])]
     spans = [_Span(SSE, 160 + 16 * index, 16)]
-    if parts > 1:
+    if parts > 1 and AVX in offsets:
         spans.append(_Span(AVX, offsets[AVX] + 16 * index, 16))
-    if parts > 2:
+    if parts > 2 and ZMM_HIGH in offsets:
         spans.append(_Span(ZMM_HIGH, offsets[ZMM_HIGH] + 32 * index, 32))
     return spans
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import signal
 import struct
 
@@ -21,17 +22,23 @@ from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.registers import (
     _SLOT,
+    AVX,
     FLAGS,
     GENERAL,
     NT_PRSTATUS,
     NT_X86_XSTATE,
+    OPMASK,
     XSTATE_BV,
+    ZMM_HIGH,
+    ZMM_UPPER,
     Registers,
+    _xsave_offsets,
 )
 
 WINDOW = 4096
 WORDS = 27
-NAMES = [*GENERAL, "rflags", *(n for n in all_registers() if n[0] in "xyzk" or n[:2] == "st")]
+_WIDE = (n for n in all_registers() if n[0] in "xyzk" or n[:2] == "st")
+NAMES = [*GENERAL, "rflags", *(re.sub("^[xy]mm", "zmm", name) for name in _WIDE)]
 
 
 class Probe:
@@ -49,8 +56,10 @@ class Probe:
         self.start = self.target - WINDOW // 2
         self.words = list(self.registers.general())
         self.area = bytearray(self.registers.extended())
-        # All components are in use, so that the kernel takes every value.
-        present = int.from_bytes(self.area[XSTATE_BV : XSTATE_BV + 8], "little") | 0b1110_0111
+        # All components that there are are in use, so that the kernel takes every value.
+        present = int.from_bytes(self.area[XSTATE_BV : XSTATE_BV + 8], "little") | 0b11
+        for component in _xsave_offsets().keys() & {AVX, OPMASK, ZMM_HIGH, ZMM_UPPER}:
+            present |= 1 << component
         self.area[XSTATE_BV : XSTATE_BV + 8] = present.to_bytes(8, "little")
         self.area_at = 64 * WORDS
         self.memory_at = self.area_at + 8 * len(self.area)
@@ -249,7 +258,8 @@ def with_immediate(code, rng):
     found = _disassembled(code)
     if not found.imm_offset or rng.random() < 0.3:
         return code
-    low = int(rng.integers(1, 16)) | int(rng.integers(0, 16)) << 4
+    low, high = int(rng.integers(1, 16)), int(rng.integers(0, 16))
+    low |= high << 4 if rng.random() < 0.5 else 0  # a small one shifts hardly anything out
     value = bytes([low]) + rng.bytes(found.imm_size - 1)
     return code[: found.imm_offset] + value + code[found.imm_offset + found.imm_size :]
 

@@ -18,8 +18,9 @@ if pytest.importorskip("platform").machine() != "x86_64":
 import masks
 import probe
 
+from mavfi_cli.fi.tracer.registers import widest_vector
+
 FOLDER = Path(__file__).parent
-ILLEGAL = 4  # SIGILL: this processor lacks the instruction
 ANY = (1 << 512) - 1
 SIGNS_32, SIGNS_16 = (sum(1 << bit for bit in range(n - 1, 512, n)) for n in (32, 16))
 EDGES = sum(1 << bit | 1 << bit + 15 for bit in range(0, 512, 16))
@@ -54,11 +55,19 @@ NEVER_WRITTEN = [
 
 
 def forms(name):
-    lines = (FOLDER / name).read_text().splitlines()
-    return [bytes.fromhex(line.split()[0]) for line in lines if not line.startswith("#")]
+    """The opcodes of a list: of AVX-512, and all others."""
+    codes = {True: [], False: []}
+    for line in (FOLDER / name).read_text().splitlines():
+        if not line.startswith("#"):
+            code = bytes.fromhex(line.split()[0])
+            text = probe.decoded(code, 0).text
+            codes[code[0] == EVEX or bool(re.search(r"\bk[0-7]\b", text))].append(code)
+    return codes[True], codes[False]
 
 
-KERNELS, OTHERS = forms("kernel_opcodes.txt"), forms("other_opcodes.txt")
+EVEX = 0x62
+(_, KERNELS), (_, OTHERS) = LISTS = forms("kernel_opcodes.txt"), forms("other_opcodes.txt")
+AVX512 = [*LISTS[0][0], *LISTS[1][0]]
 FEW = KERNELS[::16]
 PARTS = 8
 
@@ -81,8 +90,6 @@ def disagreements(start, codes):
     place, found = probe.Probe(start("probe")), []
     for code in codes:
         verdict = masks.check(place, code)
-        if not verdict.states and verdict.raised == {ILLEGAL}:
-            continue
         unread = {} if twice(verdict.text) else verdict.never_read
         odd = (
             verdict.wrong,
@@ -96,6 +103,13 @@ def disagreements(start, codes):
 
 def test_masks_of_some_opcodes_agree_with_execution(start):
     assert disagreements(start, FEW) == []
+
+
+@pytest.mark.skipif(widest_vector() != "zmm", reason="this processor has no AVX-512")
+@pytest.mark.parametrize("code", AVX512, ids=lambda code: probe.decoded(code, 0).text)
+@pytest.mark.slow
+def test_masks_of_an_opcode_of_avx512_agree_with_execution(start, code):
+    assert disagreements(start, [code]) == []
 
 
 @pytest.mark.slow
