@@ -189,11 +189,10 @@ def by_processor(module):
         for node in ast.walk(each)
     ]
     for node in ast.walk(tree(module)):
-        text = ast.unparse(node) if isinstance(node, ast.Call | ast.BinOp) else ""
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
-            yield text
-        elif isinstance(node, ast.Call) and node not in inside and BY_PROCESSOR.match(text):
-            yield text
+        called = ast.unparse(node) if isinstance(node, ast.Call) and node not in inside else ""
+        product = isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)
+        if product or BY_PROCESSOR.match(called):
+            yield ast.unparse(node)
 
 
 def test_no_last_digit_of_a_mission_depends_on_the_processor():

@@ -15,7 +15,7 @@ from probe import NAMES, WINDOW, decoded, random_state, relocated, with_immediat
 
 from mavfi_cli.fi.tracer.registers import FLAG_BITS, FLAGS
 
-STATES, AT_LEAST, ATTEMPTS = 500, 4, 5000
+STATES, AT_LEAST, ATTEMPTS = 400, 4, 4000
 _EVERY = (1 << 512) - 1
 # Their masks do not follow the immediate: masking by a value is no matter of operands.
 _ANY_IMMEDIATE = re.compile(

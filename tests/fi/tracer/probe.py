@@ -37,6 +37,7 @@ from mavfi_cli.fi.tracer.registers import (
 
 WINDOW = 4096
 WORDS = 27
+EDGES = np.array([0, *((1 << 64) - 1 >> n for n in range(3)), 1 << 62, 1 << 63], np.uint64)
 _WIDE = (n for n in all_registers() if n[0] in "xyzk" or n[:2] == "st")
 NAMES = [*GENERAL, "rflags", *(re.sub("^[xy]mm", "zmm", name) for name in _WIDE)]
 
@@ -181,6 +182,8 @@ def _general(rng, count):
         values[:] = 0
     elif kind == 6:
         values = ~np.uint64(0) >> shifts
+    elif kind == 7:
+        values = rng.choice(EDGES, count)
     return values
 
 
@@ -258,8 +261,9 @@ def with_immediate(code, rng):
     found = _disassembled(code)
     if not found.imm_offset or rng.random() < 0.3:
         return code
-    low, high = int(rng.integers(1, 16)), int(rng.integers(0, 16))
-    low |= high << 4 if rng.random() < 0.5 else 0  # a small one shifts hardly anything out
+    small, any_high = int(rng.integers(1, 16)), int(rng.integers(0, 16)) << 4
+    # A small one shifts hardly anything out, the longest ones nearly everything.
+    low = int(rng.choice([small, small | any_high, 31, 63]))
     value = bytes([low]) + rng.bytes(found.imm_size - 1)
     return code[: found.imm_offset] + value + code[found.imm_offset + found.imm_size :]
 
