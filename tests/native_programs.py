@@ -31,6 +31,17 @@ int main(int c, char **v) {
     printf("%ld %.17g\\n", sink, sum);
     return 0;
 }""",
+    # For -nostdlib -static: no object of it has writable data.
+    "bare": """
+static void call(long number, long a, long b, long c) {
+    __asm__ volatile("syscall" : "+a"(number) : "D"(a), "S"(b), "d"(c) : "rcx", "r11", "memory");
+}
+void _start(void) {
+    unsigned long x = 88172645463325252UL;
+    for (int i = 0; i < 3000; i++) { x ^= x << 13; x ^= x >> 7; x ^= x << 17; }
+    call(1, 1, (long) &x, 8);
+    call(60, 0, 0, 0);
+}""",
     # Each way in which a detour moves an instruction: relative to rip, jumps, calls, repeated ones,
     # and blocks that are too short for a long jump.
     "flows": r"""

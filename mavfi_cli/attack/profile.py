@@ -27,8 +27,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.attack.callgrind import UNNAMED, Executions
 from mavfi_cli.attack.target import AttackPlace, Watch
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
@@ -39,6 +41,11 @@ from mavfi_cli.stats.shares import Interval, estimated_total
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _NOTHING = "executes nothing that may be hit"
+_UNNAMED = (
+    "executes code that callgrind cannot name: its object has no writable data in its file, and is "
+    "loaded anywhere; link it at a fixed address (-no-pie), or name a function"
+)
+_COOL = 64  # an instruction that is executed at most this many times less often than the hottest
 _CHECKED = 4  # instructions whose counts are checked, besides the most executed
 _DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
 Guard = Callable[[Tracee], AbstractContextManager[object]]
@@ -264,7 +271,7 @@ def profile_calls(
 def profile_counted(
     place: AttackPlace,
     rng: np.random.Generator,
-    counts: Callable[[Sequence[str]], Mapping[str, Mapping[int, int]]],
+    counts: Executions,
     begun: float,
 ) -> TargetProfile:
     """The profile of a whole run whose executions have been counted.
@@ -272,26 +279,60 @@ def profile_counted(
     Some counts are checked in runs of the place: the largest, and others in proportion to them.
 
     Args:
-        counts: function from the paths of objects to the executions of each linked address.
+        counts: the executions of the run.
         begun: when the counting began, `time.perf_counter`.
 
     Raises:
         TargetError: no instruction in scope executes, or one more or less often than counted.
     """
-    image, code, scope = _code(place)
-    objects = {each.path: each for each in map(image.named, scope.objects) if each.path is not None}
-    executions = {
-        objects[path].bias + offset: count
-        for path, found in counts(list(objects)).items()
-        for offset, count in found.items()
-        if objects[path].bias + offset in scope
-    }
-    if not executions:
-        raise TargetError(place.name, _NOTHING)
-    run = CountedRun.of(executions, lambda address: _code_of(code, address))
+    run, image, code = _counted(place, counts)
+    if not run.executed:
+        raise TargetError(place.name, _UNNAMED)
     cost_s = time.perf_counter() - begun
     _require_counts(place, run, image, rng)
     return TargetProfile(counted=run, image=image, code=code, cost_s=cost_s)
+
+
+def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
+    """CPU time of a native run until it has executed as much as has been counted, s.
+
+    Args:
+        counts: the executions in a part of the run, from its beginning.
+
+    Returns:
+        None if nothing in scope has been counted yet, or the run does not execute as much.
+    """
+    run, image, _ = _counted(place, counts)
+    if not run.executed:
+        return None
+    # A detour at the hottest instruction would slow the run down.
+    cool = np.where(run.reached * _COOL <= run.reached.max(), run.reached, 0)
+    index = int(np.argmax(cool if cool.max() >= _COOL else run.reached))
+    with started(place) as tracee:
+        begun_s = linux.cpu_time_s(tracee.pid)
+        for stage in run.stages(index, int(run.reached[index]), image.locate):
+            if not tracee.run_to(image.address(stage.location), stage.count, stage.detour):
+                return None
+        return linux.cpu_time_s(tracee.pid) - begun_s
+
+
+def _counted(
+    place: AttackPlace, counts: Executions
+) -> tuple[CountedRun, Image, tuple[tuple[int, bytes], ...]]:
+    """The executions in scope, in a native run."""
+    image, code, scope = _code(place)
+    objects = {each.path: each.bias for each in map(image.named, scope.objects) if each.path}
+    # Valgrind names the code of an object only if a file is mapped to its writable data. The code
+    # of another one lies where it was linked, or else nobody knows where.
+    biases = objects | {UNNAMED: 0}
+    executions = {
+        biases[path] + offset: count
+        for path, found in counts.items()
+        if path in biases
+        for offset, count in found.items()
+        if biases[path] + offset in scope
+    }
+    return CountedRun.of(executions, lambda address: _code_of(code, address)), image, code
 
 
 def _require_counts(

@@ -8,13 +8,10 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
-import shutil
 import signal
 import stat
-import subprocess
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +19,12 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.callgrind import Executions, count_executions, find_valgrind
 from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison
 from mavfi_cli.attack.profile import (
     TargetProfile,
     function_of,
+    native_time_s,
     profile_calls,
     profile_counted,
     profile_run,
@@ -235,7 +234,7 @@ class _Workplace:
                 self, rng, [function_of(self, function)], windows=windows, limit=limit,
                 watch=watch, guard=self._guard,
             )  # fmt: skip
-        if _callgrind() is None:
+        if find_valgrind() is None:
             return profile_run(self, rng, limit=limit, watch=watch, guard=self._guard)
         try:
             short = min(limit, _SHORT)
@@ -258,14 +257,17 @@ class _Workplace:
         """Count the executions of a whole run by callgrind, and check some of them."""
         begun = time.perf_counter()
         self._folder.renew()
-        code = _run_counted(
+        code, executions = count_executions(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
-            wall_s=self._known_golden().wall_s, tell=watch or (lambda _: None),
+            golden=self._known_golden(), native_s=self._native_s, tell=watch or (lambda _: None),
         )  # fmt: skip
         self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
-        profile = profile_counted(self, rng, lambda paths: _read_counts(self._counts, paths), begun)
-        self._counts.unlink()
-        return profile
+        return profile_counted(self, rng, executions, begun)
+
+    def _native_s(self, executions: Executions) -> float | None:
+        """CPU time of a native run up to these executions, beside the run under callgrind."""
+        with contextlib.closing(self.target.open()) as other:
+            return native_time_s(other, executions)
 
     def _require_golden(self, how: str, ended: Ended) -> None:
         """Refuse a profile if the profiled run has not ended and printed as the golden run."""
@@ -413,93 +415,3 @@ def _joined(parts: dict[str, bytes | None]) -> bytes:
 def _children_cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-# -- counting by valgrind's callgrind
-
-_SLOWER = 200.0  # callgrind takes 10 to 60 times as long as the program
-_START_S = 60.0
-_TOLD_EVERY_S = 1.0
-
-
-def _callgrind() -> str | None:
-    """Path of valgrind; None if it is not installed."""
-    return shutil.which("valgrind")
-
-
-def _run_counted(
-    command: Program,
-    *,
-    stdout: Path,
-    stderr: Path,
-    counts: Path,
-    wall_s: float,
-    tell: Callable[[str], None] = lambda _: None,
-) -> int:
-    """Run a program under callgrind and return its exit code.
-
-    Args:
-        counts: file to which callgrind writes.
-        wall_s: duration of the program without it.
-        tell: called every second with how long it has been running, in words.
-
-    Raises:
-        TargetError: it does not end in time, or a signal kills it.
-    """
-    name, limit_s = Path(command.argv[0]).name, _SLOWER * wall_s + _START_S
-    tool = [
-        str(_callgrind()), "--quiet", "--tool=callgrind", "--dump-instr=yes", "--compress-pos=no",
-        "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
-        f"--callgrind-out-file={counts}", "--",
-    ]  # fmt: skip
-    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
-        process = subprocess.Popen(
-            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
-            stdin=given, stdout=out, stderr=err, start_new_session=True,
-        )  # fmt: skip
-    try:
-        code = _await_end(process, name, limit_s, tell)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-    if code < 0:
-        raise TargetError(name, f"is killed by signal {-code} under callgrind")
-    return code
-
-
-def _await_end(
-    process: subprocess.Popen[bytes], name: str, limit_s: float, tell: Callable[[str], None]
-) -> int:
-    """Wait for the exit code; tell how long it takes."""
-    begun_s = time.monotonic()
-    while (elapsed_s := time.monotonic() - begun_s) < limit_s:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            return process.wait(min(_TOLD_EVERY_S, limit_s - elapsed_s))
-        tell(f"counted by callgrind, {elapsed_s:.0f} s of at most {limit_s:.0f} s")
-    raise TargetError(name, f"has not ended under callgrind after {limit_s:.0f} s")
-
-
-def _read_counts(path: Path, objects: Iterable[str]) -> dict[str, Counter[int]]:
-    """Executions of each instruction, by the path of its object and its linked address.
-
-    Args:
-        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
-            the cost of the called function.
-        objects: paths of the wanted objects.
-    """
-    found: dict[str, Counter[int]] = {each: Counter() for each in objects}
-    current: Counter[int] | None = None
-    of_callee = False
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if line.startswith("0x"):
-                if current is not None and not of_callee:
-                    address, _, count = line.split()
-                    current[int(address, 16)] += int(count)
-                of_callee = False
-            elif line.startswith("ob="):
-                current = found.get(os.path.realpath(line[3:].rstrip("\n")))
-            elif line.startswith("calls="):
-                of_callee = True
-    return found

@@ -306,7 +306,7 @@ def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) 
         and counts[at + 1] == counts[at]
         for at, how in enumerate(flows[:-1])
     ]
-    return [*joined, False]
+    return [*joined, False][: len(flows)]
 
 
 def _detours(

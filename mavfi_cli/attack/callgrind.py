@@ -1,0 +1,187 @@
+"""Counts how often a program executes each instruction in one run, by valgrind's callgrind.
+
+Callgrind takes 10 to 60 times as long as the program. It writes a file of counts after every
+`_BLOCKS` basic blocks and one at the end, and their sum is the whole run. The files that are there
+say how fast it counts. The native CPU time that leads to the same counts says how much is left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavfi_cli.attack.target import Golden
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer.spawn import Program
+
+# By the path of an object, or UNNAMED: the executions of each linked address.
+Executions = Mapping[str, Mapping[int, int]]
+UNNAMED = "???"  # objects that valgrind does not recognise; their addresses are those in memory
+
+_SLOWER = 200.0
+_START_S = 60.0
+_TOLD_EVERY_S = 1.0
+_LAST_BYTES = 64  # of a file, which hold its last line
+_BLOCKS = 200_000_000  # basic blocks between two files: 10 to 20 s
+
+
+def find_valgrind() -> str | None:
+    """Path of valgrind; None if it is not installed."""
+    return shutil.which("valgrind")
+
+
+def count_executions(
+    command: Program,
+    *,
+    stdout: Path,
+    stderr: Path,
+    counts: Path,
+    golden: Golden,
+    native_s: Callable[[Executions], float | None],
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[int, Executions]:
+    """Run a program under callgrind; its exit code and the executions of its run.
+
+    Args:
+        counts: file to which callgrind writes, and to others of this name with a number.
+        native_s: function from the executions at one moment to the CPU time of a native run until
+            then, s; None if it is not known.
+        tell: called every second with how far it is, in words.
+
+    Raises:
+        TargetError: it does not end in time, or a signal kills it.
+    """
+    name = Path(command.argv[0]).name
+    tool = [
+        str(find_valgrind()), "--quiet", "--tool=callgrind", "--dump-instr=yes",
+        "--compress-pos=no", "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
+        "--vgdb=no", f"--dump-every-bb={_BLOCKS}", f"--callgrind-out-file={counts}", "--",
+    ]  # fmt: skip
+    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
+        process = subprocess.Popen(
+            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
+            stdin=given, stdout=out, stderr=err, start_new_session=True,
+        )  # fmt: skip
+    count = _Count(counts=counts, golden=golden, native_s=native_s)
+    try:
+        code = _await_end(process, name, count, tell)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    if code < 0:
+        raise TargetError(name, f"is killed by signal {-code} under callgrind")
+    count.read_rest()
+    return code, count.executions
+
+
+@dataclass(slots=True)
+class _Count:
+    """What has been counted of a run so far, and when it will end."""
+
+    counts: Path
+    golden: Golden
+    native_s: Callable[[Executions], float | None]
+    begun_s: float = field(default_factory=time.monotonic)
+    executions: dict[str, Counter[int]] = field(default_factory=dict)
+    read: int = 0  # files
+    rate: float = 0.0  # instructions/s
+    forecast_s: float | None = None  # whole duration
+    forecast_at_s: float = 0.0
+
+    @property
+    def limit_s(self) -> float:
+        """The longest duration."""
+        return _SLOWER * self.golden.wall_s + _START_S
+
+    def update(self) -> str:
+        """Read the new files; how far the count is, in words."""
+        elapsed_s = time.monotonic() - self.begun_s
+        if self._read_files():
+            counted = sum(sum(each.values()) for each in self.executions.values())
+            self.rate = counted / elapsed_s
+            if elapsed_s > 2 * self.forecast_at_s:
+                self.forecast_at_s, reached_s = elapsed_s, self.native_s(self.executions)
+                if reached_s:
+                    self.forecast_s = elapsed_s * max(1.0, self.golden.cpu_s / reached_s)
+        return "; ".join(self._words(time.monotonic() - self.begun_s))
+
+    def _words(self, elapsed_s: float) -> Iterator[str]:
+        yield f"counted by callgrind, {elapsed_s:.0f} s of at most {self.limit_s:.0f} s"
+        if self.rate:
+            yield f"{self.rate / 1e6:.3g} million instructions a second"
+        if self.forecast_s is not None:
+            yield f"about {max(0.0, self.forecast_s - elapsed_s):.0f} s left"
+
+    def read_rest(self) -> None:
+        """Read what is left when callgrind has ended."""
+        self._read_files()
+        self._add(self.counts)
+
+    def _read_files(self) -> bool:
+        """Read the new files with a number; False if there is none."""
+        before = self.read
+        while _is_complete(path := Path(f"{self.counts}.{self.read + 1}")):
+            self._add(path)
+        return self.read > before
+
+    def _add(self, path: Path) -> None:
+        self.read += 1
+        for name, found in _read_counts(path).items():
+            self.executions.setdefault(name, Counter()).update(found)
+        path.unlink()
+
+
+def _await_end(
+    process: subprocess.Popen[bytes], name: str, count: _Count, tell: Callable[[str], None]
+) -> int:
+    """Wait for the exit code; tell how far it is."""
+    while (left_s := count.begun_s + count.limit_s - time.monotonic()) > 0:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.wait(min(_TOLD_EVERY_S, left_s))
+        tell(count.update())
+    raise TargetError(name, f"has not ended under callgrind after {count.limit_s:.0f} s")
+
+
+def _is_complete(path: Path) -> bool:
+    """True if callgrind has finished a file: its last line is the total."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _LAST_BYTES))
+            return b"\ntotals: " in file.read()
+    except OSError:
+        return False
+
+
+def _read_counts(path: Path) -> dict[str, Counter[int]]:
+    """Executions of each instruction, by the path of its object and its linked address.
+
+    Args:
+        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
+            the cost of the called function.
+    """
+    found: dict[str, Counter[int]] = {}
+    current: Counter[int] = Counter()
+    of_callee = False
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.startswith("0x"):
+                if not of_callee:
+                    address, _, count = line.split()
+                    current[int(address, 16)] += int(count)
+                of_callee = False
+            elif line.startswith("ob="):
+                name = line[3:].rstrip("\n")
+                name = name if name == UNNAMED else os.path.realpath(name)
+                current = found.setdefault(name, Counter())
+            elif line.startswith("calls="):
+                of_callee = True
+    return found
