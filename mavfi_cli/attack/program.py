@@ -11,7 +11,7 @@ import resource
 import signal
 import stat
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -365,14 +365,23 @@ class _Workplace:
         return f" ({lines[-1][:200]})" if lines else ""
 
     def _notices(self) -> Iterator[str]:
-        outside = [
-            p for p in self._watch().written if not Path(p).is_relative_to(self._folder.tree)
-        ]
+        written = [Path(each) for each in self._watch().written]
+        outside = [each for each in written if not each.is_relative_to(self._folder.tree)]
         if outside:
-            more = f" and {len(outside) - 1} more" if len(outside) > 1 else ""
             yield (
-                f"{self.name} writes outside its folder: {outside[0]}{more}; runs share that, and "
-                "faults may damage it"
+                f"{self.name} writes outside its folder: {_first_of(outside)}; runs share that, "
+                "and faults may damage it"
+            )
+        compared = [self._folder.path / name for name in self.target.comparison.files]
+        ignored = [
+            Path(os.path.relpath(each, self._folder.path))
+            for each in written
+            if each not in (*outside, *compared) and each.is_file()
+        ]
+        if ignored:
+            yield (
+                f"{self.name} writes {_first_of(ignored)}, which is not compared: a fault that "
+                f"changes nothing else is benign; --compare file:{ignored[0]} compares it"
             )
 
     def unlike(self, golden: Golden, again: Golden) -> str:
@@ -410,6 +419,10 @@ def _joined(parts: dict[str, bytes | None]) -> bytes:
         return pieces[0]
     names = (f"== {name}\n".encode() for name in parts)
     return b"".join(name + piece for name, piece in zip(names, pieces, strict=True))
+
+
+def _first_of(paths: Sequence[Path]) -> str:
+    return f"{paths[0]} and {len(paths) - 1} more" if len(paths) > 1 else str(paths[0])
 
 
 def _children_cpu_s() -> float:

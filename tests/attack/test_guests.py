@@ -57,10 +57,17 @@ def test_one_that_writes_outside_its_folder_is_attacked_with_a_warning(attack, t
     assert done.exit_code == 0, done.output
     assert f"warning: guest writes outside its folder: {tmp_path}/mine; runs share" in done.stderr
     assert (tmp_path / "mine").read_text() == "x"
+
+
+def test_one_that_writes_a_file_that_is_not_compared_is_attacked_with_a_warning(attack):
     done = attack("writes here")
     assert done.exit_code == 0, done.output
-    assert "warning" not in done.stderr
+    assert "warning: guest writes here, which is not compared" in done.stderr
+    assert "--compare file:here compares it" in done.stderr
     assert not Path("here").exists()
+    done = attack("writes here", "--compare", "file:here")
+    assert done.exit_code == 0, done.output
+    assert "warning" not in done.stderr
 
 
 def test_a_script(attack, tmp_path):
