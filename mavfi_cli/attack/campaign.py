@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,11 +29,20 @@ from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
 from mavfi_cli.attack.journal import Journal, read_plan, read_runs
 from mavfi_cli.attack.profile import TargetProfile, started
 from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, Watch, places_of
-from mavfi_cli.core.errors import BuildMismatch, FaultError, RecordError, TargetError
+from mavfi_cli.core.errors import (
+    BuildMismatch,
+    ConfigError,
+    FaultError,
+    RecordError,
+    TargetError,
+)
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
+
+if TYPE_CHECKING:
+    from mavfi_cli.attack.program import ProgramTarget
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,6 +237,7 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
         if profile is None:
             records.append({"version": record.VERSION, "state": "planned", "trigger": []} | what)
             continue
+        assert profile.image is not None
         fault = profile.draw(chosen, bench.generator(index))
         struck = replace(fault, corruption=None) if plan.null else fault
         records.append(record.planned(struck, profile.image, **what))
@@ -399,19 +409,27 @@ class _Replay:
     record: dict[str, Any]
 
 
-def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> Iterator[_Replay]:
+def replay_runs(
+    folder: Path,
+    kernels: tuple[str, ...] = (),
+    runs: int = 0,
+    program: ProgramTarget | None = None,
+) -> Iterator[_Replay]:
     """Repeat the runs of a campaign's folder.
 
     Args:
         kernels: names of the kernels; all of ours if none is named.
         runs: number of runs of each kernel, or of the program, from the first; 0 for all.
+        program: the program of the folder, which may be somebody else's: it is not executed unless
+            it is this one.
 
     Raises:
         RecordError: the folder has no runs that can be repeated.
+        ConfigError: the folder has the runs of another program.
         BuildMismatch: a record is of another build; says what differs.
     """
     plan, found = read_plan(folder), False
-    for target in _targets(plan, folder, kernels):
+    for target in _targets(plan, folder, kernels, program):
         of_it = [e for e in read_runs(folder) if (e.get("kernel"),) == (target.stream or (None,))]
         records = [entry for entry in of_it if entry["trigger"]]
         if not records:
@@ -430,23 +448,32 @@ def replay_runs(folder: Path, kernels: tuple[str, ...] = (), runs: int = 0) -> I
 
 
 def _targets(
-    plan: dict[str, Any], folder: Path, kernels: tuple[str, ...]
+    plan: dict[str, Any],
+    folder: Path,
+    kernels: tuple[str, ...],
+    program: ProgramTarget | None,
 ) -> Iterator[AttackTarget]:
     from mavfi_cli.attack.kernels import catalogue
     from mavfi_cli.attack.kernels.inputs import INPUTS
     from mavfi_cli.attack.kernels.target import KernelTarget
-    from mavfi_cli.attack.program import ProgramTarget
 
     if "program" in plan:
         if kernels:
             raise RecordError(f"{folder}: holds runs of a program, not of {' and '.join(kernels)}")
-        try:
-            target = ProgramTarget.of_plan(plan)
-        except KeyError as missing:
-            problem = f"the plan of an older version, without {missing}, cannot be repeated"
-            raise RecordError(f"{folder}: {problem}") from None
-        yield target
+        if program is None:
+            raise ConfigError(
+                f"holds runs of a program, {plan['program']!r}, which would be executed: if it is "
+                "yours, give --program and the other options of the program again",
+                path=folder,
+            )
+        known = {"stdin": None, "files": None, **program.known()}
+        if differs := [name for name, value in known.items() if plan.get(name) != value]:
+            problem = f"holds runs of another program; it differs in {differs}"
+            raise ConfigError(problem, path=folder)
+        yield program
         return
+    if program is not None:
+        raise ConfigError("holds no runs of a program", path=folder)
     if "inputs_sha256" not in plan:
         raise RecordError(f"{folder}: holds no runs of kernels or of a program")
     if plan.get("sources") != own_digest():  # other code has another memory layout

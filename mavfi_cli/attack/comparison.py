@@ -91,13 +91,6 @@ class OutputComparison:
             ignored=tuple(_pattern(text) for text in ignored),
         )
 
-    @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> OutputComparison:
-        """Make the comparison of which `to_json` told."""
-        names = told["file"] if isinstance(told["file"], list) else [told["file"]]
-        outputs = [STDOUT if name is None else f"file:{name}" for name in names]
-        return cls.of(outputs, tolerance=told["tolerance"], ignored=told.get("ignored", ()))
-
     def to_json(self) -> dict[str, Any]:
         """The entries that results depend on."""
         names: list[str | None] = [None] if self.stdout else []

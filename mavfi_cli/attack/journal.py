@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import write_atomically, write_json, writing
+from mavfi_cli.core.files import open_own, read_bounded, write_atomically, write_json, writing
 
 PLAN, RUNS = "plan.json", "runs.jsonl"
+_LARGEST_PLAN = 1 << 24  # bytes
 _DRAWN = ("object", "offset", "trigger", "k", "instruction_bytes", "corruption", "build_ids")
 
 
@@ -101,7 +103,7 @@ class Journal:
 
     def _write(self, data: bytes) -> None:
         path = self._folder / RUNS
-        with writing(path), path.open("ab") as file:
+        with writing(path), open(open_own(path, os.O_WRONLY | os.O_APPEND), "ab") as file:
             file.write(data)
 
 
@@ -113,9 +115,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
     """
     path = folder / PLAN
     try:
-        plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror or error}") from None
+        plan: dict[str, Any] = json.loads(read_bounded(path, _LARGEST_PLAN))
     except ValueError as error:
         raise RecordError(f"{path}: damaged ({error})") from None
     return plan

@@ -47,10 +47,21 @@ _UNNAMED = (
 )
 _COOL = 64  # an instruction that is executed at most this many times less often than the hottest
 _CHECKED = 4  # instructions whose counts are checked, besides the most executed
+_TAIL = 16  # bytes behind the code, for the decoder
 _DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
 Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
 Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScopeCode:
+    """Code in scope that lies in one piece."""
+
+    start: int  # address
+    data: bytes  # the code, and _TAIL bytes behind it
+    object: str
+    offset: int  # of the start in the object
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +70,9 @@ class TargetProfile:
 
     strata: tuple[Stratum, ...] = ()
     counted: CountedRun | None = None  # a whole run that was counted instead of stepped
-    image: Image
-    code: tuple[tuple[int, bytes], ...]  # start address and bytes of the code in scope
+    code: tuple[ScopeCode, ...]
     cost_s: float
+    image: Image | None = None  # None in a profile that was read from a file
 
     @property
     def complete(self) -> bool:
@@ -101,6 +112,21 @@ class TargetProfile:
         """16 bytes of code."""
         return _code_of(self.code, address)
 
+    def contains(self, addresses: NDArray[np.int64]) -> bool:
+        """Return True if all addresses (n,) are in scope."""
+        inside = np.zeros(len(addresses), bool)
+        for piece in self.code:
+            behind = addresses - piece.start
+            inside |= (behind >= 0) & (behind < len(piece.data) - _TAIL)
+        return bool(inside.all())
+
+    def locate(self, address: int) -> Location:
+        """The location of an address in scope."""
+        for piece in self.code:
+            if 0 <= (at := address - piece.start) < len(piece.data) - _TAIL:
+                return Location(piece.object, piece.offset + at)
+        raise ValueError(f"{address:#x} is not in scope")
+
     def window_of(self, record: Mapping[str, Any]) -> Window | None:
         """The sampled window of a fault; None if no sample of windows was taken."""
         first = record["trigger"][0]
@@ -127,7 +153,7 @@ class TargetProfile:
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
         """Draw one fault, uniformly over the executed instructions."""
         drawn = self.counted or self._drawn_stratum(rng)
-        return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.image.locate)
+        return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.locate)
 
     def _drawn_stratum(self, rng: np.random.Generator) -> Stratum:
         shares = np.array([stratum.instructions for stratum in self.strata])
@@ -148,6 +174,7 @@ class TargetProfile:
         if self.complete:
             return f"all {self.executed} executed instructions in scope"
         windows: dict[str, list[int]] = {}
+        assert self.image is not None
         for stratum in self.strata:
             if stratum.marker is not None:
                 name = short_name(self.image.symbol(stratum.marker) or stratum.marker.object)
@@ -165,11 +192,11 @@ class TargetProfile:
         )
 
 
-def _code_of(code: Iterable[tuple[int, bytes]], address: int) -> bytes:
-    """16 bytes at an address, from pieces of code with their start addresses."""
-    for start, data in code:
-        if start <= address < start + len(data):
-            return data[address - start : address - start + 16]
+def _code_of(code: Iterable[ScopeCode], address: int) -> bytes:
+    """16 bytes at an address, from pieces of code."""
+    for piece in code:
+        if 0 <= (at := address - piece.start) < len(piece.data):
+            return piece.data[at : at + 16]
     return b""
 
 
@@ -398,11 +425,20 @@ def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> Tar
     return TargetProfile(strata=tuple(strata), image=image, code=code, cost_s=cost_s)
 
 
-def _code(place: AttackPlace) -> tuple[Image, tuple[tuple[int, bytes], ...], Scope]:
+def _code(place: AttackPlace) -> tuple[Image, tuple[ScopeCode, ...], Scope]:
     with started(place) as tracee:
         image = place.image(tracee)
         scope = place.scope(image)
-        code = tuple((s.start, tracee.memory.read(s.start, len(s) + 16)) for s in scope.spans)
+        places = [image.locate(span.start) for span in scope.spans]
+        code = tuple(
+            ScopeCode(
+                start=span.start,
+                data=tracee.memory.read(span.start, len(span) + _TAIL),
+                object=place.object,
+                offset=place.offset,
+            )
+            for span, place in zip(scope.spans, places, strict=True)
+        )
     return image, code, scope
 
 

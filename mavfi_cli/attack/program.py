@@ -132,24 +132,6 @@ class ProgramTarget:
             told["files"] = {place: str(source) for place, source in self.files.items()}
         return told
 
-    @classmethod
-    def of_plan(cls, plan: Mapping[str, Any]) -> ProgramTarget:
-        """Make the target of which `known` told."""
-        command = Program.of(
-            plan["program"],
-            environment=plan["environment"],
-            stdin=Path(plan.get("stdin", os.devnull)),
-            memory_bytes=plan["memory_bytes"],
-        )
-        return cls(
-            command=command,
-            comparison=OutputComparison.from_json(plan["comparison"]),
-            objects=tuple(plan["scope"]),
-            function=plan["function"],
-            folder=None if plan["folder"] is None else Path(plan["folder"]),
-            files={place: Path(source) for place, source in plan.get("files", {}).items()},
-        )
-
     def open(self) -> _Workplace:
         """Make a scratch folder for its runs."""
         return _Workplace(self)

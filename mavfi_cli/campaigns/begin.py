@@ -52,7 +52,11 @@ _ALIKE = ("seed", "time_limit_s", "isolate", "world")
 
 
 def chosen(
-    what: str, out: Path | None, scale: float | None, changes: Sequence[str] = ()
+    what: str,
+    out: Path | None,
+    scale: float | None,
+    changes: Sequence[str] = (),
+    firmware: str | None = None,
 ) -> tuple[Spec, Path]:
     """Find the named campaign and its folder.
 
@@ -61,13 +65,15 @@ def chosen(
         out: the folder; None means campaigns/NAME, or the named folder.
         scale: fraction of the repetitions; for a folder, only the one it was begun with.
         changes: factors to replace, as `replaced` takes them; the default folder's name has them.
+        firmware: the program that a folder's missions may name; see
+            `MissionConfig.require_firmware`.
 
     Raises:
         ConfigError: the specification or the scale cannot be used; or a preset without `out`
             has the name of a campaign here.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, out)
+    spec = chosen_spec(what, scale, changes, out, firmware)
     if (folder := _folder(what)) is not None:
         return spec, folder
     if out is None:
@@ -76,7 +82,11 @@ def chosen(
 
 
 def chosen_spec(
-    what: str, scale: float | None, changes: Sequence[str] = (), out: Path | None = None
+    what: str,
+    scale: float | None,
+    changes: Sequence[str] = (),
+    out: Path | None = None,
+    firmware: str | None = None,
 ) -> Spec:
     """Find the named specification, as `chosen` does, without its folder."""
     folder = _folder(what)
@@ -91,6 +101,8 @@ def chosen_spec(
         stored = stored_spec(ledger)
     if stored is None:
         raise ConfigError("has no specification, because a program made its list", path=folder)
+    for kind in stored.kinds():
+        kind.config.require_firmware(firmware)
     return stored
 
 

@@ -15,9 +15,10 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import os
 import sqlite3
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import plain, writing
+from mavfi_cli.core.files import inflate, open_own, plain, writing
 from mavfi_cli.mission.measures import fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -69,6 +70,7 @@ _SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
     "replans", "simulated_s",
 )  # fmt: skip
+_LARGEST_RECORD = 1 << 27  # bytes of JSON
 _PORTION = 5000  # rows that are read at once
 
 
@@ -87,7 +89,7 @@ class Ledger:
         """
         self.folder = folder
         self._path = folder / LEDGER
-        self._lock: Any = None
+        self._lock: int | None = None  # descriptor
         self._writing = writing
         with contextlib.ExitStack() as undo:
             if writing:
@@ -95,6 +97,8 @@ class Ledger:
                 undo.callback(self._unlock)
             elif not self._path.is_file():
                 raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
+            if self._path.is_symlink():
+                raise RecordError(f"{self._path}: is a link")
             try:
                 self._db = self._connect()
                 undo.callback(self._db.close)
@@ -117,7 +121,7 @@ class Ledger:
     def _become_writer(self) -> None:
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.folder / LOCK).open("w")
+            self._lock = open_own(self.folder / LOCK, os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -126,7 +130,7 @@ class Ledger:
 
     def _unlock(self) -> None:
         if self._lock is not None:
-            self._lock.close()
+            os.close(self._lock)
             self._lock = None
 
     def _connect(self) -> sqlite3.Connection:
@@ -168,7 +172,7 @@ class Ledger:
                 with contextlib.suppress(sqlite3.Error):
                     self._db.execute("ROLLBACK")
 
-    def _rows(self, query: str, *values: object) -> Iterator[Any]:
+    def _rows(self, query: str, *values: object) -> Generator[Any]:
         """The rows of a query, one after the other.
 
         Raises:
@@ -323,29 +327,30 @@ class Ledger:
             f"JOIN cells USING (cell) JOIN records USING (number) {chosen}ORDER BY number",
             *([] if numbers is None else [json.dumps(list(numbers))]),
         )
-        for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
-            wall_s, attempts, path, blob = rest
-            yield MissionResult(
-                number=number,
-                mission=PlannedMission(
-                    config=structure(json.loads(changes), MissionConfig),
-                    labels=json.loads(labels),
-                    pair=pair,
-                ),
-                state=ResultState(state),
-                outcome=outcome,
-                reason=reason,
-                result=self._unpacked(blob),
-                injected=None if injected is None else Injected(injected),
-                wall_s=wall_s,
-                attempts=attempts,
-                path=None if path is None else self.folder.absolute() / path,
-            )
+        with contextlib.closing(rows):  # before the ledger, also after an error
+            for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
+                wall_s, attempts, path, blob = rest
+                yield MissionResult(
+                    number=number,
+                    mission=PlannedMission(
+                        config=structure(json.loads(changes), MissionConfig),
+                        labels=json.loads(labels),
+                        pair=pair,
+                    ),
+                    state=ResultState(state),
+                    outcome=outcome,
+                    reason=reason,
+                    result=self._unpacked(blob),
+                    injected=None if injected is None else Injected(injected),
+                    wall_s=wall_s,
+                    attempts=attempts,
+                    path=None if path is None else self.folder.absolute() / path,
+                )
 
     def _unpacked(self, blob: bytes) -> dict[str, Any]:
         try:
-            result: dict[str, Any] = json.loads(zlib.decompress(blob))
-        except (zlib.error, ValueError) as error:
+            result: dict[str, Any] = json.loads(inflate(blob, _LARGEST_RECORD))
+        except ValueError as error:
             raise RecordError(f"{self._path}: {error}") from None
         return result
 

@@ -16,7 +16,7 @@ import shutil
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,12 +41,13 @@ from mavfi_cli.campaigns.workers import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, Interrupted
-from mavfi_cli.core.files import file_digest, writing
+from mavfi_cli.core.files import file_digest, own_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.processes import interruptible
+from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import record_of
 from mavfi_cli.mission.run_folder import RESULT
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
 from mavfi_cli.stats.shares import rate
 
 Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
@@ -73,6 +74,10 @@ class Options:
         cluster_key: folder of its keys (`cluster_keys.make_keys`), for an address with tls://.
         only: numbers of the missions to fly; None flies all.
         kept: numbers of missions whose run folders are kept whatever `keep` says.
+        profiles: folder of the profiles of instruction-level faults that several campaigns share;
+            None for the campaign's own, from which profiles go after their last mission.
+        firmware: programs that missions of the folder may name; see
+            `MissionConfig.require_firmware`.
     """
 
     jobs: int = 0  # as many as there are cores
@@ -84,6 +89,8 @@ class Options:
     cluster_key: Path | None = None
     only: frozenset[int] | None = None
     kept: frozenset[int] = frozenset()
+    profiles: Path | None = None
+    firmware: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit_s < math.inf:
@@ -123,7 +130,10 @@ def run_campaign(
     """
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=append)
-        fly_missing(ledger, options or Options(), spectator or Spectator(), stop)
+        options = options or Options()
+        named = {each.config.firmware for each in missions if each.config.firmware}
+        options = replace(options, firmware=options.firmware | named)
+        fly_missing(ledger, options, spectator or Spectator(), stop)
     return Ledger(folder)
 
 
@@ -182,18 +192,17 @@ def fly_missing(
         MavfiError: as `run_campaign`.
     """
     run = _Run(ledger, options, spectator, stop)
-    with _prepared(ledger.folder), interruptible() as asked:
+    with _prepared(ledger.folder, run.profiles), interruptible() as asked:
         run.fly(asked)
 
 
 @contextlib.contextmanager
-def _prepared(folder: Path) -> Iterator[None]:
+def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
     """Make a clean folder for the attempts; remnants of a killed run are removed."""
-    work = folder / WORK
-    with writing(work):
-        shutil.rmtree(work, ignore_errors=True)
-        for path in (work, folder / PROFILES):
-            path.mkdir(exist_ok=True)
+    work = own_folder(folder / WORK)
+    shutil.rmtree(work, ignore_errors=True)
+    for path in (work, profiles):
+        own_folder(path)
     try:
         yield
     finally:
@@ -300,6 +309,12 @@ class _Run:
         self._flying: dict[int, Entry] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
+        self.profiles = (options.profiles or self._folder / PROFILES).absolute()
+        self._sharing = Counter(
+            _golden_text(changes)
+            for _, _, changes in ledger.missing(errors=options.errors)
+            if changes.get("instruction") and options.profiles is None
+        )
         names = [str(labels.get("setting", "")) for labels in ledger.cells()]
         self._setting_of = [names[cell] for cell in ledger.cell_of_each()]
         self._outcomes = {name: Counter[str]() for name in names}
@@ -331,6 +346,8 @@ class _Run:
                 if asked and self._flying and not told:
                     told = True
                     self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
+        if self._options.profiles is None and not self._sharing:
+            shutil.rmtree(self.profiles, ignore_errors=True)  # an interruption may have left some
         self._spectator.on_end(self._progress())
         if asked:
             raise Interrupted("interrupted; run again to go on")
@@ -347,6 +364,8 @@ class _Run:
             if entry is None:
                 return
             number, _, changes = entry
+            if changes.get("firmware"):
+                structure(changes, MissionConfig).require_firmware(*self._options.firmware)
             self._attempts[number] += 1
             self._flying[number] = entry
             workers.start(number, changes, self._made(number), self._options.limit_s)
@@ -355,7 +374,7 @@ class _Run:
         out = self._out(number)
         with writing(out):
             out.mkdir()
-            (out / ".profiles").symlink_to(self._folder / PROFILES)
+            (out / CACHE).symlink_to(self.profiles)
         return out
 
     def _out(self, number: int) -> Path:
@@ -377,7 +396,19 @@ class _Run:
             self._given_up[number] = verdict.reason
         else:
             self._settle(ended, verdict, config)
+            self._forget_profiles(entry[2])
         shutil.rmtree(out, ignore_errors=True)
+
+    def _forget_profiles(self, changes: Mapping[str, Any]) -> None:
+        """Remove what missions with the same golden run share after the last of them."""
+        if (golden := _golden_text(changes)) not in self._sharing:
+            return
+        if changes.get("instruction"):
+            self._sharing[golden] -= 1
+        if not self._sharing[golden]:
+            del self._sharing[golden]
+            config = structure(changes, MissionConfig).with_firmware().golden
+            shutil.rmtree(kept_in(self.profiles, config), ignore_errors=True)
 
     def _settle(self, ended: AttemptEnd, verdict: Verdict, config: Mapping[str, Any]) -> None:
         """Store a mission that is over: first its run folder, then its row."""
@@ -425,12 +456,16 @@ class _Run:
         )
 
 
+def _golden_text(changes: Mapping[str, Any]) -> str:
+    """The golden mission of a mission as text."""
+    return canonical({name: changes[name] for name in changes if name not in NOT_OF_GOLDEN})
+
+
 def _put_away(run: Path, runs: Path, number: int) -> Path:
     """Move a run folder to the kept ones; return its new path."""
     stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
-    place = runs / f"{number:06d}-{stem}"
+    place = own_folder(runs) / f"{number:06d}-{stem}"
     with writing(place):
-        runs.mkdir(exist_ok=True)
         for old in runs.glob(f"{number:06d}-*"):  # of an attempt whose row was never written
             shutil.rmtree(old)
         run.replace(place)

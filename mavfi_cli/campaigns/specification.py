@@ -273,6 +273,10 @@ class Spec:
         """
         return [self._mission(values, labels, 0) for values, labels, _ in self._points()]
 
+    def firmware(self) -> frozenset[str]:
+        """Return the programs that missions name as their firmware. Raises as `kinds`."""
+        return frozenset(kind.config.firmware for kind in self.kinds() if kind.config.firmware)
+
     def _points(self) -> list[tuple[dict[str, Any], dict[str, Label], int]]:
         """Combine the factors; return each combination with its labels and repetitions."""
         crossed = [

@@ -19,7 +19,7 @@ from mavfi_cli.core.config import (
     read_text,
     structure,
 )
-from mavfi_cli.core.errors import ConfigError, named_member
+from mavfi_cli.core.errors import ConfigError, UnknownName, named_member
 
 PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
@@ -32,11 +32,18 @@ def load_spec(name: str) -> Spec:
     """Load a preset, or the specification in a TOML file.
 
     Raises:
-        UnknownName: neither a preset nor a file.
+        UnknownName: neither a preset nor a file, or no mission flies in a world of
+            `[fixed_world]`.
         ConfigError: the file cannot be used; says where and why.
     """
     path = PRESETS.path(name)
-    return parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
+    spec = parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
+    if spec.fixed_world is not None:
+        flown = {mission.config.world for mission in spec.kinds()}
+        for world in spec.fixed_world.worlds:
+            if world not in flown:
+                raise UnknownName(f"{path}: fixed_world.worlds: world", world, flown)
+    return spec
 
 
 def parse_spec(text: str, path: Path) -> Spec:

@@ -19,16 +19,16 @@ import uuid
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
-from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.files import ScratchFolder, inflate, own_folder, write_atomically
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.types import Outcome
@@ -253,6 +253,7 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
 
 CONNECT_S, WORKERS_S = 15.0, 60.0
 _BACKLOG = 2  # missions queued for each thread, so that it never waits for us
+_LARGEST_FILE = 1 << 30  # bytes, of a run folder
 _LOOK_S = 2.0  # interval between queries for the number of threads
 
 
@@ -323,8 +324,10 @@ class Cluster:
         ended, files = answer
         for name, data in files.items():  # where the mission would have written them
             path = out / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(zlib.decompress(data))
+            if ".." in Path(name).parts or not path.is_relative_to(out):
+                return AttemptEnd(number=number, lost=f"a worker sent the file {name!r}")
+            write = partial(_write, inflate(data, _LARGEST_FILE))
+            write_atomically(own_folder(path.parent) / path.name, write)
         return AttemptEnd(**ended)
 
     def close(self) -> None:
@@ -333,6 +336,10 @@ class Cluster:
             self._client.cancel([future for future, _ in self._futures.values()])
         self._futures.clear()
         self._client.close()
+
+
+def _write(data: bytes, file: BinaryIO) -> None:
+    file.write(data)
 
 
 def _connect(address: str, keys: Path | None) -> Client:

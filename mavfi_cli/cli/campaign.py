@@ -63,6 +63,9 @@ def campaign() -> None:
             help="Fly on a dask.distributed scheduler, such as tls://host:8786.")  # fmt: skip
 @_execution("--cluster-key", type=_FOLDER, metavar="DIR",
             help="Keys of the cluster, made by `mavfi campaign keys`.")  # fmt: skip
+@_execution("--firmware", metavar="PATH",
+            help="SITL binary that the missions of a folder name. It is executed only if it is "
+                 "this one, or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
 @_execution("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
             show_default=True,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
@@ -84,7 +87,8 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.cli.progress import missions_view
 
     cluster, keys = options["cluster"], options["cluster_key"]
-    spec, folder = chosen(what, options["out"], options["scale"], options["changes"])
+    named = (options[name] for name in ("out", "scale", "changes", "firmware"))
+    spec, folder = chosen(what, *named)
     flying = Options(
         jobs=options["jobs"] or 0,
         keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
@@ -92,6 +96,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
         errors=options["retry_errors"],
         cluster=cluster,
         cluster_key=keys,
+        firmware=spec.firmware(),
     )
     if cluster is not None and keys is None:
         click.echo(_OPEN_CLUSTER.format(cluster), err=True)

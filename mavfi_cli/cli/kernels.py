@@ -20,7 +20,12 @@ from mavfi_cli.core.files import ScratchFolder
 
 if TYPE_CHECKING:
     from mavfi_cli.attack.campaign import Plan
+    from mavfi_cli.attack.program import ProgramTarget
     from mavfi_cli.attack.target import AttackTarget
+
+_OF_PROGRAM = (
+    "args", "compare", "ignore_lines", "stdin_file", "folder", "env", "scope", "function",
+)  # fmt: skip
 
 
 _target = partial(click.option, cls=GroupedOption, group="Kernels")
@@ -81,7 +86,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
        help="Relative error still counted as benign.")  # fmt: skip
 @_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
        help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
-            "--runs limits the runs of each.")  # fmt: skip
+            "--runs limits the runs of each. For runs of a program, give the options of the "
+            "program again.")  # fmt: skip
 @_output("--out", type=click.Path(path_type=Path, file_okay=False),
          help="Folder for records, JSON, CSV and plot. Recorded runs are not "
               "repeated.")  # fmt: skip
@@ -100,17 +106,20 @@ def kernels(**options: Any) -> None:
         chosen = ("sampling", "site", "role", "field", "bits")
         refuse_given(chosen, "goes without --compat, which chooses it by its own rule")
     if options["replay"] is not None:
-        others = [name for name in options if name not in ("replay", "kernel", "runs")]
+        shared = ("replay", "kernel", "runs", "program", "tolerance", "memory", *_OF_PROGRAM)
+        others = [name for name in options if name not in shared]
         refuse_given(others, "goes without --replay: a record says how it was drawn")
+        if options["program"] is None:
+            refuse_given(("tolerance", "memory", *_OF_PROGRAM), "needs --program")
+        program = None if options["program"] is None else _program(options)
         limit = given_options().get("runs", 0)
-        if not _replay_folder(options["replay"], options["kernel"], limit):
+        if not _replay_folder(options["replay"], options["kernel"], limit, program):
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
         refuse_given(("kernel", "world", "world_seed"), "goes without --program")
         _attack(options)
     else:
-        programs = "args compare ignore_lines stdin_file folder env memory scope function"
-        refuse_given(programs.split(), "needs --program")
+        refuse_given(("memory", *_OF_PROGRAM), "needs --program")
         _attack(options)
 
 
@@ -181,7 +190,7 @@ def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
     return kernel_targets(kernels, config, folder, options["tolerance"])
 
 
-def _program(options: dict[str, Any]) -> AttackTarget:
+def _program(options: dict[str, Any]) -> ProgramTarget:
     from mavfi_cli.attack.comparison import OutputComparison
     from mavfi_cli.attack.program import ProgramTarget
     from mavfi_cli.attack.work_folder import copied_arguments
@@ -219,12 +228,14 @@ def _variable(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _replay_folder(folder: Path, kernels: tuple[str, ...], runs: int) -> bool:
+def _replay_folder(
+    folder: Path, kernels: tuple[str, ...], runs: int, program: ProgramTarget | None
+) -> bool:
     """Repeat recorded runs and print those that differ; True if none does."""
     from mavfi_cli.attack.campaign import replay_runs
 
     equal = total = 0
-    for result in replay_runs(folder, kernels, runs):
+    for result in replay_runs(folder, kernels, runs, program):
         total += 1
         equal += not result.differs
         if result.differs:

@@ -61,12 +61,15 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
 @click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
               show_default=True, help="Parent of the new run folder.")  # fmt: skip
+@click.option("--firmware", metavar="PATH",
+              help="SITL binary that RUN names. It is executed only if it is this one, or that of "
+                   "PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
 @click.option("--gdb", is_flag=True,
               help="Instruction level: stop the node at the injected instruction and wait for a "
                    "debugger. The activation is then neither followed nor compared.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
 def replay(
-    run: Path, number: int | None, without_fault: bool, out: Path, gdb: bool, as_json: bool
+    run: Path, number: int | None, out: Path, firmware: str | None, as_json: bool, **how: bool
 ) -> None:
     """Repeat RUN, a run folder, and compare the records byte for byte.
 
@@ -74,21 +77,24 @@ def replay(
     effect of the fault. An interrupted replay leaves no files. With --mission, the measures of the
     repetition are compared with those that the campaign recorded.
     """
+    options: Any = {"with_fault": not how["without_fault"], "firmware": firmware}
     if number is None:
-        comparison, lines = _repeat_run(run, out, with_fault=not without_fault, gdb=gdb)
-    elif gdb:
+        comparison, lines = _repeat_run(run, out, gdb=how["gdb"], **options)
+    elif how["gdb"]:
         raise click.UsageError("--gdb needs a run folder, which --mission does not")
     else:
-        comparison, lines = _repeat_mission(run, number, out, with_fault=not without_fault)
+        comparison, lines = _repeat_mission(run, number, out, **options)
     click.echo(json.dumps(comparison, indent=2) if as_json else "\n".join(lines))
-    if not comparison["identical"] and not without_fault:
+    if not comparison["identical"] and not how["without_fault"]:
         raise click.exceptions.Exit(1)
 
 
 _Comparison = tuple[dict[str, Any], list[str]]  # as JSON, and as lines
 
 
-def _repeat_run(path: Path, out: Path, *, with_fault: bool, gdb: bool) -> _Comparison:
+def _repeat_run(
+    path: Path, out: Path, *, with_fault: bool, firmware: str | None, gdb: bool
+) -> _Comparison:
     from mavfi_cli.core.files import file_digest
     from mavfi_cli.core.installed import installed_versions, version_differences
     from mavfi_cli.mission.run import fly_again
@@ -100,10 +106,11 @@ def _repeat_run(path: Path, out: Path, *, with_fault: bool, gdb: bool) -> _Compa
         raise click.UsageError("--gdb needs an instruction-level fault to stop at")
     for text in version_differences(run.record.versions, installed_versions()):
         _note(f"warning: another build: {text}")
-    config = run.mission(with_fault=with_fault)
+    flown: Any = {"with_fault": with_fault, "firmware": firmware}
+    config = run.mission(**flown)
     what = "again" if with_fault else "without its fault"
     _note(f"flying {config.world}, seed {config.seed}, {what}")
-    again = fly_again(run, out, with_fault=with_fault, for_debugger=_say_where if gdb else None)
+    again = fly_again(run, out, **flown, for_debugger=_say_where if gdb else None)
     ignored = _TELL_ACTIVATION if gdb else ()
     differing = [name for name in run.differing_sections(again) if name not in ignored]
     identical = not differing and (file_digest(run.folder.trace) == file_digest(again.folder.trace))
@@ -128,12 +135,15 @@ def _repeat_run(path: Path, out: Path, *, with_fault: bool, gdb: bool) -> _Compa
     return comparison, [*lines, f"Run folder  {again.folder.path}"]
 
 
-def _repeat_mission(campaign: Path, number: int, out: Path, *, with_fault: bool) -> _Comparison:
+def _repeat_mission(
+    campaign: Path, number: int, out: Path, *, with_fault: bool, firmware: str | None
+) -> _Comparison:
     from mavfi_cli.analysis.flights import differing, mission_of
     from mavfi_cli.mission.run import fly_to_end
     from mavfi_cli.report.summary import outcome_line
 
     config, row = mission_of(campaign, number)
+    config.require_firmware(firmware)
     config = config if with_fault else config.golden
     _note(f"flying mission {number}: {config.world}, seed {config.seed}")
     again = fly_to_end(config, out)

@@ -361,7 +361,7 @@ class Executor:
     def kill(self, name: str) -> None:
         """Kill the process of a node as a signal would. Does nothing if the node is down.
 
-        Its present and waiting inputs are lost.
+        Its present input is lost, as that of a node that crashes. Its successor takes the newest.
         """
         node = self.nodes[name]
         together = (node, *node.mates)
@@ -371,7 +371,7 @@ class Executor:
         for job in jobs:  # the result must not depend on the host's progress
             job.settle(self.wall)
             job.cancelled = True
-        node.busy, node.pending = True, None
+        node.busy = True
         self._note_loss(node, self.now_s, NodeLost(hung=False, how="killed by SIGKILL"))
         self._at(self.now_s + self.restart_s, self._restart, node)
         self._free_cores(len(jobs))

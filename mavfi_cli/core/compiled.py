@@ -6,6 +6,7 @@ then strikes the same instruction on a processor with AVX-512 and on one without
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
@@ -39,8 +40,10 @@ def compiled(function: F) -> F:
     """
     numba = _numba()
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
-    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    cache = getattr(dispatcher, "_cache", None)
+    cache_file = getattr(cache, "_cache_file", None)
     if cache_file is not None:
+        _recover(cache)
         known: list[Any] = [function, *_callees(function)]
         folders = sorted({Path(inspect.getfile(each)).parent for each in known})
         cache_file._source_stamp = tuple(folder_digest(folder) for folder in folders)
@@ -70,7 +73,25 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
     Also True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call takes long.
     """
     cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    return cache_file is None or bool(cache_file._load_index())
+    try:
+        return cache_file is None or bool(cache_file._load_index())
+    except Exception:  # a damaged file can raise any error
+        return False
+
+
+def _recover(cache: Any) -> None:
+    """Have damaged entries of numba's cache compiled anew; it would raise their errors."""
+    load = cache.load_overload
+
+    def load_overload(*arguments: Any) -> Any:
+        try:
+            return load(*arguments)
+        except Exception:  # a damaged file can raise any error
+            with contextlib.suppress(OSError):
+                cache._cache_file.flush()
+            return None
+
+    cache.load_overload = load_overload
 
 
 def _numba() -> Any:

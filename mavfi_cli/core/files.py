@@ -1,6 +1,7 @@
 """Files: atomic writes, scratch folders, and digests of source code.
 
-A kill leaves the old file or the new one, never a partial one.
+A kill leaves the old file or the new one, never a partial one. A folder of results may come from
+anybody: nothing is written through a link in it, and what is read has bounds.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shutil
 import stat
 import tempfile
 import weakref
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -22,14 +24,19 @@ from typing import Any, BinaryIO
 from mavfi_cli.core.errors import RecordError
 
 PACKAGE = Path(__file__).parents[1]
+_LARGEST = 1 << 32  # bytes of a table
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 def file_digest(name: str | Path) -> str:
-    """Return the SHA-256 of a file's bytes; empty if there is no such file."""
+    """Return the SHA-256 of a regular file's bytes; empty if there is no such file."""
     try:
-        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
-    except OSError:
-        return ""
+        with open(os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return hashlib.file_digest(file, "sha256").hexdigest()
+    except (OSError, ValueError):
+        pass
+    return ""
 
 
 @contextlib.contextmanager
@@ -39,6 +46,59 @@ def writing(place: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise RecordError(f"{place}: {error.strerror or error}") from None
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """Read a regular file. No link is followed, and no pipe is waited for.
+
+    Args:
+        limit: the most bytes that it may have.
+
+    Raises:
+        RecordError: It cannot be read, is another kind of file, or is larger.
+    """
+    with writing(path), open(os.open(path, _READ), "rb") as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise RecordError(f"{path}: is not a regular file")
+        if about.st_size > limit:
+            raise RecordError(f"{path}: has {about.st_size} bytes, more than {limit}")
+        return file.read(limit)
+
+
+def open_own(path: Path, flags: int) -> int:
+    """Open a file of ours, or create it; return its descriptor. A link raises OSError."""
+    return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+def own_folder(path: Path) -> Path:
+    """Make a folder of ours unless it is there, and return its path.
+
+    Raises:
+        RecordError: It cannot be made, or something else has its name. A link to a folder is
+            refused too, because files are removed in folders of ours.
+    """
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    if path.is_symlink():
+        raise RecordError(f"{path}: is a link; mavfi removes files in this folder")
+    return path
+
+
+def inflate(data: bytes, limit: int) -> bytes:
+    """Decompress zlib's format.
+
+    Raises:
+        ValueError: The data are damaged, or have more than `limit` bytes.
+    """
+    inflater = zlib.decompressobj()
+    try:
+        whole = inflater.decompress(data, limit)
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
+    if not inflater.eof:
+        raise ValueError(f"is cut off, or has more than {limit >> 20} MB")
+    return whole
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -52,8 +112,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
+        temporary.unlink(missing_ok=True)  # of a killed process, or a link
         try:
-            with temporary.open("wb") as file:
+            with open(open_own(temporary, os.O_WRONLY | os.O_EXCL), "wb") as file:
                 write(file)
                 file.flush()
                 os.fsync(file.fileno())
@@ -178,6 +239,12 @@ def read_parquet(path: Path, what: str) -> Any:
     import pyarrow.parquet as pq
 
     try:
+        with pq.ParquetFile(path) as file:
+            about = file.metadata
+            groups = map(about.row_group, range(about.num_row_groups))
+            packed = sum(group.total_byte_size for group in groups)
+            if max(packed, 8 * about.num_rows * about.num_columns) > _LARGEST:
+                raise RecordError(f"{path}: has more than {_LARGEST >> 20} MB")
         return pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise RecordError(f"{path}: damaged, no {what} can be read ({error})") from None

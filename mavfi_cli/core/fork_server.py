@@ -46,6 +46,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import open_own
 from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
@@ -273,7 +274,7 @@ def _own_surroundings(folder: Path) -> None:
     scratch.mkdir(parents=True, exist_ok=True)
     os.environ["TMPDIR"] = tempfile.tempdir = str(scratch)
     nothing = os.open(os.devnull, os.O_RDWR)
-    errors = os.open(folder / ERRORS, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    errors = open_own(folder / ERRORS, os.O_WRONLY | os.O_TRUNC)
     for stream, target in ((0, nothing), (1, nothing), (2, errors)):
         os.dup2(target, stream)
     for descriptor in (nothing, errors):

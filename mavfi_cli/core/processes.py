@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
+import importlib
+import io
+import operator
 import os
 import pickle
 import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
+from enum import EnumMeta
 from typing import Any
 
 PYTHON = (sys.executable, "-P")
@@ -46,13 +51,36 @@ def send(connection: socket.socket, value: Any) -> None:
 
 
 def receive(connection: socket.socket) -> Any:
-    """Receive one value.
+    """Receive one value. Bytes that a corrupted process sends can call none of our functions.
 
     Raises:
         EOFError: The other end has closed.
+        pickle.UnpicklingError: The value has a type that no message has.
     """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
-    return pickle.loads(_exactly(connection, size))
+    return _Values(io.BytesIO(_exactly(connection, size))).load()
+
+
+_BUILT_IN = {
+    "builtins": ("range", "complex", "set", "frozenset"),
+    "numpy": ("ndarray", "dtype"),
+    "numpy._core.multiarray": ("_reconstruct", "scalar"),
+    "numpy._core.numeric": ("_frombuffer",),
+    "pathlib": ("Path", "PosixPath"),
+}
+
+
+class _Values(pickle.Unpickler):
+    """Reads dataclasses and enumerations of ours, and values of numpy."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module in sys.modules and name in _BUILT_IN.get(module, ()):
+            return getattr(sys.modules[module], name)
+        if module.startswith(("mavfi_cli.", "sitl.")):
+            found = operator.attrgetter(name)(importlib.import_module(module))
+            if dataclasses.is_dataclass(found) or (type(found) is EnumMeta):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no value")
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:

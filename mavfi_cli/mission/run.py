@@ -294,15 +294,25 @@ def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
     return flown
 
 
-def fly_again(run: Run, out: Path, *, with_fault: bool = True, **options: Any) -> Run:
+def fly_again(
+    run: Run,
+    out: Path,
+    *,
+    with_fault: bool = True,
+    firmware: str | None = None,
+    **options: Any,
+) -> Run:
     """Repeat a run, or fly its golden run. Arguments as for `fly_mission`, raises as `fly_to_end`.
+
+    Args:
+        firmware: as for `Run.mission`.
 
     Raises:
         RecordError: The run is not repeatable.
     """
     from mavfi_cli.fi.tracer.record import read
 
-    config = run.mission(with_fault=with_fault)
+    config = run.mission(with_fault=with_fault, firmware=firmware)
     repeat = read(run.folder.fault) if config.instruction is not None else None
     return fly_to_end(config, out, repeat=repeat, **options)
 
@@ -340,6 +350,6 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
     with writing(kept), ScratchFolder("golden", run.folder.path) as parent:
         flown = fly_to_end(config, parent)
         if kept.is_dir():
-            shutil.rmtree(kept)
+            shutil.rmtree(kept)  # follows no link
         shutil.move(flown.folder.path, kept)
     return load_run(kept)

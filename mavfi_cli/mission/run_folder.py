@@ -312,12 +312,16 @@ class Run:
         golden = load_run(path) if path.is_dir() else None
         return None if golden is None or golden.record.interrupted else golden
 
-    def mission(self, *, with_fault: bool = True) -> MissionConfig:
+    def mission(self, *, with_fault: bool = True, firmware: str | None = None) -> MissionConfig:
         """Return the configuration of the run, or of its golden run if `with_fault` is False.
 
         The golden run has no detector either, because it is the reference for fault and detection.
 
+        Args:
+            firmware: The program that the run may name; see `MissionConfig.require_firmware`.
+
         Raises:
+            ConfigError: The run names another program.
             RecordError: The run is not repeatable, because it flew a foreign autopilot, used
                 measured times, was interrupted by the user, or named a file that has changed since.
         """
@@ -328,13 +332,14 @@ class Run:
             why = "a flight of a foreign autopilot does not repeat"
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times does not repeat"
-        for name, digest in record.files.items():
-            if not why and file_digest(name) != digest:
+        config = structure(dict(record.config), MissionConfig, path=self.folder.result)
+        for name, digest in {**dict.fromkeys(config.files, ""), **record.files}.items():
+            if not why and not (digest and file_digest(name) == digest):
                 how = "has changed since this flight" if Path(name).exists() else "does not exist"
                 why = f"{name} {how}, so the flight does not repeat"
         if why:
             raise RecordError(f"{path}: {why}")
-        config = structure(dict(record.config), MissionConfig, path=self.folder.result)
+        config.require_firmware(firmware)
         return config if with_fault else config.golden
 
     def differing_sections(self, other: Run) -> list[str]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
+from mavfi_cli.campaigns.missions import MissionResult
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -22,6 +25,8 @@ from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
 _MEASURED = 12  # missions that a forecast is from, if no more are over
+_OF_A_KIND = 4  # the least of them of each kind
+_NEWEST = 2000  # the most that are read
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
 
 
@@ -149,27 +154,70 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
     raise ConfigError(f"{problem}; choose another --out", path=plan.folder)
 
 
-def _missing(ledger: Ledger, wanted: frozenset[int]) -> frozenset[int]:
-    return wanted.intersection(number for number, _, _ in ledger.missing())
+def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
+    """Kinds of the wanted missions that are missing, by number."""
+    return {
+        number: _kind(changes.get("instruction"), changes.get("fault"))
+        for number, _, changes in ledger.missing()
+        if number in wanted
+    }
 
 
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """The missions that a forecast is from. A few are flown if too few are over.
+    """The missions that a forecast is from. A few are flown of each kind of which few are over.
 
     The first missions also fly the golden flights of others, so the ones after them tell.
     """
-    missing = sorted(_missing(ledger, wanted))
-    if len(wanted) - len(missing) >= _MEASURED or len(missing) <= _MEASURED:
-        return sorted(wanted.difference(missing))[-2000:]
-    spectator.on_note(f"measuring {_MEASURED} missions")
-    last = min(len(missing), len(ledger.cells())) - 1  # of the first repetition
-    places = range(0, last, max(2, last // _MEASURED))[:_MEASURED]
-    fly_missing(ledger, replace(options, only=frozenset(missing[p] for p in places)), Spectator())
-    told = [missing[place + 1] for place in places]
-    fly_missing(ledger, replace(options, only=frozenset(told)), Spectator())
-    return told
+    missing = _missing(ledger, wanted)
+    over = sorted(wanted.difference(missing))[-_NEWEST:]
+    if len(missing) <= _MEASURED:
+        return over
+    known = Counter(kind for kind, _ in _kinds(ledger.results(over)))
+    kinds: dict[str, list[int]] = {}
+    for number, kind in sorted(missing.items()):
+        kinds.setdefault(kind, []).append(number)
+    first, told = [], []
+    for kind, numbers in kinds.items():
+        if known[kind] >= _OF_A_KIND:
+            continue
+        last = min(len(numbers), len(ledger.cells())) - 1  # of the first repetition
+        count = -(-_MEASURED // len(kinds))
+        places = range(0, last, max(2, last // count))[:count]
+        first += [numbers[place] for place in places]
+        told += [numbers[place + 1] for place in places]
+    if told:
+        spectator.on_note(f"measuring {len(told)} missions")
+    for part in (first, told):
+        fly_missing(ledger, replace(options, only=frozenset(part)), Spectator())
+    return over + told
+
+
+def _kind(instruction: object, fault: object) -> str:
+    """The kind of a mission with these faults or none, by which its wall time differs most."""
+    return "instruction" if instruction else "source" if fault else "golden"
+
+
+def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
+    """Kind and wall time of missions that are over."""
+    configs = [(each.mission.config, each.wall_s) for each in results]
+    return [(_kind(config.instruction, config.fault), wall_s) for config, wall_s in configs]
+
+
+def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int]) -> float:
+    """Wall time of missing missions one after the other, from the mean of each kind, s.
+
+    Args:
+        measured: kind and wall time of missions that are over.
+        missing: number of missing missions of each kind. A kind that was never measured takes as
+            long as the mean of all.
+    """
+    times: dict[str, list[float]] = {}
+    for kind, wall_s in measured:
+        times.setdefault(kind, []).append(wall_s)
+    every = [wall_s for each in times.values() for wall_s in each] or [0.0]
+    return sum(count * fmean(times.get(kind, every)) for kind, count in missing.items())
 
 
 def _with_flights(
@@ -182,18 +230,18 @@ def _with_flights(
     """A forecast with what the missing missions take beside it, by the missions that are told."""
     missing = _missing(ledger, wanted)
     flown = list(ledger.results(told))
-    each_s = sum(each.wall_s for each in flown) / max(1, len(flown))
+    left_s = remaining_s(_kinds(flown), Counter(missing.values()))
     losses = sum(each.outcome != "success" for each in flown) / max(1, len(flown))
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
     row_bytes = rows / ledger.over() if flown else _ROW_BYTES
     runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()][-20:]
     run_bytes = sum(map(_size, runs)) / len(runs) if runs else _FOLDER_BYTES
-    kept = len(missing & options.kept) + losses * len(missing)
+    kept = len(missing.keys() & options.kept) + losses * len(missing)
     return replace(
         forecast,
         missions=len(wanted),
         over=len(wanted) - len(missing),
-        seconds=forecast.seconds + len(missing) * each_s / forecast.jobs,
+        seconds=forecast.seconds + left_s / forecast.jobs,
         disk_bytes=forecast.disk_bytes + len(missing) * row_bytes + kept * run_bytes,
         measured=len(flown),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -30,6 +31,11 @@ OF_THE_WORLD = (
     "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
 )  # fmt: skip
 """Settings of the world and of what is simulated in it."""
+
+NOT_OF_GOLDEN: Mapping[str, Any] = {
+    "fault": None, "instruction": None, "detector": None, "isolate": (),
+}  # fmt: skip
+"""Settings that a golden mission lacks, with its values."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
@@ -221,7 +227,7 @@ class MissionConfig:
     @property
     def golden(self) -> MissionConfig:
         """The same mission without fault and without protection."""
-        return replace(self, fault=None, instruction=None, detector=None, isolate=())
+        return replace(self, **NOT_OF_GOLDEN)
 
     @property
     def seed_of_world(self) -> int:
@@ -259,6 +265,27 @@ class MissionConfig:
                 key="firmware",
             )
         return replace(self, firmware=path)
+
+    def require_firmware(self, *known: str | None) -> None:
+        """Refuse a recorded mission whose firmware is none of the known programs.
+
+        A record may be somebody else's, and flying it executes the program that it names. The
+        program of the environment variable is known.
+
+        Raises:
+            ConfigError: The mission names another program.
+        """
+        if self.firmware is None:
+            return
+        variable = FIRMWARE.get(self.autopilot, "")
+        for path in (*known, os.environ.get(variable)):
+            if path and os.path.realpath(path) == os.path.realpath(self.firmware):
+                return
+        raise ConfigError(
+            f"the record names the program {self.firmware}, which would be executed: if it is "
+            f"yours, name it with --firmware or in {variable or 'the environment'}",
+            key="firmware",
+        )
 
     def briefing(self, start_enu_m: FloatArray) -> Briefing:
         """Build the briefing for a foreign autopilot without a known world, from its place (3,)."""

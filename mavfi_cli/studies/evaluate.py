@@ -7,6 +7,7 @@ keeps only records. The missions with detectors depend on the faults that do har
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,6 @@ from mavfi_cli.campaigns.detector_plans import NONE, EvaluationPlan, model_diges
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import PROFILES, Options
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.files import writing
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.studies import fly
 
@@ -50,35 +50,26 @@ def evaluate(
     for world in plan.worlds:
         check_names(replace(plan.base, world=world, seed=plan.first_seed))
     spectator.on_note("flights without detectors")
+    profiles = folder / BARE / PROFILES  # flights with detectors have the same golden flights
+    options = replace(options, profiles=profiles)
     tables = [fly(plan.missions(), folder / BARE, Keep.ALL, options, spectator)]
     _, faults = pairs_of([flown(tables[0])], [NONE], plan.complete)
     names = ["world", "seed", "stage", "target", "field"]
     harm = {tuple(row.values()) for row in harmful(faults).select(names).to_pylist()}
     for detector in plan.protectors:
         spectator.on_note(f"the same with {detector}")
-        place = _protected_folder(plan, folder, detector)
+        # One folder for each model, whatever the name of its file.
+        digest = model_digest(plan.detector_config(detector), plan.base.stack)
+        place = folder / PROTECTED / f"{detector}-{digest[:12]}"
         missions = plan.missions(detector, harm)
         tables.append(fly(missions, place, Keep.NONE, options, spectator))
+    shutil.rmtree(profiles, ignore_errors=True)
     pairs = pairs_of(map(flown, tables), (NONE, *plan.protectors), plan.complete)
     detectors = [plan.detector_config(name) for name in plan.protectors]
     scores = scored(detectors, plan.base.stack, folder, pairs, spectator.on_note)
     spectator.on_note("counting")
     failed = [text for table in tables for text in errors(table, "{labels}: {reason}")]
     return told(plan, pairs, failed, scores), pairs
-
-
-def _protected_folder(plan: EvaluationPlan, folder: Path, detector: str) -> Path:
-    """Folder of the flights with a detector: one per model, independent of its file name.
-
-    It shares the profiles of the bare flights, which have the same golden flight.
-    """
-    digest = model_digest(plan.detector_config(detector), plan.base.stack)
-    place = folder / PROTECTED / f"{detector}-{digest[:12]}"
-    with writing(folder):
-        place.mkdir(parents=True, exist_ok=True)
-        if not (place / PROFILES).exists():
-            (place / PROFILES).symlink_to(Path("..") / ".." / BARE / PROFILES)
-    return place
 
 
 def told(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import signal
 import subprocess
 import time
@@ -191,6 +192,14 @@ class FirmwareAutopilot(Links):
 
 
 _OUTPUT = "output.txt"
+_TAIL_LINES, _TAIL_BYTES = 5, 8192  # of its output that an error shows
+_DEATH_S = 1.0
+_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # of a terminal
+
+
+def _plain(line: str) -> str:
+    """Return a line of output without colours and other control characters."""
+    return "".join(filter(str.isprintable, _COLOUR.sub("", line))).strip()
 
 
 class FirmwareProcess:
@@ -237,15 +246,28 @@ class FirmwareProcess:
         return path.resolve()
 
     def require_running(self) -> None:
-        """Raise VehicleProcessError if it has ended, with its last line."""
+        """Raise VehicleProcessError if it has ended, with its last lines."""
+        if self._process.poll() is not None:
+            raise VehicleProcessError(self._state())
+
+    def explain(self, problem: str) -> VehicleProcessError:
+        """Return an error about the firmware with its state and its last lines."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_DEATH_S)  # a link may close before its process has ended
+        return VehicleProcessError(f"{problem}; {self._state()}")
+
+    def _state(self) -> str:
+        """Return in one line whether it runs or how it ended, and the last lines that it wrote."""
         code = self._process.poll()
-        if code is None:
-            return
-        lines = (self._scratch.path / _OUTPUT).read_text(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
-        last = f": {said[-1]}" if said else ""
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
-        raise VehicleProcessError(f"the firmware {self._binary} {how}{last}")
+        how = "is running" if code is None else f"ended with code {code}"
+        if code is not None and code < 0:
+            how = f"was killed by signal {-code}"
+        with (self._scratch.path / _OUTPUT).open("rb") as output:
+            output.seek(max(0, output.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            text = output.read().decode(errors="replace")
+        lines = [line for raw in text.split("\n") if (line := _plain(raw))]
+        last = f": {' | '.join(lines[-_TAIL_LINES:])}" if lines else ""
+        return f"the firmware {self._binary} {how}{last}"
 
     def end(self) -> None:
         """Kill it with all of its children and remove its folder. May be called repeatedly."""

@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,20 @@ class FirmwareSimulation(Simulation):
             self.advance()
         autopilot.forget()
 
+    def advance(self, between: Callable[[int], None] | None = None) -> None:
+        """See `Simulation`. An error about a firmware that we started shows its last lines."""
+        with self._explained():
+            super().advance(between)
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except VehicleProcessError as error:
+            if self._process is None:
+                raise
+            raise self._process.explain(str(error)) from None
+
     def close(self) -> None:
         """End the process, if we started it, and close the links."""
         if self._process is not None:
@@ -120,7 +134,10 @@ class FirmwareSimulation(Simulation):
     def _await_call(self, stopped: Callable[[], bool]) -> None:
         """Wait until the firmware calls, or until stopped; for a minute if we started it."""
         deadline_s = time.monotonic() + _START_LIMIT_S
-        while not stopped() and not self._link.heard(_LOOK_S):
+        while not stopped():
+            with self._explained():
+                if self._link.heard(_LOOK_S):
+                    return
             if self._process is None:
                 continue
             self._process.require_running()

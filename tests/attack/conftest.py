@@ -28,7 +28,7 @@ def kernel_inputs(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     world = folder / "posts.toml"
     world.write_text(POSTS)
-    path = folder / "inputs.pickle"
+    path = folder / "inputs.npz"
     save_inputs(path, record_inputs(MissionConfig(world=str(world), seed=2, stack="hardened")))
     return path
 
@@ -56,7 +56,7 @@ def attack(tracing, kernel_inputs):
 def control_folder(tmp_path_factory, kernel_inputs):
     """The folder of the campaign on the controller; copy it before you change it."""
     folder = tmp_path_factory.mktemp("control")
-    (folder / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    (folder / "inputs.npz").write_bytes(kernel_inputs.read_bytes())
     return folder
 
 

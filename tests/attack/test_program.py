@@ -298,10 +298,14 @@ def replayed(native_program, tmp_path):
     from mavfi_cli.cli.kernels import kernels
 
     folder = tmp_path / "out"
-    line = ["--program", str(native_program("counting")), "--args", "9000", "--runs", "12"]
-    done = CliRunner().invoke(kernels, [*line, "--out", str(folder)])
+    line = ["--program", str(native_program("counting")), "--args", "9000"]
+    done = CliRunner().invoke(kernels, [*line, "--runs", "12", "--out", str(folder)])
     assert done.exit_code == 0, done.output
-    return folder, lambda *options: CliRunner().invoke(kernels, ["--replay", str(folder), *options])
+
+    def replay(*options, program=line):
+        return CliRunner().invoke(kernels, ["--replay", str(folder), *program, *options])
+
+    return folder, replay
 
 
 def test_the_runs_of_a_program_are_repeated_bit_by_bit(replayed):
@@ -321,12 +325,25 @@ def test_the_runs_of_a_program_are_repeated_bit_by_bit(replayed):
 
 
 def test_runs_that_cannot_be_repeated_are_refused(replayed):
-    folder, replay = replayed
+    _, replay = replayed
     assert "holds runs of a program, not of octomap" in str(replay("--kernel", "octomap").exception)
-    plan = json.loads((folder / "plan.json").read_text())
-    del plan["environment"]
-    (folder / "plan.json").write_text(json.dumps(plan))
-    assert "the plan of an older version, without 'environment'" in str(replay().exception)
+
+
+def test_a_folder_does_not_choose_the_program_that_is_executed(replayed, tmp_path):
+    folder, replay = replayed
+    plan, struck = json.loads((folder / "plan.json").read_text()), tmp_path / "struck"
+
+    def hostile(**changes):
+        (folder / "plan.json").write_text(json.dumps(plan | changes))
+
+    hostile(program=["/usr/bin/touch", str(struck)])
+    assert "which would be executed: if it is yours" in str(replay(program=()).exception)
+    assert "it differs in ['program']" in str(replay().exception)
+    hostile(environment={"LD_PRELOAD": "/tmp/theirs.so"})
+    assert "it differs in ['environment']" in str(replay().exception)
+    hostile(stdin="/dev/zero")
+    assert "it differs in ['stdin']" in str(replay().exception)
+    assert not struck.exists()
 
 
 def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
@@ -376,7 +393,7 @@ def test_runs_of_a_program_that_was_built_anew_replace_the_earlier_ones(target, 
     again = attacked(built, folder=folder, runs=3, seed=9).records
     assert len(runs.read_text().splitlines()) == 6
     assert read_runs(folder) == list(again)
-    assert [replay.differs for replay in replay_runs(folder)] == [()] * 3
+    assert [replay.differs for replay in replay_runs(folder, program=built)] == [()] * 3
 
 
 def test_a_record_of_another_build_is_refused(target, start):

@@ -7,8 +7,11 @@ import subprocess
 import sys
 import time
 
+from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError, VehicleProcessError, WorldError
 from mavfi_cli.core.seeds import Stream
+from mavfi_cli.mission.instruction import CACHE, kept_in
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def prepare():
@@ -21,6 +24,7 @@ def perform(changes, out):
     run = out / f"{world}-{seed}-001"
     run.mkdir()
     (run / "fault.json").write_text(json.dumps({"schema": 1, "state": "applied", "seed": seed}))
+    keep_profile(changes, out)
     if world == "sleep":
         time.sleep(float(value))
     elif world == "orphan":  # a child in a session of its own, that outlives its parent
@@ -49,6 +53,13 @@ def perform(changes, out):
         raise ZeroDivisionError("a defect")
     (run / "result.json").write_text(json.dumps(record(changes, seed, world, value)))
     return run
+
+
+def keep_profile(changes, out):
+    """Leave what a mission with an instruction-level fault leaves for others."""
+    if "instruction" in changes:
+        golden = structure(changes, MissionConfig).golden
+        kept_in(out / CACHE, golden).mkdir(exist_ok=True)
 
 
 def record(changes, seed, world, value):

@@ -9,8 +9,8 @@ from mavfi_cli.campaigns import begin as beginning
 from mavfi_cli.campaigns.begin import SEARCH, begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import FixedWorld
-from mavfi_cli.campaigns.specification_file import parse_spec, replaced
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, replaced
+from mavfi_cli.core.errors import ConfigError, UnknownName
 
 SPEC = """
 name = "mine"
@@ -144,6 +144,15 @@ def test_other_values_of_factors_keep_the_rule(begun):
 def test_a_rule_that_makes_no_sense_is_refused(old, new, error, told):
     with pytest.raises(error, match=told):
         spec_of(SPEC.replace(old, new))
+
+
+def test_a_world_of_the_rule_that_no_mission_flies_is_refused(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(SPEC.replace('worlds = ["rising"]', 'worlds = ["risin"]'))
+    with pytest.raises(UnknownName, match=r"fixed_world.worlds: world 'risin'; did you mean 'ris"):
+        load_spec(str(file))
+    file.write_text(SPEC)
+    assert load_spec(str(file)).fixed_world.worlds == ("rising",)
 
 
 def test_the_rule_comes_back_as_it_was():

@@ -12,12 +12,15 @@ import pytest
 from plans import planned
 
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import Injected, ResultState
+from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import ATTEMPTS
+from mavfi_cli.campaigns.run import ATTEMPTS, PROFILES
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.campaigns.workers import CampaignStopped
 from mavfi_cli.core.errors import ConfigError, Interrupted
+from mavfi_cli.mission.instruction import kept_in
+from mavfi_cli.spec.fault import InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 
 def only(ledger):
@@ -92,6 +95,32 @@ def test_nothing_of_a_mission_is_left_when_it_is_over(campaign):
     assert only(campaign.run(planned("orphan"))).outcome == "crash"
     assert not alive(int((campaign.folder / "orphan.pid").read_text()))
     assert not (campaign.folder / "work").exists()
+
+
+def test_profiles_go_after_the_last_mission_with_their_golden_run(campaign):
+    def faults(seed, number):
+        attacks = (InstructionConfig(target="control", seed=fault) for fault in range(number))
+        return [
+            PlannedMission(config=MissionConfig(world="fly", seed=seed, instruction=attack))
+            for attack in attacks
+        ]
+
+    kept = {seed: kept_in(campaign.folder / PROFILES, faults(seed, 1)[0].config.golden)
+            for seed in (1, 2)}  # fmt: skip
+    missions = faults(1, 3) + faults(2, 3)
+    campaign.run(missions, only=frozenset({0, 1, 3, 4, 5})).close()
+    assert kept[1].is_dir()  # a mission with this golden run is still missing
+    assert not kept[2].exists()
+    campaign.run(missions).close()
+    assert not kept[1].exists()
+    assert not (campaign.folder / PROFILES).exists()
+
+
+def test_profiles_that_several_campaigns_share_stay(campaign, tmp_path):
+    attack = InstructionConfig(target="control", seed=1)
+    config = MissionConfig(world="fly", instruction=attack)
+    campaign.run([PlannedMission(config=config)], profiles=tmp_path / "shared").close()
+    assert kept_in(tmp_path / "shared", config.golden).is_dir()
 
 
 def test_a_mission_killed_from_outside_is_begun_again(campaign):

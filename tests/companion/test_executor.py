@@ -1,5 +1,7 @@
+import os
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -148,3 +150,25 @@ def test_never_more_nodes_at_work_than_cores(plan, cores):
         at_work = [j for j in executor.timetable if j.start_s <= middle < j.end_s]
         assert len(at_work) <= cores
         assert len({j.node for j in at_work}) == len(at_work)
+
+
+@pytest.mark.parametrize("end", ["crash", "kill"])
+def test_a_node_that_ends_loses_its_present_input_and_keeps_the_waiting_one(end):
+    executor, published = make({"a": 0.2})
+    node = executor.nodes["a"]
+    if end == "crash":
+        node.kernel = lambda value, start: os.abort() if value == "first" else (value, start)
+    executor.isolate("a")
+    try:
+        executor.submit("first", "a")
+        executor.compute()
+        executor.advance(0.1)
+        executor.submit("second", "a")
+        if end == "kill":
+            executor.kill("a")
+        executor.advance(5.0)
+    finally:
+        executor.close()
+    restarted_s = {"crash": 1.2, "kill": 1.1}[end]  # the end of a crash is when output was due
+    ((_, (value, begun_s), _),) = published
+    assert (value, round(begun_s, 9), node.restarts) == ("second", restarted_s, 1)

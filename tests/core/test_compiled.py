@@ -58,3 +58,22 @@ def test_kernels_have_the_same_instructions_on_every_processor():
     code = "".join(scale.inspect_asm().values())
     assert "ymm" in code
     assert "zmm" not in code
+
+
+def test_damaged_machine_code_is_compiled_anew(tmp_path, monkeypatch):
+    (tmp_path / "caller_module.py").write_text(CALLER)
+    (tmp_path / "callee_module.py").write_text(CALLEE.format(1.0))
+    monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
+
+    def run():
+        command = [sys.executable, "-c", "import caller_module"]
+        result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+        return result.stdout.split()
+
+    assert run() == ["2.0", "0", "False"]
+    cache = tmp_path / "__pycache__"
+    for pattern in ("*.nbi", "*.nbc"):
+        for file in cache.glob(pattern):
+            file.write_bytes(file.read_bytes()[:40] + b"damage")
+        assert run()[:2] == ["2.0", "0"]
+        assert run() == ["2.0", "1", "True"]

@@ -2,12 +2,26 @@ import os
 import signal
 import subprocess
 import sys
+import zlib
 from pathlib import Path
+from unittest import mock
 
+import pyarrow as pa
 import pytest
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import ScratchFolder, folder_digest, write_text
+from mavfi_cli.core.files import (
+    ScratchFolder,
+    file_digest,
+    folder_digest,
+    inflate,
+    open_own,
+    own_folder,
+    read_bounded,
+    read_parquet,
+    write_parquet,
+    write_text,
+)
 from mavfi_cli.core.processes import fork
 
 _MAKE_AND_WAIT = """
@@ -84,3 +98,53 @@ def test_a_deep_digest_depends_on_settings_and_a_shallow_one_on_sources_only(tmp
     (shallow, deep), (same, other) = digests(1), digests(2)
     assert shallow == same
     assert deep != other
+
+
+def test_nothing_is_written_through_a_link(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / f".out.txt.{os.getpid()}.partial").symlink_to(precious)
+    (folder / "out.txt").symlink_to(precious)
+    write_text(folder / "out.txt", "ours")
+    assert (folder / "out.txt").read_text() == "ours"
+    (folder / "lock").symlink_to(precious)
+    with pytest.raises(OSError, match="Too many levels of symbolic links"):
+        open_own(folder / "lock", os.O_RDWR | os.O_TRUNC)
+    assert precious.read_text() == "mine"
+    (folder / "runs").symlink_to(tmp_path)
+    with pytest.raises(RecordError, match="runs: is a link"):
+        own_folder(folder / "runs")
+    assert own_folder(folder / "own") == own_folder(folder / "own")
+
+
+@pytest.mark.parametrize("name", ["pipe", "link", "folder"])
+def test_only_a_regular_file_is_read(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/etc/hostname")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(RecordError, match=name):
+        read_bounded(tmp_path / name, 100)
+
+
+def test_what_is_read_has_bounds(tmp_path):
+    (tmp_path / "file").write_bytes(b"12345")
+    assert read_bounded(tmp_path / "file", 5) == b"12345"
+    with pytest.raises(RecordError, match="has 5 bytes, more than 4"):
+        read_bounded(tmp_path / "file", 4)
+    packed = zlib.compress(bytes(1 << 20))
+    assert inflate(packed, 1 << 20) == bytes(1 << 20)
+    for damaged, limit in ((packed, (1 << 20) - 1), (packed[:-8], 1 << 21), (b"no", 9)):
+        with pytest.raises(ValueError, match=r"cut off|header"):
+            inflate(damaged, limit)
+    os.mkfifo(tmp_path / "pipe")
+    assert file_digest(tmp_path / "pipe") == file_digest("/dev/zero") == ""
+
+
+def test_a_table_that_inflates_beyond_bounds_is_not_read(tmp_path):
+    table = pa.table({"x": pa.array([0]).take(pa.array([0] * 1000))})
+    write_parquet(tmp_path / "table.parquet", table)
+    with mock.patch("mavfi_cli.core.files._LARGEST", 4000), pytest.raises(RecordError, match="MB"):
+        read_parquet(tmp_path / "table.parquet", "table")
+    assert read_parquet(tmp_path / "table.parquet", "table").num_rows == 1000

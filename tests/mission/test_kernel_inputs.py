@@ -56,7 +56,7 @@ def test_some_trajectories_are_free_and_some_are_not_if_the_flight_had_both(inpu
 
 def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
     fed = inputs_of_flight(config, tmp_path)
-    assert fed["inputs_sha256"] == save_inputs(tmp_path / "again.pickle", inputs)
+    assert fed["inputs_sha256"] == save_inputs(tmp_path / "again.npz", inputs)
     assert load_inputs(fed["inputs"])[1] == fed["inputs_sha256"]
     with pytest.raises(ConfigError, match="holds inputs of a golden flight"):
         inputs_of_flight(MissionConfig(world="farm"), tmp_path)

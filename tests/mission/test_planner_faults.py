@@ -1,7 +1,6 @@
 """Faults in the planner node: one request is one invocation, straight or searched."""
 
 import json
-import pickle
 from collections import Counter
 from dataclasses import replace
 
@@ -12,9 +11,11 @@ from missions import POSTS
 from mavfi_cli.attack.attacker import TracerThread
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.companion.node_process import NodeProcess
+from mavfi_cli.core.archive import unpack
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.linux import SUPPORTED
 from mavfi_cli.mission.instruction.injection import (
+    GoldenOrders,
     Rehearsal,
     draw_invocation,
 )
@@ -79,9 +80,9 @@ def searching(tmp_path_factory):
     config = MissionConfig(world=str(world), seed=2, planner="rrtconnect")
     attacked = replace(config, instruction=InstructionConfig(target="planner", seed=1))
     fly_mission(attacked, folder, Watcher())
-    (kept,) = folder.glob(".profiles/*/orders.pickle")
-    briefing, orders = pickle.loads(kept.read_bytes())
-    return Setup.of(config, briefing, "planner"), orders["planner"][:2]
+    (kept,) = folder.glob(".profiles/*/orders.npz")
+    golden = unpack(kept.read_bytes(), GoldenOrders)
+    return Setup.of(config, golden.briefing, "planner"), golden.planner[:2]
 
 
 @pytest.mark.slow

@@ -76,6 +76,23 @@ def test_the_forecast_comes_from_missions_that_count(tmp_path):
     assert over(asked) == 40
 
 
+def test_a_forecast_takes_the_rate_of_each_kind():
+    measured = [("golden", 10.0)] * 20 + [("source", 2.0), ("source", 4.0), ("instruction", 1.0)]
+    missing = {"golden": 1, "source": 100, "instruction": 1000}
+    assert flying.remaining_s(measured, missing) == 10.0 + 300.0 + 1000.0
+    assert flying.remaining_s([("golden", 4.0), ("source", 2.0)], {"instruction": 10}) == 30.0
+    assert flying.remaining_s([], {"golden": 3}) == 0.0
+
+
+def test_each_kind_that_is_missing_is_measured(tmp_path):
+    asked = plan(tmp_path, "fig9", "table4", scale=0.05)
+    forecast = flown(asked)
+    with Ledger(asked.folder) as ledger:
+        kinds = {kind for kind, _ in flying._kinds(ledger.results())}
+    assert {"golden", "source"} <= kinds
+    assert forecast.measured >= 4 * len(kinds)
+
+
 def test_few_missions_are_not_measured(tmp_path):
     first = flown(plan(tmp_path, "fig9"))
     assert (first.missions, first.measured, first.seconds) == (8, 0, 0.0)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingParams, TrackingState
+from mavfi_cli.core.archive import pack, unpack
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import write_atomically
+from mavfi_cli.core.files import read_bounded, write_atomically
 from mavfi_cli.core.types import DepthFrame, FloatArray, PointCloud
 
-INPUTS = "inputs.pickle"  # file in a campaign's folder
-_PROTOCOL = 5
+INPUTS = "inputs.npz"  # file in a campaign's folder
+_LARGEST = 1 << 30  # bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,13 +45,18 @@ class KernelInputs:
     tracking_params: TrackingParams
 
 
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    inputs: tuple[KernelInputs, ...]
+
+
 def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
     """Write the inputs; return the SHA-256 of the file.
 
     Raises:
         RecordError: the file could not be written.
     """
-    data = pickle.dumps(tuple(inputs), protocol=_PROTOCOL)
+    data = pack(_Stored(tuple(inputs)))
     write_atomically(path, lambda file: file.write(data))
     return hashlib.sha256(data).hexdigest()
 
@@ -60,27 +64,29 @@ def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
 def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
     """Read inputs that `save_inputs` wrote, and the SHA-256 of the file.
 
-    The file is a pickle: load only what you wrote yourself.
-
     Raises:
         RecordError: no such file, or it holds something else.
     """
+    data = read_inputs(path)
     try:
-        data = path.read_bytes()
         inputs = inputs_of_bytes(data)
-    except (OSError, pickle.UnpicklingError, AttributeError, EOFError, ImportError) as error:
+    except ValueError as error:
         raise RecordError(f"{path}: not a file of kernel inputs ({error})") from None
     return inputs, hashlib.sha256(data).hexdigest()
+
+
+def read_inputs(path: Path) -> bytes:
+    """Read the bytes of such a file. Raises RecordError."""
+    return read_bounded(path, _LARGEST)
 
 
 def inputs_of_bytes(data: bytes) -> tuple[KernelInputs, ...]:
     """Read the inputs from the bytes of such a file.
 
     Raises:
-        pickle.UnpicklingError: the bytes are something else.
+        ValueError: the bytes are something else.
     """
-    inputs: Any = pickle.loads(data)
-    known = isinstance(inputs, tuple) and all(isinstance(each, KernelInputs) for each in inputs)
-    if not (known and inputs):
-        raise pickle.UnpicklingError(f"a {type(inputs).__name__}")
-    return tuple(inputs)
+    inputs = unpack(data, _Stored).inputs
+    if not inputs:
+        raise ValueError("it has none")
+    return inputs

@@ -20,12 +20,13 @@ from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.catalogue import unpack
+from mavfi_cli.attack.kernels.inputs import read_inputs
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
 from mavfi_cli.attack.profile import TargetProfile, profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import Golden, RunLimits, RunOutcome, RunVerdict, Watch, digest, judged
-from mavfi_cli.core.errors import FaultError, RecordError, TargetError
+from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive
 from mavfi_cli.fi.tracer.image import Image, Scope
@@ -94,7 +95,7 @@ class _KernelPlace:
             TargetError: the kernel cannot be loaded.
         """
         self.name, self._kernel = target.name, catalogue.find(target.kernel)
-        self.limits, inputs = RunLimits(cpu_grace_s=self._kernel.hang_s), _read(target.inputs)
+        self.limits, inputs = RunLimits(cpu_grace_s=self._kernel.hang_s), read_inputs(target.inputs)
         with contextlib.ExitStack() as undo:
             self._output = os.memfd_create("mavfi-kernel-output")
             undo.callback(os.close, self._output)
@@ -216,10 +217,3 @@ class _KernelPlace:
         except (ValueError, KeyError) as damage:
             text = f"unreadable: {damage}"
             return Difference(relative=math.inf, absolute=math.inf, text=text)
-
-
-def _read(inputs: Path) -> bytes:
-    try:
-        return inputs.read_bytes()
-    except OSError as error:
-        raise RecordError(f"{inputs}: {error.strerror}") from None

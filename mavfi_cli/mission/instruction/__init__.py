@@ -1,3 +1,28 @@
 """Instruction-level faults in a mission: plan, profile, injection, and the attacked node."""
 
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from mavfi_cli.core.files import file_digest, own_digest
+from mavfi_cli.core.installed import installed_versions
+from mavfi_cli.spec.mission import MissionConfig
+
 PROGRAM = "mavfi_cli.mission.instruction.server"  # of the attacked node
+CACHE = ".profiles"  # folder in that of the runs
+
+
+def kept_in(folder: Path, golden: MissionConfig) -> Path:
+    """Return where a golden mission's orders and profiles are kept in their folder.
+
+    The name is a hash of everything that the golden run depends on.
+    """
+    parts = [
+        json.dumps(golden.to_dict(), sort_keys=True),
+        json.dumps(installed_versions(), sort_keys=True),
+        own_digest(),
+        *(digest for name in golden.files if (digest := file_digest(name))),
+    ]
+    return folder / hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -10,13 +10,11 @@ everything that they depend on. In the flight a tracer thread injects the fault.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
-import pickle
 import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,21 +24,29 @@ from mavfi_cli.attack.attacker import EntryCounter, LiveAttack, TracerThread, at
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
 from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.autonomy.collision import CollisionInputs
+from mavfi_cli.autonomy.occupancy import MapSnapshot
+from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import SCHEMA, NoInjection
+from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.companion.node_process import NodeProcess
+from mavfi_cli.core.archive import pack, unpack
 from mavfi_cli.core.errors import FaultError, RecordError, TargetError
-from mavfi_cli.core.files import file_digest, own_digest, write_atomically, writing
-from mavfi_cli.core.installed import installed_versions
+from mavfi_cli.core.files import (
+    own_folder,
+    read_bounded,
+    write_atomically,
+)
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import Briefing
+from mavfi_cli.core.types import Briefing, DepthFrame, PointCloud
 from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.mission.instruction import PROGRAM
+from mavfi_cli.mission.instruction import CACHE, PROGRAM, kept_in
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.run import fly_golden
@@ -48,8 +54,7 @@ from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
-_Order = tuple[Any, float]  # input, start stamp
-CACHE = ".profiles"
+_Order = tuple[T, float]  # input, start stamp
 _CONTEXT = (
     "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
     "windows", "profiled_instructions", "seed", "request",
@@ -59,6 +64,32 @@ _WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `pro
 _INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
 
+_LARGEST = 1 << 31  # bytes of a kept file
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GoldenOrders:
+    """The briefing of a golden run, and the orders that it gave, by node."""
+
+    briefing: Briefing
+    point_cloud: tuple[_Order[DepthFrame], ...] = ()
+    octomap: tuple[_Order[PointCloud], ...] = ()
+    collision_check: tuple[_Order[CollisionInputs], ...] = ()
+    planner: tuple[_Order[tuple[PlanRequest, MapSnapshot]], ...] = ()
+    control: tuple[_Order[ControlInput], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Entries:
+    """Entries of a kernel up to each order of its node."""
+
+    counts: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if any(later < earlier for earlier, later in pairwise((0, *self.counts))):
+            raise ValueError("counts that fall")
+
+
 def _plan_fault(
     config: MissionConfig, asked: InstructionConfig, out: Path
 ) -> tuple[InstructionFault, dict[str, Any]]:
@@ -66,24 +97,30 @@ def _plan_fault(
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
-    folder = out / CACHE / _key(golden)
+    folder = kept_in(out / CACHE, golden)
 
-    def fly() -> tuple[Briefing, dict[str, list[_Order]]]:
-        """The briefing of the golden run, and the orders that it gave, by node."""
+    def fly() -> GoldenOrders:
         recorder = Recorder()
         fly_golden(golden, folder, recorder)
         assert recorder.briefing is not None
-        return recorder.briefing, recorder.orders
+        orders = {name: tuple(given) for name, given in recorder.orders.items()}
+        return GoldenOrders(briefing=recorder.briefing, **orders)
 
-    briefing, all_orders = _kept(folder / "orders.pickle", fly)
-    setup = Setup.of(config, briefing, node)
-    orders = all_orders.get(node, [])
+    kept = _kept(folder / "orders.npz", GoldenOrders, fly)
+    setup = Setup.of(config, kept.briefing, node)
+    orders: tuple[_Order[Any], ...] = getattr(kept, node)
 
-    def count() -> list[int]:
+    def count() -> _Entries:
         with contextlib.closing(Rehearsal(setup)) as place:
-            return place.count_entries(orders)
+            return _Entries(counts=tuple(place.count_entries(orders)))
 
-    counts = _kept(folder / f"entries-{kernel}.pickle", count)
+    entries = _kept(
+        folder / f"entries-{kernel}.npz",
+        _Entries,
+        count,
+        sound=lambda entries: len(entries.counts) == len(orders),
+    )
+    counts = entries.counts
     if not counts or not counts[-1]:
         raise FaultError(
             f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
@@ -92,11 +129,16 @@ def _plan_fault(
     rng = Stream.FAULT.generator(asked.seed, "instruction")
     drawn = draw_invocation(node, counts, rng)
     profiling = Stream.FAULT.generator(config.seed, "profile", kernel, drawn.number)
-    found: TargetProfile = _kept(
-        folder / f"profile-{kernel}-{drawn.number}.pickle",
-        lambda: Rehearsal.profile_invocation(
-            setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
+    found = _kept(
+        folder / f"profile-{kernel}-{drawn.number}.npz",
+        TargetProfile,
+        lambda: replace(
+            Rehearsal.profile_invocation(
+                setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
+            ),
+            image=None,
         ),
+        sound=_is_sound,
     )
     fault = found.draw(replace(strategy, whole_process=False), rng)
     context = {
@@ -151,27 +193,33 @@ def draw_invocation(
     )
 
 
-def _kept(path: Path, make: Callable[[], T]) -> T:
-    """Read a value from its file, or make it and keep it there."""
-    if path.is_file():
-        kept: T = pickle.loads(path.read_bytes())
-        return kept
-    value = make()
-    with writing(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: pickle.dump(value, file))
-    return value
+def _is_sound(profile: TargetProfile) -> bool:
+    """Return True if a fault can be drawn from a profile that was read from a file."""
+    segments = [segment for stratum in profile.strata for segment in stratum.segments]
+    return (
+        bool(segments)
+        and profile.counted is None
+        and all(stratum.windows_in_run >= len(stratum.segments) > 0 for stratum in profile.strata)
+        and all(len(segment.trace) and profile.contains(segment.trace) for segment in segments)
+    )
 
 
-def _key(golden: MissionConfig) -> str:
-    """A hash of everything that the golden run depends on."""
-    parts = [
-        json.dumps(golden.to_dict(), sort_keys=True),
-        json.dumps(installed_versions(), sort_keys=True),
-        own_digest(),
-        *(digest for name in golden.files if (digest := file_digest(name))),
-    ]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+def _kept(
+    path: Path, kind: type[T], make: Callable[[], T], *, sound: Callable[[T], bool] = lambda _: True
+) -> T:
+    """Read a value from its file; if that is not there or damaged, make the value and write it.
+
+    A value that is made is read back, so that it is the same as in every later mission.
+
+    Args:
+        sound: False for a value that was not made by this program.
+    """
+    with contextlib.suppress(RecordError, ValueError):
+        if sound(kept := unpack(read_bounded(path, _LARGEST), kind)):
+            return kept
+    data = pack(make())
+    write_atomically(own_folder(path.parent) / path.name, lambda file: file.write(data))
+    return unpack(data, kind)
 
 
 # Rehearsal ----------------------------------------------------------------------------------------
@@ -187,7 +235,7 @@ class Rehearsal:
 
     kind = "node"
 
-    def __init__(self, setup: Setup, orders: Sequence[_Order] = (), entry: int = 1) -> None:
+    def __init__(self, setup: Setup, orders: Sequence[_Order[Any]] = (), entry: int = 1) -> None:
         self._setup, self._entry = setup, entry
         self._last = orders[-1:]
         self._spawned = ServedProcess.of(PROGRAM)
@@ -200,10 +248,10 @@ class Rehearsal:
             self._image = Image(self._spawned.pid, self.scope_of_node.regions)
             undo.pop_all()
 
-    def _work(self, order: _Order) -> None:
+    def _work(self, order: _Order[Any]) -> None:
         self._process.take(self._process.order(self._setup.node, *order))
 
-    def count_entries(self, orders: Sequence[_Order]) -> list[int]:
+    def count_entries(self, orders: Sequence[_Order[Any]]) -> list[int]:
         """Count the kernel's entries up to the end of each order.
 
         Raises:
@@ -266,7 +314,7 @@ class Rehearsal:
     def profile_invocation(
         cls,
         setup: Setup,
-        orders: Sequence[_Order],
+        orders: Sequence[_Order[Any]],
         entry: int,
         earlier: int,
         rng: np.random.Generator,

@@ -165,7 +165,7 @@ def test_the_planner_is_attacked_in_its_own_library(attack):
 
 def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
-    (tmp_path / "inputs.pickle").write_bytes(kernel_inputs.read_bytes())
+    (tmp_path / "inputs.npz").write_bytes(kernel_inputs.read_bytes())
     plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
     (kernel,) = summarise(plan, [runs])["kernels"]
     for number, profile in enumerate(runs.profiles):
@@ -241,7 +241,7 @@ def test_kernels_come_in_the_order_of_the_pipeline():
 
 
 def test_inputs_of_something_else_are_refused(tmp_path):
-    path = tmp_path / "inputs.pickle"
+    path = tmp_path / "inputs.npz"
     path.write_bytes(b"nothing of the kind")
     with pytest.raises(RecordError, match="not a file of kernel inputs"):
         load_inputs(path)
@@ -253,7 +253,7 @@ def test_the_command_line_refuses_what_makes_no_sense(mavfi):
     assert asked.stderr.startswith("error: unknown kernel 'contrl'; did you mean 'control'?")
     assert mavfi("kernels", "--args", "5").returncode == 2
     assert mavfi("kernels", "--program", "/bin/true", "--kernel", "rrt").returncode == 2
-    for option in (["--json"], ["--seed", "1"], ["--program", "/bin/true"]):
+    for option in (["--json"], ["--seed", "1"], ["--jobs", "2"]):
         asked = mavfi("kernels", "--replay", ".", *option)
         assert asked.returncode == 2
         assert f"error: {option[0]} goes without --replay" in asked.stderr

@@ -77,6 +77,29 @@ def test_a_program_that_ends_is_no_firmware(tmp_path: Path, script: str, told: s
         firmware.close()
 
 
+_DYING_PX4 = f"""#!{sys.executable}
+import socket, sys, time
+port = 4560 + int(sys.argv[sys.argv.index("-i") + 1])
+socket.create_connection(("127.0.0.1", port)).close()
+print("INFO  [init] found model")
+print("\\x1b[31mERROR [commander] \\x1b[0mno parameters", flush=True)
+time.sleep(0.1)
+sys.exit(3)
+"""
+
+
+def test_the_last_words_of_px4_are_in_the_error(tmp_path: Path) -> None:
+    (tmp_path / "etc" / "init.d-posix").mkdir(parents=True)
+    (tmp_path / "etc" / "init.d-posix" / "rcS").touch()
+    firmware = _open("px4", _program(tmp_path / "bin" / "px4", _DYING_PX4))
+    told = r"ended with code 3: INFO  \[init\] found model \| ERROR \[commander\] no parameters$"
+    try:
+        with pytest.raises(VehicleProcessError, match=told):
+            firmware.begin()
+    finally:
+        firmware.close()
+
+
 def test_the_end_takes_children_and_folder_along() -> None:
     scratch = ScratchFolder("test")
     folder = scratch.path

@@ -1,0 +1,159 @@
+"""Archives: dataclasses with arrays as bytes, in numpy's `.npz`, read back without executing any.
+
+An archive has two arrays of bytes. `value` is JSON, in which an array is its place in `data`, its
+dtype, shape, order and writeability. An array that occurs twice is there once. Equal values give
+equal bytes. An archive may come from anybody: sizes are bounded, and types and shapes are checked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import cattrs
+import numpy as np
+from cattrs.gen import make_dict_structure_fn
+
+T = TypeVar("T")
+_TYPES = {np.dtype(kind).str for kind in ("f8", "i8", "i4", "u1", "?")}
+_MARK = "$array"
+_XYZ, _MANY = (3,), None
+_SHAPES: Mapping[str, tuple[int | None, ...]] = {
+    **dict.fromkeys(
+        (
+            "start_enu_m", "goal_enu_m", "position_enu_m", "velocity_enu_mps", "origin_enu_m",
+            "hold_enu_m", "front_enu_m", "camera_offset_flu_m", "integral_mps",
+        ),
+        _XYZ,
+    ),
+    "quaternion": (4,),
+    "bounds_enu_m": (6,),
+    "points_enu_m": (_MANY, 3),
+    "depth_m": (_MANY, _MANY),
+    "waypoints": (_MANY, 10),
+    "durations_s": (_MANY,),
+    "trace": (_MANY,),
+}  # fmt: skip
+"""Shape of each array, by the name of its field."""
+
+
+def pack(value: Any) -> bytes:
+    """Return an archive of a dataclass of numbers, texts, arrays, bytes and further dataclasses."""
+    data, places = bytearray(), dict[int, dict[str, Any]]()
+
+    def place(item: Any) -> Any:
+        """Write what JSON lacks."""
+        if isinstance(item, np.generic):
+            return item.item()
+        if id(item) not in places:
+            array = np.frombuffer(item, np.uint8) if isinstance(item, bytes) else item
+            columns_first = array.flags.f_contiguous and not array.flags.c_contiguous
+            order: Literal["C", "F"] = "F" if columns_first else "C"
+            about = [len(data), array.dtype.str, array.shape, order, array.flags.writeable]
+            data.extend(array.tobytes(order))
+            places[id(item)] = {_MARK: about}
+        return places[id(item)]
+
+    text = json.dumps(_CONVERTER.unstructure(value), default=place, separators=(",", ":"))
+    file = io.BytesIO()
+    np.savez(file, value=np.frombuffer(text.encode(), np.uint8), data=np.frombuffer(data, np.uint8))
+    return file.getvalue()
+
+
+def unpack(archive: bytes, kind: type[T]) -> T:
+    """Return the dataclass of an archive.
+
+    Raises:
+        ValueError: The bytes are no archive of this dataclass.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(archive)) as parts:
+            if any(part.compress_type != zipfile.ZIP_STORED for part in parts.infolist()):
+                raise ValueError("is compressed")
+        with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
+            text, data = arrays["value"].tobytes(), arrays["data"].tobytes()
+        known: dict[Any, Any] = {}
+
+        def array(item: dict[str, Any]) -> Any:
+            """Return the array of its place, one for all that refer to it."""
+            if _MARK not in item:
+                return item
+            at, dtype, shape, order, writeable = item[_MARK]
+            place = at, dtype, *shape, order, writeable
+            if place not in known:
+                if dtype not in _TYPES or at < 0 or min(shape, default=0) < 0:
+                    raise ValueError("has an array of another kind")
+                count = int(np.prod(shape, dtype=object))
+                made = np.frombuffer(data, dtype, count, at).copy().reshape(shape, order=order)
+                made.flags.writeable = writeable
+                known[place] = made
+            return known[place]
+
+        return _CONVERTER.structure(json.loads(text, object_hook=array), kind)
+    except Exception as error:  # the file may be anything
+        raise ValueError(f"{type(error).__name__}: {error}"[:200]) from None
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter(detailed_validation=False, forbid_extra_keys=True)
+    for kind, *others in ((float, int), (int,), (bool,), (str,)):
+        converter.register_structure_hook(kind, _as_it_is(kind, *others))
+    converter.register_unstructure_hook(bytes, lambda value: value)
+    converter.register_structure_hook(bytes, lambda value, _: value.tobytes())
+    converter.register_unstructure_hook_func(_is_array, lambda value: value)
+    converter.register_structure_hook_func(_is_array, _checked_array)
+
+    @converter.register_structure_hook_factory(dataclasses.is_dataclass)
+    def shaped(cls: Any) -> Any:
+        make = make_dict_structure_fn(
+            cls, converter, _cattrs_forbid_extra_keys=True, _cattrs_detailed_validation=False
+        )
+
+        def hook(value: Any, kind: Any) -> Any:
+            """Raise ValueError for an array of another shape."""
+            made = make(value, kind)
+            for name, shape in _SHAPES.items():
+                array = getattr(made, name, None)
+                if array is not None and not _fits(array.shape, shape):
+                    raise ValueError(f"{name} has the shape {array.shape}")
+            return made
+
+        return hook
+
+    return converter
+
+
+def _as_it_is(*kinds: type) -> Any:
+    def hook(value: Any, _: Any) -> Any:
+        """Raise TypeError for a value of another type, ValueError for one beyond 64 bits."""
+        if isinstance(value, bool) is not (kinds[0] is bool) or not isinstance(value, kinds):
+            raise TypeError(f"{value!r} is no {kinds[0].__name__}")
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ValueError(f"{value} has more than 64 bits")
+        return value
+
+    return hook
+
+
+def _is_array(kind: Any) -> bool:
+    return get_origin(kind) is np.ndarray
+
+
+def _checked_array(value: Any, kind: Any) -> Any:
+    (scalar,) = get_args(get_args(kind)[1])
+    if not isinstance(value, np.ndarray) or value.dtype != np.dtype(scalar):
+        raise TypeError(f"no array of {scalar.__name__}")
+    return value
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(
+        size == known or known is _MANY for size, known in zip(shape, wanted, strict=True)
+    )
+
+
+_CONVERTER = _converter()

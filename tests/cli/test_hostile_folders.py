@@ -1,0 +1,168 @@
+"""A folder of somebody else's: no command executes what it names, or writes through its links."""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+import sqlite3
+import zlib
+from pathlib import Path
+
+import pytest
+
+from mavfi_cli.campaigns import ledger as ledgers
+from mavfi_cli.campaigns.begin import SPEC
+from mavfi_cli.campaigns.ledger import LEDGER, LOCK, Ledger
+from mavfi_cli.campaigns.missions import ResultState
+from mavfi_cli.campaigns.specification_file import parse_spec
+from mavfi_cli.mission.run_folder import RESULT
+from mavfi_cli.spec.fault import FaultConfig
+
+_TEXT = "mine"
+
+
+class _Bomb:
+    """Pickles as a call that leaves a file."""
+
+    def __init__(self, struck):
+        self.struck = struck
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.struck}",)
+
+
+@pytest.fixture
+def precious(tmp_path):
+    """A folder of the user's."""
+    folder = tmp_path / "precious"
+    (folder / "000000-kept").mkdir(parents=True)
+    (folder / "000000-kept" / "file").write_text(_TEXT)
+    (folder / "file").write_text(_TEXT)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def faulty_flight(fly_short):
+    return fly_short(fault=FaultConfig(target="planning", seed=1))
+
+
+@pytest.fixture
+def hostile(faulty_flight, precious, tmp_path):
+    """A folder that is a run, a campaign, one of kernels, and the parent of such folders."""
+    folder, struck = tmp_path / "hostile", tmp_path / "struck"
+    shutil.copytree(faulty_flight.path, folder)
+    script = tmp_path / "firmware"
+    script.write_text(f"#!/bin/sh\ntouch {struck}\n")
+    script.chmod(0o755)
+    firmware = {"autopilot": "ardupilot", "firmware": str(script)}
+    _make_run(folder / RESULT, firmware)
+    _make_campaign(folder, firmware)
+    pickled = pickle.dumps(_Bomb(struck))
+    for name in ("inputs.npz", "inputs.pickle", "orders.pickle"):
+        (folder / name).write_bytes(pickled)
+    plan = {"program": ["/usr/bin/touch", str(struck)], "environment": {}, "scope": ["touch"]}
+    (folder / "plan.json").write_text(json.dumps(plan))
+    names = ("runs", "work", "profiles", ".profiles", "golden", "world-search", "protected")
+    for name in names:
+        (folder / name).symlink_to(precious)
+    os.unlink(folder / LOCK)
+    for name in (LOCK, "runs.jsonl", "kernels.json", f".{RESULT}.{os.getpid()}.partial"):
+        (folder / name).symlink_to(precious / "file")
+    for name in ("mavbench", "bare", "kernels"):
+        shutil.copytree(folder, folder / name, symlinks=True)
+    return folder
+
+
+def _make_run(path, firmware):
+    result = json.loads(path.read_text())
+    result["config"] |= firmware
+    digest = hashlib.sha256(Path(firmware["firmware"]).read_bytes()).hexdigest()
+    result["files"] = {firmware["firmware"]: digest}
+    path.write_text(json.dumps(result))
+
+
+def _make_campaign(folder, firmware):
+    mission = "".join(f"{name} = {json.dumps(value)}\n" for name, value in firmware.items())
+    text = f'name = "theirs"\nrepetitions = 2\n[mission]\nworld = "farm"\n{mission}'
+    spec = parse_spec(text, Path(SPEC))
+    (folder / SPEC).write_text(text)
+    result = json.loads((folder / RESULT).read_text())
+    with Ledger(folder, writing=True) as ledger:
+        ledger.plan(spec.missions())
+        ledger.set_meta({"spec": spec.to_toml(), "name": spec.name})
+        ledger.add(
+            0, state=ResultState.FLOWN, result=result, reason="", injected=None, wall_s=1.0,
+            attempts=1, path="../precious",
+        )  # fmt: skip
+
+
+COMMANDS = [
+    "show HOSTILE",
+    "show HOSTILE --pair",
+    "show HOSTILE --picture picture.svg",
+    "replay HOSTILE",
+    "replay HOSTILE --without-fault",
+    "replay HOSTILE --mission 0",
+    "view HOSTILE --save view.rrd",
+    "report HOSTILE --output report.html",
+    "campaign plan HOSTILE",
+    "campaign status HOSTILE --full",
+    "campaign export HOSTILE -",
+    "campaign report HOSTILE",
+    "campaign draw HOSTILE --output pair.svg",
+    "campaign run HOSTILE --quiet",
+    "campaign run HOSTILE --missing-only --quiet",
+    "kernels --kernel control --runs 1 --out HOSTILE",
+    "kernels --replay HOSTILE",
+    "reproduce fig9 --scale 0.001 --out HOSTILE",
+    "train --flown HOSTILE --out models",
+    "train --flown . --out models",
+    "vpm --overhead HOSTILE",
+    "detect evaluate --world farm --flights 1 --golden-flights 1 --quiet --out HOSTILE",
+    "compare --world farm --missions 1 --quiet --out HOSTILE",
+    "fly --world farm --start=2,2,0 --goal=10,6,5 --quiet --out HOSTILE",
+]
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_a_command_neither_executes_nor_removes_what_a_folder_names(
+    line, hostile, precious, command_line, monkeypatch
+):
+    monkeypatch.delenv("ARDUCOPTER_SITL", raising=False)
+    before = sorted(path.relative_to(precious) for path in precious.rglob("*"))
+    code, _, err = command_line(*line.replace("HOSTILE", str(hostile)).split())
+    assert code in (0, 1, 2)
+    assert "Traceback" not in err
+    assert not (hostile.parent / "struck").exists()
+    assert sorted(path.relative_to(precious) for path in precious.rglob("*")) == before
+    assert {path.read_text() for path in precious.rglob("file")} == {_TEXT}
+
+
+def test_the_firmware_of_a_record_flies_only_if_the_user_names_it(hostile, command_line):
+    code, _, err = command_line("replay", hostile)
+    script = hostile.parent / "firmware"
+    assert code == 1
+    assert f"names the program {script}, which would be executed" in err
+    code, _, err = command_line("replay", hostile, "--firmware", script)
+    assert (hostile.parent / "struck").exists()
+    assert code == 1
+    assert "the firmware" in err
+
+
+def test_a_record_that_inflates_beyond_bounds_is_refused(hostile, command_line, monkeypatch):
+    monkeypatch.setattr(ledgers, "_LARGEST_RECORD", 1 << 20)
+    with sqlite3.connect(hostile / LEDGER) as database:
+        bomb = zlib.compress(b'"' + bytes(8 << 20) + b'"')
+        database.execute("UPDATE records SET result = ?", (bomb,))
+    code, out, err = command_line("campaign", "export", hostile, "-")
+    assert (code, out) == (1, "")
+    assert "has more than 1 MB" in err
+
+
+def test_the_lock_of_a_campaign_is_no_link(hostile, precious, command_line, monkeypatch):
+    monkeypatch.setenv("ARDUCOPTER_SITL", str(hostile.parent / "firmware"))
+    code, _, err = command_line("campaign", "run", hostile, "--quiet")
+    assert code == 1
+    assert "Too many levels of symbolic links" in err
+    assert (precious / "file").read_text() == _TEXT
