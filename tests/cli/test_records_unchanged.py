@@ -97,7 +97,7 @@ COMMANDS = {
         ["campaign", "export", "c", "-"],
     ),
     "plan": ("6aa389c6388b46f8", ["campaign", "plan", "fig7", "--json"]),
-    # Its inputs_sha256 is of a pickle that names our modules: renewed when those moved to attack/.
+    # Renewed when its inputs_sha256 became that of an .npz file, because no pickle is on the disk.
     # Renewed when operands became the bits that are read or written, and when the settings got the
     # memory of a run, and with the code of x86-64-v3.
     "kernels": ("2717cc920551488f", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
