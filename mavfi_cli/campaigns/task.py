@@ -27,8 +27,10 @@ def perform(changes: Mapping[str, Any], out: Path) -> Path:
         MavfiError: the mission could not begin, or its record could not be written.
     """
     from mavfi_cli.core.config import structure
+    from mavfi_cli.mission.instruction import CACHE
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.spec.mission import MissionConfig
 
-    return fly_mission(structure(changes, MissionConfig), out, Watcher()).path
+    profiles = (out / CACHE).resolve()  # the runner has made a link to those of the campaign
+    return fly_mission(structure(changes, MissionConfig), out, Watcher(), profiles=profiles).path

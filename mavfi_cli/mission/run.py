@@ -35,6 +35,7 @@ from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import Outcome, Reaction
 from mavfi_cli.mission.flight import Flight
+from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
@@ -52,6 +53,7 @@ def fly_mission(
     *,
     recorder: Recorder | None = None,
     repeat: Mapping[str, Any] | None = None,
+    profiles: Path | None = None,
     for_debugger: Callable[[int], None] | None = None,
     launch: StartVehicle = Vehicle.start,
 ) -> RunFolder:
@@ -63,6 +65,7 @@ def fly_mission(
         out: where the run folder goes.
         recorder: keeps what the flight asks of its nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
+        profiles: folder of the profiles of instruction-level faults; None for one in `out`.
         for_debugger: called when the node waits for a debugger at the injected instruction.
         launch: starts the simulated vehicle.
 
@@ -78,7 +81,7 @@ def fly_mission(
     if config.instruction is not None:
         from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the tracer
 
-        injection = InstructionInjection(config, out, repeat, for_debugger)
+        injection = InstructionInjection(config, profiles or out / CACHE, repeat, for_debugger)
     with (
         contextlib.closing(injection),
         interruptible() as interrupt,

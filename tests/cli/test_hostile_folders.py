@@ -122,6 +122,7 @@ COMMANDS = [
     "detect evaluate --world farm --flights 1 --golden-flights 1 --quiet --out HOSTILE",
     "compare --world farm --missions 1 --quiet --out HOSTILE",
     "fly --world farm --start=2,2,0 --goal=10,6,5 --quiet --out HOSTILE",
+    "fly --world farm --level instruction --inject control --quiet --out HOSTILE",
 ]
 
 

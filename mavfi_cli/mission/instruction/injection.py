@@ -46,7 +46,7 @@ from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.tracee import Tracee
-from mavfi_cli.mission.instruction import CACHE, PROGRAM, kept_in
+from mavfi_cli.mission.instruction import PROGRAM, kept_in
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
 from mavfi_cli.mission.run import fly_golden
@@ -91,13 +91,13 @@ class _Entries:
 
 
 def _plan_fault(
-    config: MissionConfig, asked: InstructionConfig, out: Path
+    config: MissionConfig, asked: InstructionConfig, profiles: Path
 ) -> tuple[InstructionFault, dict[str, Any]]:
     """Draw the fault of a mission, and the entries of _CONTEXT."""
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
-    folder = kept_in(out / CACHE, golden)
+    folder = own_folder(kept_in(own_folder(profiles), golden))
 
     def fly() -> GoldenOrders:
         recorder = Recorder()
@@ -218,7 +218,7 @@ def _kept(
         if sound(kept := unpack(read_bounded(path, _LARGEST), kind)):
             return kept
     data = pack(make())
-    write_atomically(own_folder(path.parent) / path.name, lambda file: file.write(data))
+    write_atomically(path, lambda file: file.write(data))
     return unpack(data, kind)
 
 
@@ -348,7 +348,7 @@ class InstructionInjection(NoInjection):
     """One instruction-level fault in one mission; messages pass unchanged.
 
     Args:
-        out: the folder below which golden runs and profiles are kept.
+        profiles: the folder in which golden runs and profiles are kept.
         repeat: the record of a fault to repeat; None draws one.
         for_debugger: called when the node waits for a debugger at the injected instruction.
 
@@ -360,7 +360,7 @@ class InstructionInjection(NoInjection):
     def __init__(
         self,
         config: MissionConfig,
-        out: Path,
+        profiles: Path,
         repeat: Mapping[str, Any] | None,
         for_debugger: Callable[[int], None] | None,
     ) -> None:
@@ -373,7 +373,7 @@ class InstructionInjection(NoInjection):
             )
         self._repeat, self._for_debugger = repeat, for_debugger
         if repeat is None:
-            self._fault, self._context = _plan_fault(config, config.instruction, out)
+            self._fault, self._context = _plan_fault(config, config.instruction, profiles)
         else:
             self._fault = record.fault_of(repeat)
             if missing := [name for name in _CONTEXT if name not in repeat]:
