@@ -28,6 +28,7 @@ UNCALLED = {
     "format_commands": "click calls it",
     "format_options": "click calls it",
     "checkMotion": "OMPL calls it",
+    "find_class": "pickle calls it",
     "library_scope": "for kernels of users (docs/how-to/kernel.md)",
 }
 # Rooms whose numbers reach a mission, a fault's draw or the model; training is none of them.

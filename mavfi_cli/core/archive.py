@@ -108,7 +108,7 @@ def _converter() -> cattrs.Converter:
     converter.register_structure_hook_func(_is_array, _checked_array)
 
     @converter.register_structure_hook_factory(dataclasses.is_dataclass)
-    def shaped(cls: Any) -> Any:
+    def _shaped(cls: Any) -> Any:
         make = make_dict_structure_fn(
             cls, converter, _cattrs_forbid_extra_keys=True, _cattrs_detailed_validation=False
         )
