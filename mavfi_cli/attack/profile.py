@@ -345,7 +345,7 @@ def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
 
 def _counted(
     place: AttackPlace, counts: Executions
-) -> tuple[CountedRun, Image, tuple[tuple[int, bytes], ...]]:
+) -> tuple[CountedRun, Image, tuple[ScopeCode, ...]]:
     """The executions in scope, in a native run."""
     image, code, scope = _code(place)
     objects = {each.path: each.bias for each in map(image.named, scope.objects) if each.path}
