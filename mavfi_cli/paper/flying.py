@@ -178,12 +178,11 @@ def _measured(
     kinds: dict[str, list[int]] = {}
     for number, kind in sorted(missing.items()):
         kinds.setdefault(kind, []).append(number)
-    first, told = [], []
-    for kind, numbers in kinds.items():
-        if known[kind] >= _OF_A_KIND:
-            continue
+    rare = [numbers for kind, numbers in kinds.items() if known[kind] < _OF_A_KIND]
+    first, told = list[int](), list[int]()
+    for place, numbers in enumerate(sorted(rare, key=len)):
         last = min(len(numbers), len(ledger.cells())) - 1  # of the first repetition
-        count = -(-_MEASURED // len(kinds))
+        count = -(-(_MEASURED - len(told)) // (len(rare) - place))
         places = range(0, last, max(2, last // count))[:count]
         first += [numbers[place] for place in places]
         told += [numbers[place + 1] for place in places]
