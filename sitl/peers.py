@@ -1,11 +1,14 @@
-"""The peers at several endpoints: who is heard, in which order, and for how long.
+"""The peers at several endpoints: who is heard and told, in which order, and for how long.
 
 A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
-their number and what waits for them. A UDP peer without a valid frame for 30 s is forgotten.
+their number and what waits for them. A sender's address may be false, and everything that is sent
+then hits whoever has it. So a UDP peer is told everything only for a short while after each of its
+valid frames, then less and less, and is forgotten after 30 s.
 """
 
 from __future__ import annotations
 
+import math
 import select
 import time
 from abc import ABC, abstractmethod
@@ -18,13 +21,20 @@ from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
 from mavfi_cli.link.transport import Listener, Transport, open_listener
 
 _SILENCE_S = 30.0
+# Time after a valid frame for which a UDP peer is told everything: after its first one, and later.
+_NEWCOMER_S, _LISTENER_S = 0.2, 3.0
 
 
 class Peer(ABC):
-    """Somebody at the other end of a transport. `Peers` keeps scheme and time of the last word."""
+    """Somebody at the other end of a transport.
+
+    `Peers` keeps its scheme, when it was last heard and told, and for how long it is told everything
+    after it was heard.
+    """
 
     scheme = ""
-    heard_s = 0.0
+    heard_s = told_s = 0.0
+    listens_s = _NEWCOMER_S
 
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
@@ -33,10 +43,12 @@ class Peer(ABC):
     def take(self, data: bytes) -> Sequence[object]:
         """Handle received bytes. Return the valid messages among them."""
 
-    def forward(self, *, frame: bytes, of: Peer) -> None:
-        """Send a frame of another peer unchanged."""
-        if of is not self:
-            self.transport.send(frame)
+    def forward(self, *, frame: bytes, of: Peer) -> bool:
+        """Send a frame of another peer unchanged. Return False for the peer's own."""
+        if of is self:
+            return False
+        self.transport.send(frame)
+        return True
 
     def close(self) -> None:
         """Release the connection."""
@@ -64,7 +76,7 @@ class Peers(Generic[P]):
         self._signing, self._allow_unsigned, self._clock = signing, allow_unsigned, clock
         self._endpoints: list[tuple[str, Listener, Callable[[Transport], P]]] = []
         self._peers: list[P] = []
-        self._turns = 0
+        self._turns = self._told = 0
         self.over = False  # True once an inherited connection has closed
         self.lost: LinkLost | None = None  # of the only peer of an endpoint that calls
 
@@ -114,6 +126,25 @@ class Peers(Generic[P]):
         for peer in self:
             self._try(peer, action)
 
+    def tell(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
+        """Call a function that sends with every peer by turns, except for a silent UDP peer.
+
+        The intervals at which a silent one is told double. Once the time is over, the others have
+        to wait for the next call, in which they are the first. The function returns False if there
+        was nothing to send.
+        """
+        for _ in range(len(self._peers)):
+            if not self._peers:
+                break
+            self._told = (self._told + 1) % len(self._peers)
+            peer, now_s = self._peers[self._told], self._clock()
+            silent_s, untold_s = now_s - peer.heard_s, now_s - peer.told_s
+            if peer.scheme != "udpin" or silent_s <= max(peer.listens_s, 2.0 * untold_s):
+                if self._try(peer, action) is not False:
+                    peer.told_s = now_s
+            if self._clock() >= until_s:
+                break
+
     def close(self) -> None:
         """Close every peer and endpoint."""
         for peer in self._peers:
@@ -126,14 +157,16 @@ class Peers(Generic[P]):
             for transport in listener.accept_ready():
                 peer = make(transport)
                 peer.scheme, peer.heard_s = scheme, self._clock()
+                peer.told_s = peer.heard_s
                 self._peers.append(peer)
                 self._hear(peer)  # else a copy of its signed frame would be as new
+                peer.listens_s = _NEWCOMER_S
 
     def _hear(self, peer: P) -> bool:
         """Handle a few waiting bytes of a peer. Return True if there were any."""
         data = self._try(peer, lambda peer: peer.transport.receive(0.0))
         if data and self._try(peer, lambda peer: peer.take(data)):
-            peer.heard_s = self._clock()
+            peer.heard_s, peer.listens_s = self._clock(), _LISTENER_S
         return bool(data)
 
     def _try(self, peer: P, action: Callable[[P], T]) -> T | None:

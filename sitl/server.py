@@ -118,15 +118,16 @@ class Client(Peer):
             ]
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
-    def send_between(self, stamp_us: int) -> None:
+    def send_between(self, stamp_us: int) -> bool:
         """Send the streams that are faster than a tick, at a stamp between two ticks."""
         autopilot = self._simulation.autopilot
-        if self.link.is_fast and isinstance(autopilot, Autopilot):
-            self._send([], autopilot.collect_between(self.link, stamp_us))
+        if not (self.link.is_fast and isinstance(autopilot, Autopilot)):
+            return False
+        return self._send([], autopilot.collect_between(self.link, stamp_us))
 
-    def send_answers(self) -> None:
+    def send_answers(self) -> bool:
         """Send answers without waiting for the tick."""
-        self._send([], self.link.take())
+        return self._send([], self.link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
         """Send messages of both components; the camera's answers are the first."""
@@ -153,6 +154,7 @@ class Client(Peer):
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 _LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
+_LATE_S = 0.25  # delay of a tick beyond which fast streams have the rate of ticks
 _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdue
 
 
@@ -298,9 +300,10 @@ class _Realtime:
             click.echo(f"{kind} is ready: clients may connect", err=True)
         self._clients.serve(until_s=0.0)
         while not stopped() and not self._clients.over:
-            self._clients.each(Client.send_tick)
-            is_fast = any(client.link.is_fast for client in self._clients)
-            self._serve(STEP_US if is_fast else TICK_US, stopped)
+            is_fast = self._pace.remaining_s() > -_LATE_S and any(
+                client.link.is_fast for client in self._clients
+            )
+            self._serve(Client.send_tick, STEP_US if is_fast else TICK_US, stopped)
             self._simulation.advance(partial(self._between, stopped=stopped) if is_fast else None)
             collision = self._simulation.referee.collision
             if collision is not None and not self._told_collision:
@@ -314,33 +317,38 @@ class _Realtime:
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
         """Send the fast streams at a stamp within a tick, and wait for the next step."""
-        self._clients.each(partial(Client.send_between, stamp_us=stamp_us))
-        self._serve(STEP_US, stopped)
+        send = partial(Client.send_between, stamp_us=stamp_us)
+        self._serve(send, STEP_US, stopped)
 
     def close(self) -> None:
         self._clients.close()
 
-    def _serve(self, duration_us: int, stopped: Callable[[], bool]) -> None:
-        """Answer clients for a part of the tick; at least once, also if it is overdue.
+    def _serve(
+        self, send: Callable[[Client], bool], duration_us: int, stopped: Callable[[], bool]
+    ) -> None:
+        """Send what is due, and answer clients until the next tick or step, once if it is overdue.
 
-        The time for all clients is bounded, so that a flood cannot stop the clock.
+        The time for all clients is bounded, so that a flood cannot stop the clock: half of it is
+        for what is due.
         """
         self._pace.next_tick(duration_us * 1e-6)
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
-        until_s = time.monotonic() + max(self._pace.remaining_s(), share_s)
+        now_s = time.monotonic()
+        time_s = max(self._pace.remaining_s(), share_s)
+        self._clients.tell(send, now_s + 0.5 * time_s)
         while True:
             self._clients.wait(max(self._pace.remaining_s(), 0.0))
-            self._clients.serve(until_s)
-            self._forward()
-            self._clients.each(Client.send_answers)
+            self._clients.serve(now_s + time_s)
+            self._forward(now_s + time_s)
+            self._clients.tell(Client.send_answers, now_s + time_s)
             if self._pace.remaining_s() <= 0.0 or stopped() or self._clients.over:
                 break
 
-    def _forward(self) -> None:
+    def _forward(self, until_s: float) -> None:
         for speaker in self._clients:
-            while speaker.overheard:
+            while speaker.overheard and time.monotonic() < until_s:
                 frame = speaker.overheard.popleft()
-                self._clients.each(partial(Client.forward, frame=frame, of=speaker))
+                self._clients.tell(partial(Client.forward, frame=frame, of=speaker), until_s)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -464,7 +464,7 @@ class _UdpListener(_SocketOwner):
 
     def pump(self) -> None:
         judged = 0
-        for _ in range(_PUMPED):
+        for _ in range(_MAX_WAITING):
             data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
             if sender is None:
                 return

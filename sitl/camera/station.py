@@ -64,9 +64,8 @@ class _Linked(Peer):
             self._station.hear(message, self)
         return messages
 
-    def forward(self, *, frame: bytes, of: Peer) -> None:
-        if self.awaits_frames:
-            super().forward(frame=frame, of=of)
+    def forward(self, *, frame: bytes, of: Peer) -> bool:
+        return self.awaits_frames and super().forward(frame=frame, of=of)
 
     def close(self) -> None:
         super().close()
@@ -296,7 +295,7 @@ class Station:
         """Handle a message of a peer, and pass it on."""
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
-            self.peers.each(partial(_Linked.forward, frame=frame, of=source))
+            self.peers.tell(partial(_Linked.forward, frame=frame, of=source))
 
     def _is_of_holder(self, message: Any, source: _Linked) -> bool:
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
@@ -435,7 +434,7 @@ class Station:
     def _send(self, messages: Sequence[Any]) -> None:
         self.frames_sent += sum(m.get_type() == "CAMERA_IMAGE_CAPTURED" for m in messages)
         if data := b"".join(self._codec.encode(message) for message in messages):
-            self.peers.each(lambda peer: peer.transport.send(data))
+            self.peers.tell(lambda peer: peer.transport.send(data))
 
     def close(self) -> None:
         """Close every link."""
