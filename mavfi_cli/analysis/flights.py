@@ -51,6 +51,15 @@ EXPORTED = (
     "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
     "wall_s", *COSTS, "attempts", "path", "changes",
 )  # fmt: skip
+BITS = pa.list_(pa.list_(pa.int64()))  # of each struck component, its bits
+_TYPES = {  # of the columns that are not text; one without a value has its type, too
+    "struck_bits": BITS,
+    **dict.fromkeys(
+        ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
+         "strike_tick", "struck_execution", "replans", "attempts"), pa.int64()),
+    **dict.fromkeys(
+        (*QUALITY, *COSTS, "strike_s", "first_read_s", "simulated_s", "wall_s"), pa.float64()),
+}  # fmt: skip
 _HOST = ("machine", "cores", "started")
 _METADATA = "mavfi"  # key of an export's provenance
 BoolArray = NDArray[np.bool_]
@@ -168,8 +177,46 @@ def exported(ledger: Ledger) -> pa.Table:
     """
     whole = flights(ledger)
     labels = [name for name in whole.column_names if name.startswith("label_")]
-    mine = whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]])
+    mine = _typed(whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]]))
     return mine.replace_schema_metadata({_METADATA: canonical(provenance(ledger))})
+
+
+def read_export(path: Path) -> pa.Table:
+    """Read a file of `exported`. One of an earlier version gets the types of this one.
+
+    Raises:
+        RecordError: the file is missing or damaged.
+    """
+    table = read_parquet(path, "export of a campaign")
+    place = table.schema.get_field_index("struck_bits")
+    if place >= 0 and pa.types.is_string(table.schema.field(place).type):  # as in "53;1 55"
+        try:
+            bits = [_parsed(text) for text in table["struck_bits"].to_pylist()]
+        except ValueError as error:
+            raise RecordError(f"{path}: damaged, no export can be read ({error})") from None
+        table = table.set_column(place, "struck_bits", pa.array(bits, BITS))
+    return _typed(table)
+
+
+def _parsed(text: str | None) -> list[list[int]] | None:
+    if text is None:
+        return None
+    return [[*map(int, component.split())] for component in text.split(";")] if text else []
+
+
+def _typed(table: pa.Table) -> pa.Table:
+    """A table whose columns without a value have the types that they have with values."""
+    kinds = {
+        field.name: _TYPES.get(field.name, pa.string())
+        for field in table.schema
+        if pa.types.is_null(field.type)
+    }
+    return table.cast(
+        pa.schema(
+            [field.with_type(kinds.get(field.name, field.type)) for field in table.schema],
+            table.schema.metadata,
+        )
+    )
 
 
 def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
@@ -251,7 +298,7 @@ def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str,
         ConfigError: no such mission has flown.
     """
     if campaign.is_file():
-        table = read_parquet(campaign, "export of a campaign")
+        table = read_export(campaign)
         if missing := {"number", "outcome", "changes"} - {*table.column_names}:
             told = f"no export of a campaign: it has no column {', '.join(sorted(missing))}"
             raise RecordError(f"{campaign}: {told}")

@@ -3,7 +3,8 @@
 This is the one place where a result.json is read. Each measure is a column of a table of flights. A
 mission that crashed or hung before it could write its record has few fields; a measure that its
 record does not have is None. A source-level fault that struck several components has them joined by
-";", in one order in all measures; of several strikes the measures have the first.
+";", in one order in all measures; `struck_bits` has a list of bits for each. Of several strikes the
+measures have the first.
 """
 
 from __future__ import annotations
@@ -223,7 +224,7 @@ def _source(fault: Record) -> dict[str, Any]:
             f"struck_{when}": _joined(_value(change, when) for change in changes)
             for when in ("before", "after")
         },
-        "struck_bits": _joined(_bits(change["bits"]) for change in changes),
+        "struck_bits": [list(change["bits"]) for change in changes],
         "activation": _at(fault, "activation", "activation"),
         "first_reader": reader.get("name"),
         "first_read_state": reader.get("state"),
@@ -246,7 +247,7 @@ def _instruction(fault: Record, nodes: Record) -> dict[str, Any]:
         "struck_execution": fault.get("k"),
         "struck_role": corruption.get("role"),
         "struck_register": corruption.get("register") or corruption.get("site"),
-        "struck_bits": _bits(corruption["bits"]) if corruption else None,
+        "struck_bits": [list(corruption["bits"])] if corruption else None,
         "strike_invocation": fault.get("invocation"),
         "strikes": int(injection["applied"]) if injection else None,  # cut off: who knows
     }
@@ -267,10 +268,6 @@ def _instruction(fault: Record, nodes: Record) -> dict[str, Any]:
 
 def _joined(values: Iterable[Any]) -> str:
     return ";".join(map(str, values))
-
-
-def _bits(places: Sequence[int]) -> str:
-    return " ".join(map(str, places))
 
 
 def _value(change: Record, when: str) -> Any:

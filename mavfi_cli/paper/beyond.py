@@ -103,7 +103,7 @@ def state_map(flights: Flights) -> dict[tuple[str, str, str], dict[str, Share]]:
     A fault in several components is told by its group, and by the highest bit that it flips.
     """
     hit = flights.struck(level="source", own_lost=False)
-    hit = hit.where([bool(x["struck_state"] and x["struck_bits"]) for x in hit.rows()])
+    hit = hit.where([bool(x["struck_state"] and any(x["struck_bits"] or ())) for x in hit.rows()])
     places = ((_state(x), _class(x), x["strike_phase"] or "") for x in hit.rows())
     return {
         place: {"harmed": those.share("harmed"), "lost": those.share()}
@@ -118,9 +118,9 @@ def _state(flight: Row) -> str:
 
 def _class(flight: Row) -> str:
     name = str(flight["struck_state"]).split(";")[0]
-    bits = max(map(int, str(flight["struck_bits"]).replace(";", " ").split()))
+    highest = max(bit for bits in flight["struck_bits"] for bit in bits)
     kinds = _BITS[BY_NAME[name].dtype if name in BY_NAME else DType.FLOAT64]
-    return next(each for each, lowest in kinds if bits >= lowest)
+    return next(each for each, lowest in kinds if highest >= lowest)
 
 
 # Failures a flight hour ---------------------------------------------------------------------------

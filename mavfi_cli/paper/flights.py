@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis import flights as tables
-from mavfi_cli.analysis.flights import COSTS, BoolArray
+from mavfi_cli.analysis.flights import BITS, COSTS, BoolArray
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
@@ -32,9 +32,10 @@ _COLUMNS: Mapping[str, pa.DataType] = {
     **dict.fromkeys((
         "pair", "world", "planner", "platform", "stack", "level", "fault_target", "fault_field",
         "detector", "protect", "state", "outcome", "injected", "activation",
-        "strike_phase", "struck_state", "struck_bits", "struck_kernel", "node_ended", "path",
+        "strike_phase", "struck_state", "struck_kernel", "node_ended", "path",
         "changes",
     ), pa.string()),
+    "struck_bits": BITS,
     **dict.fromkeys((
         "flight_time_s", "distance_m", "min_clearance_m", "goal_distance_m", "energy_regression_j",
         "energy_propeller_j", "replans", *COSTS,

@@ -11,14 +11,14 @@ from typing import Any
 import pyarrow as pa
 
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary
-from mavfi_cli.analysis.flights import flights, provenance
+from mavfi_cli.analysis.flights import flights, provenance, read_export
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError
-from mavfi_cli.core.files import file_digest, read_parquet
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import FlightsPlan
@@ -178,7 +178,7 @@ def _from_summary(path: Path) -> _Kernels:
 
 
 def _from_export(path: Path) -> CampaignSource:
-    table = read_parquet(path, "export of a campaign")
+    table = read_export(path)
     lacking = [name for name in _NEEDED if name not in table.column_names]
     if lacking:
         raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")

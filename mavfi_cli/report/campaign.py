@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -322,8 +323,19 @@ def flights_file(table: pa.Table, path: Path) -> bytes:
     if path.suffix == ".parquet":
         parquet.write_table(table, content, compression="zstd")
     elif path.suffix == ".csv" or path == Path("-"):
-        csv.write_csv(table, content)
+        csv.write_csv(_flat(table), content)
     else:
         problem = "the name must end in .parquet or .csv, or - for CSV on stdout"
         raise ConfigError(problem, path=path)
     return content.getvalue()
+
+
+def _flat(table: pa.Table) -> pa.Table:
+    """A table without lists, which CSV does not have: they become JSON."""
+    for place, field in enumerate(table.schema):
+        if pa.types.is_list(field.type):
+            texts = [
+                None if each is None else json.dumps(each) for each in table[place].to_pylist()
+            ]
+            table = table.set_column(place, field.name, pa.array(texts, pa.string()))
+    return table

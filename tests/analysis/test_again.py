@@ -1,17 +1,20 @@
 """`mavfi replay CAMPAIGN --mission`: a mission of a ledger and of an export, flown again."""
 
+import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from mavfi_cli import library
-from mavfi_cli.analysis.flights import mission_of
+from mavfi_cli.analysis.flights import mission_of, read_export
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.report.campaign import flights_file
 from mavfi_cli.spec.fault import FaultConfig
 
 FAULT = FaultConfig(target="waypoint_position", together=True, field="sign", seed=3)
@@ -77,3 +80,31 @@ def test_a_debugger_needs_a_run_folder(folder, mavfi):
     done = mavfi("replay", str(folder), "--mission", "0", "--gdb")
     assert done.returncode == 2
     assert "--gdb needs a run folder" in done.stderr
+
+
+def test_columns_of_an_export_have_their_types_with_and_without_values(export):
+    schema = pq.read_schema(export)
+    assert schema.field("world_seed").type == pa.int64()  # no mission has one
+    assert [field.name for field in schema if pa.types.is_null(field.type)] == []
+    golden, struck = pq.read_table(export)["struck_bits"].to_pylist()
+    assert golden is None
+    assert struck == [[63], [63], [63]]  # the signs of x, y and z
+
+
+def test_an_export_of_an_earlier_version_is_read_as_one_of_this(export, tmp_path):
+    table = pq.read_table(export)
+    place, old = table.schema.get_field_index("struck_bits"), tmp_path / "old.parquet"
+    rows = [None, "1 15;19 24"]
+    pq.write_table(table.slice(0, 2).set_column(place, "struck_bits", pa.array(rows)), old)
+    assert read_export(old)["struck_bits"].to_pylist() == [None, [[1, 15], [19, 24]]]
+    assert read_export(export).equals(table)
+    pq.write_table(table.slice(0, 1).set_column(place, "struck_bits", pa.array(["x"])), old)
+    with pytest.raises(RecordError, match="damaged"):
+        read_export(old)
+
+
+def test_a_list_is_json_in_csv(export):
+    text = flights_file(read_export(export), Path("t.csv")).decode()
+    rows = list(csv.DictReader(text.splitlines()))
+    struck = pq.read_table(export)["struck_bits"].to_pylist()
+    assert [json.loads(row["struck_bits"] or "null") for row in rows] == struck

@@ -41,7 +41,7 @@ def test_a_fault_in_a_state():
     assert told(fault=SOURCE) == {
         "strikes": 1, "strike_s": 11.96, "strike_phase": "flying", "strike_tick": 79,
         "strike_invocation": 1, "struck_state": "waypoint_x", "struck_index": "33",
-        "struck_bits": "57", "struck_before": "25.5", "struck_after": "150000000000.0",
+        "struck_bits": [[57]], "struck_before": "25.5", "struck_after": "150000000000.0",
         "struck_before_hex": "0x4039800000000000", "struck_after_hex": "0x4239800000000000",
         "activation": "read", "first_reader": "collision_check",
         "first_read_state": "waypoint_x", "first_read_s": 12.17,
@@ -64,14 +64,14 @@ def test_several_components_keep_their_order_and_what_json_cannot_hold_its_value
     found = told(fault={**SOURCE, "strikes": [strike, STRIKE], "strike_count": 2})
     assert found["strikes"] == 2
     assert found["struck_state"] == "waypoint_x;waypoint_y"
-    assert found["struck_bits"] == "57;1 2"
+    assert found["struck_bits"] == [[57], [1, 2]]
     assert found["struck_after"] == f"150000000000.0;{value}"
 
 
 def test_a_fault_in_an_instruction():
     nodes = {"octomap": {"crashes": [{"how": "killed by SIGSEGV"}], "hangs": 1}}
     assert told(fault=INSTRUCTION, nodes=nodes) == {
-        "strikes": 1, "strike_s": 13.39, "strike_invocation": 15, "struck_bits": "0 4",
+        "strikes": 1, "strike_s": 13.39, "strike_invocation": 15, "struck_bits": [[0, 4]],
         "struck_before_hex": "0x0", "struck_after_hex": "0x11", "activation": "read",
         "struck_node": "octomap", "struck_kernel": "octomap", "struck_function": "search+0x205",
         "struck_address": "liboctomap.so+0x28765", "struck_instruction": "and ebx, 1",
@@ -85,7 +85,7 @@ def test_a_killed_process_changes_no_bit():
     killed = {**SOURCE, "states": ["process.planner"], "strikes": [strike]}
     found = measures_of({"fault": killed})
     assert (found["struck_s"], found["first_bits"]) == (9.0, [])
-    assert (found["strikes"], found["struck_bits"]) == (1, "")
+    assert (found["strikes"], found["struck_bits"]) == (1, [])
 
 
 def test_a_fault_that_did_not_act_has_no_strike():

@@ -43,10 +43,10 @@ def test_a_state_is_told_by_its_highest_bit():
     rows = [row(seed=seed) for seed in (1, 2, 3)]
     where = {"strike_phase": "flying"}
     rows += [
-        row("planning", seed=1, struck_state="waypoint_x", struck_bits="62", **where, **LOST),
-        row("waypoint_position", seed=2, struck_state="waypoint_x;waypoint_y", struck_bits="3;63",
-            **where),
-        row("planning", seed=3, struck_state="plan_trajectory_seq", struck_bits="15", **where),
+        row("planning", seed=1, struck_state="waypoint_x", struck_bits=[[62]], **where, **LOST),
+        row("waypoint_position", seed=2, struck_state="waypoint_x;waypoint_y",
+            struck_bits=[[3], [63]], **where),
+        row("planning", seed=3, struck_state="plan_trajectory_seq", struck_bits=[[15]], **where),
     ]  # fmt: skip
     cells = state_map(flights(rows))
     assert cells.keys() == {

@@ -63,7 +63,7 @@ def test_a_mission_that_is_lost_without_a_fault_is_not_lost_by_it():
 
 def test_missions_unlike_the_papers_judge_no_claim():
     """A fault at a chosen moment tells nothing of an hour, but where a bit hurts."""
-    where = {"struck_state": "waypoint_x", "struck_bits": "62"}
+    where = {"struck_state": "waypoint_x", "struck_bits": [[62]]}
     first = {"seed": 1, "fault": {"at": "invocation=1"}, "outcome": "timeout", **where}
     rows = [row(seed=1), row("planning", seed=1), row("waypoint_x", **first)]
     told = document(evidence(rows))
