@@ -19,17 +19,24 @@ if TYPE_CHECKING:
 @click.option("--save", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
               help="Write a file instead of opening a window: .rrd for rerun, .mcap for "
                    "Foxglove.")  # fmt: skip
-def view(run: Path, save: Path | None) -> None:
+@click.option("--layout", metavar="FILE.json", type=click.Path(path_type=Path, dir_okay=False),
+              help="With --save FILE.mcap: also write a layout that Foxglove imports.")  # fmt: skip
+def view(run: Path, save: Path | None, layout: Path | None) -> None:
     """Show RUN, a run folder, in rerun: world, camera, map, plans, path and all states over time.
 
     The mission is flown again, because depth frames, clouds and maps are not in the record. A
     flight with a fault is shown together with its golden flight, which is flown once and kept.
     """
+    from mavfi_cli.core.files import require_output
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report import view as viewers
     from mavfi_cli.report.view import ViewedFlight
 
     viewers.require_viewer(save)
+    if layout is not None:
+        if save is None or save.suffix.lower() != ".mcap":
+            raise click.UsageError("--layout goes with --save FILE.mcap")
+        require_output(layout, (".json",))
     recorded = load_run(run)
     golden = _golden(recorded) if recorded.record.fault else None
     named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}
@@ -39,6 +46,11 @@ def view(run: Path, save: Path | None) -> None:
     viewers.save(flights, save)
     if save is not None:
         click.echo(save)
+    if layout is not None:
+        from mavfi_cli.report.view.mcap_file import write_layout
+
+        write_layout(flights, layout)
+        click.echo(layout)
 
 
 def _golden(run: Run) -> Run | None:

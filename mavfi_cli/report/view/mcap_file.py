@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
@@ -37,13 +37,19 @@ from matplotlib.colors import to_rgb
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
-from mavfi_cli.core.files import plain, write_atomically
+from mavfi_cli.core.files import plain, write_atomically, write_json
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
 from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
 
 _STATES = "mavfi.States"  # schema of the states of a tick
 _WORLD = "world"  # the frame of all positions
+_SHOWN = ("path", "plan", "setpoint", "vehicle", "map", "faults", "alarms")
+_PLOTS = {
+    "position": ("x_m", "y_m", "z_m"),
+    "waypoint": ("waypoint_x", "waypoint_y", "waypoint_z"),
+    "command": ("command_vx", "command_vy", "command_vz"),
+}
 _AXES = [
     PackedElementField(name=name, offset=4 * place, type=PackedElementField.FLOAT32)
     for place, name in enumerate("xyz")
@@ -63,10 +69,12 @@ def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     if run.record.config.get("link") is not None:
         later_s = unix_time_of_stamp_0(run.folder.tlog) - EPOCH_UNIX_S
         entries = (replace(entry, stamp_s=entry.stamp_s + later_s) for entry in entries)
-    write_atomically(path, lambda file: _write(entries, file))
+    write_atomically(path, lambda file: _write(entries, _metadata(flights), file))
 
 
-def _write(entries: Iterable[Entry], file: BinaryIO) -> None:
+def _write(
+    entries: Iterable[Entry], metadata: Mapping[str, Mapping[str, Any]], file: BinaryIO
+) -> None:
     writer = Writer(file)
     writer.start(library="mavfi")
     schemas: dict[str, int] = {}
@@ -77,7 +85,82 @@ def _write(entries: Iterable[Entry], file: BinaryIO) -> None:
             if topic not in channels:
                 channels[topic] = _channel(writer, schemas, topic, message)
             writer.add_message(channels[topic], time_ns, _encoded(message), time_ns)
+    for name, values in metadata.items():
+        texts = {
+            key: each if isinstance(each, str) else _json(each) for key, each in values.items()
+        }
+        writer.add_metadata(name, texts)
     writer.finish()
+
+
+def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, Any]]:
+    """Metadata records of an MCAP file, by name: what was flown, and on which versions."""
+    records: dict[str, Mapping[str, Any]] = {}
+    for flight in flights:
+        record = flight.run.record
+        end = {"outcome": record.outcome, "reason": record.reason}
+        records[f"{flight.name}/mission"] = {**record.config, **end}
+        records[f"{flight.name}/seeds"] = flight.run.result.get("seeds") or {}
+        records[f"{flight.name}/versions"] = record.versions
+        if record.fault:
+            records[f"{flight.name}/fault"] = record.fault
+    return records
+
+
+def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
+    """Write a layout that Foxglove imports for the file of these flights.
+
+    The panels: the world, the camera of the last flight, its events, and three plots of states.
+
+    Raises:
+        RecordError: The file could not be written.
+    """
+    names = [flight.name for flight in flights]
+    topics = ["/world/obstacles", "/world/goal"]
+    topics += [f"/{name}/{each}" for name in names for each in _SHOWN]
+    panels: dict[str, Any] = {
+        "3D!world": {
+            "followTf": _WORLD,
+            "followMode": "follow-none",
+            "topics": {topic: {"visible": True} for topic in topics},
+        },
+        "Image!camera": {
+            "imageMode": {
+                "imageTopic": f"/{names[-1]}/camera/depth",
+                "calibrationTopic": f"/{names[-1]}/camera/calibration",
+            }
+        },
+        "RosOut!events": {"topicToRender": f"/{names[-1]}/events"},
+    }
+    for title, columns in _PLOTS.items():
+        paths = [f"/{name}/states.{column}" for column in columns for name in names]
+        panels[f"Plot!{title}"] = {
+            "title": title,
+            "xAxisVal": "timestamp",
+            "isSynced": True,
+            "paths": [
+                {"value": each, "enabled": True, "timestampMethod": "receiveTime"} for each in paths
+            ],
+        }
+    places = [*panels]
+    layout = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _halves(
+            "row", 60,
+            _halves("column", 65, places[0], _halves("row", 50, *places[1:3])),
+            _halves("column", 33, places[3], _halves("column", 50, *places[4:6])),
+        ),
+    }  # fmt: skip
+    write_json(path, layout)
+
+
+def _halves(direction: str, percent: int, first: Any, second: Any) -> dict[str, Any]:
+    return {
+        "direction": direction, "splitPercentage": percent, "first": first, "second": second,
+    }  # fmt: skip
 
 
 def _time_ns(entry: Entry) -> int:
@@ -88,7 +171,11 @@ def _encoded(message: Message | dict[str, Any]) -> bytes:
     if isinstance(message, Message):
         data: bytes = message.SerializeToString(deterministic=True)
         return data
-    return json.dumps(plain(message), allow_nan=False).encode()
+    return _json(message).encode()
+
+
+def _json(value: Any) -> str:
+    return json.dumps(plain(value), allow_nan=False)
 
 
 def _channel(

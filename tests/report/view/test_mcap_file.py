@@ -12,7 +12,7 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.link.tlog import EPOCH_UNIX_S
 from mavfi_cli.report.view import entries_of
-from mavfi_cli.report.view.mcap_file import write_mcap
+from mavfi_cli.report.view.mcap_file import write_layout, write_mcap
 
 SCHEMAS = {
     "camera/calibration": "foxglove.CameraCalibration", "camera/depth": "foxglove.RawImage",
@@ -21,6 +21,7 @@ SCHEMAS = {
     "plan": "foxglove.SceneUpdate", "setpoint": "foxglove.SceneUpdate",
     "states": "mavfi.States", "vehicle": "foxglove.PoseInFrame",
 }  # fmt: skip
+KINDS = ("mission", "seeds", "versions")
 MARKS = {"faulty/faults", "faulty/alarms", "world/obstacles", "world/goal"}
 
 
@@ -126,3 +127,40 @@ def test_equal_flights_give_equal_bytes(pair, file, tmp_path):
 def test_a_file_that_cannot_be_written_is_one_line(pair, tmp_path):
     with pytest.raises(RecordError, match="No such file"):
         write_mcap(pair, tmp_path / "none" / "pair.mcap")
+
+
+def test_metadata_say_what_was_flown(file, pair):
+    with file.open("rb") as stream:
+        records = {each.name: each.metadata for each in make_reader(stream).iter_metadata()}
+    both = [f"{flight}/{kind}" for flight in ("golden", "faulty") for kind in KINDS]
+    assert set(records) == {*both, "faulty/fault"}
+    for flight in pair:
+        result = flight.run.result
+        mission, seeds, versions = (records[f"{flight.name}/{kind}"] for kind in KINDS)
+        assert mission["outcome"] == result["outcome"]
+        assert mission["world"] == result["config"]["world"]
+        assert json.loads(mission["v_max_mps"]) == result["config"]["v_max_mps"]
+        assert {name: json.loads(each) for name, each in seeds.items()} == result["seeds"]
+        assert versions == result["versions"]
+    struck = json.loads(records["faulty/fault"]["strikes"])
+    assert struck == pair[1].run.result["fault"]["strikes"]
+
+
+def test_a_layout_shows_topics_and_columns_of_the_file(messages, pair, tmp_path):
+    write_layout(pair, tmp_path / "layout.json")
+    layout = json.loads((tmp_path / "layout.json").read_text())
+    panels = layout["configById"]
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    assert {*panels["3D!world"]["topics"]} - {*messages} == {"/golden/faults", "/golden/alarms"}
+    assert {*panels["Image!camera"]["imageMode"].values()} <= {*messages}
+    assert panels["RosOut!events"]["topicToRender"] in messages
+    paths = [p["value"] for each in panels.values() for p in each.get("paths", ())]
+    assert len(paths) == 18
+    for path in paths:
+        topic, _, column = path.partition(".")
+        assert column in messages[topic][0][1]
+
+
+def leaves(place):
+    """The panels of a layout's tree."""
+    return [place] if isinstance(place, str) else leaves(place["first"]) + leaves(place["second"])
