@@ -1,6 +1,8 @@
 """The package: what is installed flies from an empty folder, the source archive is whole."""
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from missions import SHORT_LINE
 
 import mavfi_cli
 
@@ -56,7 +59,15 @@ def test_the_source_archive_has_the_documents(source, tmp_path):
     name = run("-c", SDIST, tmp_path, cwd=source).splitlines()[-1]
     with tarfile.open(tmp_path / name) as archive:
         found = {member.partition("/")[2] for member in archive.getnames()}
-    wanted = {"README.md", "CITATION.cff", "Containerfile", "constraints.txt", "docs/conf.py"}
+    wanted = {
+        ".zenodo.json",
+        "action.yml",
+        "README.md",
+        "CITATION.cff",
+        "Containerfile",
+        "constraints.txt",
+        "docs/conf.py",
+    }
     wanted |= {str(each.relative_to(source)) for each in source.glob("docs/**/*.md")}
     assert wanted <= found
 
@@ -71,6 +82,108 @@ def test_the_citation_is_of_this_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == mavfi_cli.__version__
     assert citation["cff-version"] == "1.2.0"
+
+
+def test_zenodo_and_the_citation_say_the_same():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
+    for key in ("title", "version", "license", "keywords"):
+        assert zenodo[key] == citation[key], key
+    assert zenodo["upload_type"] == citation["type"] == "software"
+    assert zenodo["creators"] == citation["authors"]
+    papers = [each["identifier"] for each in zenodo["related_identifiers"]]
+    assert papers == [each["doi"] for each in citation["references"]]
+
+
+@pytest.fixture(scope="module")
+def engine():
+    """A container engine that works on this machine."""
+    for name in ("podman", "docker"):
+        asked = [name, "info"]
+        if shutil.which(name) and subprocess.run(asked, capture_output=True).returncode == 0:
+            return name
+    return pytest.skip("neither podman nor docker works on this machine")
+
+
+@pytest.mark.slow
+def test_the_image_is_built_and_flies(engine, source, tmp_path):
+    """As docs/how-to/install.md says."""
+    image, mine = "mavfi-test", ["--user", f"{os.getuid()}:{os.getgid()}"]
+    mine = ["--userns=keep-id"] if engine == "podman" else mine
+    flight = [image, "fly", "--world", "farm", "--expect", "success"]
+    for line in (
+        ["build", "-q", "-t", image, "-f", "Containerfile", "."],
+        ["run", "--rm", *mine, "-v", f"{tmp_path}:/work", *flight],
+    ):
+        done = subprocess.run([engine, *line], cwd=source, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert "SUCCESS" in done.stdout
+    assert (tmp_path / "runs" / "farm-3-001" / "result.json").is_file()
+
+
+ACTION = yaml.safe_load((ROOT / "action.yml").read_text())
+STEPS = {step["name"]: step for step in ACTION["runs"]["steps"] if "run" in step}
+
+
+def test_the_action_is_whole():
+    """Every input is used and described on its page, and none is pasted into a script."""
+    assert ACTION["runs"]["using"] == "composite"
+    text = (ROOT / "action.yml").read_text()
+    assert {*re.findall(r"\$\{\{ inputs\.([\w-]+) \}\}", text)} == {*ACTION["inputs"]}
+    page = (ROOT / "docs" / "how-to" / "ci.md").read_text()
+    assert [name for name in ACTION["inputs"] if f"| `{name}` |" not in page] == []
+    assert all(each["description"] for each in ACTION["inputs"].values())
+    for step in STEPS.values():
+        assert step["shell"] == "bash"
+        assert "${{" not in step["run"]
+
+
+def run_step(name, folder, programs, **environment):
+    """Run a step as GitHub does, with these programs in the environment that it makes."""
+    made = folder / "mavfi" / "bin"
+    made.mkdir(parents=True, exist_ok=True)
+    for program, text in programs.items():
+        (made / program).write_text(text)
+        (made / program).chmod(0o755)
+    shell = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail", "-c", STEPS[name]["run"]]
+    more = {"RUNNER_TEMP": str(folder), "GITHUB_ACTION_PATH": str(ROOT), **environment}
+    return subprocess.run(
+        shell, cwd=folder, env=os.environ | more, check=False, capture_output=True, text=True
+    )
+
+
+def test_the_action_installs_with_the_constraints(tmp_path):
+    python, told = tmp_path / "python", '#!/bin/sh\nfor each; do echo "$each"; done\n'
+    python.write_text(told)
+    python.chmod(0o755)
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    for extras, package in (("", f"{ROOT}"), ("report,mcap", f"{ROOT}[report,mcap]")):
+        done = run_step("Install mavfi", tmp_path, {"pip": told}, PATH=path, EXTRAS=extras)
+        assert done.returncode == 0, done.stderr
+        words = ["install", "--quiet", "--constraint", f"{ROOT}/constraints.txt", package]
+        assert done.stdout.splitlines() == ["-m", "venv", f"{tmp_path}/mavfi", *words]
+
+
+def test_the_action_ends_with_the_first_command_that_fails(tmp_path):
+    mavfi = {"mavfi": f'#!/bin/sh\nexec {sys.executable} -m mavfi_cli "$@"\n'}
+    commands = "\n# a comment\nplatforms x86\nshow 'no such folder; touch harm' \n--version\n"
+    done = run_step("Run mavfi", tmp_path, mavfi, COMMANDS=commands)
+    assert done.returncode != 0
+    assert done.stdout.startswith("mavfi platforms x86\nx86")
+    assert "error: no such folder; touch harm: no such run folder" in done.stderr
+    assert "--version" not in done.stdout
+    assert not (tmp_path / "harm").exists()
+    assert run_step("Run mavfi", tmp_path, mavfi, COMMANDS="--version").returncode == 0
+
+
+@pytest.mark.slow
+def test_the_action_fails_on_another_outcome_than_the_expected_one(tmp_path):
+    mavfi = {"mavfi": f'#!/bin/sh\nexec {sys.executable} -m mavfi_cli "$@"\n'}
+    flight = f"{' '.join(SHORT_LINE)} --quiet --no-picture --expect"
+    assert run_step("Run mavfi", tmp_path, mavfi, COMMANDS=f"{flight} success").returncode == 0
+    done = run_step("Run mavfi", tmp_path, mavfi, COMMANDS=f"{flight} collision")
+    assert done.returncode != 0
+    assert "error: expected collision, got SUCCESS" in done.stderr
 
 
 def test_the_shell_completes_options():
