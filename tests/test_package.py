@@ -60,7 +60,6 @@ def test_the_source_archive_has_the_documents(source, tmp_path):
     with tarfile.open(tmp_path / name) as archive:
         found = {member.partition("/")[2] for member in archive.getnames()}
     wanted = {
-        ".zenodo.json",
         "action.yml",
         "README.md",
         "CITATION.cff",
