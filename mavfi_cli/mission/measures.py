@@ -95,6 +95,7 @@ class FlightRecord:
     measured_platform: Record = field(default_factory=dict)
     world: Record = field(default_factory=dict)
     referee: Record | None = field(default_factory=dict)  # None: the vehicle left no truth
+    seeds: Mapping[str, int | None] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of the user's files
     host: Record = field(default_factory=dict)

@@ -100,7 +100,7 @@ def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, Any]]:
         record = flight.run.record
         end = {"outcome": record.outcome, "reason": record.reason}
         records[f"{flight.name}/mission"] = {**record.config, **end}
-        records[f"{flight.name}/seeds"] = flight.run.result.get("seeds") or {}
+        records[f"{flight.name}/seeds"] = record.seeds
         records[f"{flight.name}/versions"] = record.versions
         if record.fault:
             records[f"{flight.name}/fault"] = record.fault
