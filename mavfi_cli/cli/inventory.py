@@ -62,8 +62,8 @@ def doctor(as_json: bool) -> None:
 
 _P95 = 1.6449  # standard normal: 90 % lie within
 _MORE_PLATFORMS = """\
-measured:FACTOR  this host's own kernel times while it flies, times FACTOR;
-                 for `mavfi fly --realtime` only
+measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for `mavfi fly \
+--realtime` only
 
 `mavfi platforms NAME` shows every kernel; docs/how-to/platform.md says how to add one."""
 _MEASURED = """\
@@ -90,7 +90,7 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
         for profile in profiles:
             click.echo(
                 f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W  "
-                f"{1000 * profile.mass_kg:>3.0f} g  kernels {_all_s(profile):>6.3f} s  "
+                f"board {1000 * profile.mass_kg:>3.0f} g  all kernels {_all_s(profile):>6.3f} s  "
                 f"{profile.description}"
             )
         click.echo(_MORE_PLATFORMS)
