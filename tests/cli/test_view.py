@@ -62,7 +62,7 @@ def test_a_flight_that_does_not_repeat_is_shown_without_what_its_nodes_received(
     run = tmp_path / "foreign"
     shutil.copytree(short_flight.path, run)
     result = json.loads((run / "result.json").read_text())
-    result["config"]["link"] = "udpin:127.0.0.1:14540"
+    result["config"] |= {"link": "udpin:127.0.0.1:14540", "eyes": True}
     (run / "result.json").write_text(json.dumps(result))
     done = mavfi("view", run, "--save", tmp_path / "foreign.mcap")
     assert done.returncode == 0
