@@ -59,6 +59,37 @@ __attribute__((naked, noinline)) long flows(void) {
         "5: imul $5, %rax, %rax\npushq %rax\nadd $8, %rsp\nret\n");
 }
 int main(void) { printf("%ld %s\n", flows(), into); return 0; }""",
+    # A hot loop that reads a constant beside it; nothing else unused is near. arg: iterations.
+    "beside": r"""
+#include <stdio.h>
+#include <stdlib.h>
+__attribute__((naked, noinline)) long hot(long n) {
+    __asm__ volatile(
+        ".rept 140\nnop\n.endr\nlea 9f(%rip), %rsi\nxor %eax, %eax\n"
+        "1: add (%rsi), %eax\njmp 2f\n"
+        "9: .quad 0x123456789\n"
+        "2: dec %edi\njnz 1b\nret\n");
+}
+int main(int c, char **v) { printf("%ld\n", hot(atol(v[1]))); return 0; }""",
+    # A loop that reads its own code. arg: iterations.
+    "introspective": """
+#include <stdio.h>
+#include <stdlib.h>
+__attribute__((noinline)) unsigned long walk(long n) {
+    unsigned long sum = 0;
+    for (long i = 0; i < n; i++) sum = sum * 31 + ((unsigned char *) walk)[i % 64];
+    return sum;
+}
+int main(int c, char **v) { printf("%lu\\n", walk(atol(v[1]))); return 0; }""",
+    # Prints the beginning of a file. arg: its path.
+    "echoing": """
+#include <stdio.h>
+int main(int c, char **v) {
+    char text[9] = ""; FILE *f = fopen(v[1], "r"); fread(text, 1, 8, f); fclose(f);
+    for (int i = 0; i < 300; i++) text[8] ^= i;
+    puts(text);
+    return 0;
+}""",
     # Callbacks from libc into the program; every comparison is in scope.
     "sorting": """
 #include <stdio.h>

@@ -31,6 +31,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Trace
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
+Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,8 +117,14 @@ class Attacker:
         finally:
             tracee.kill()
 
-    def run_timed(self, plan: Strategy, rng: np.random.Generator) -> RunResult:
-        """One run with a fault at a drawn moment of the CPU time or duration of the golden run."""
+    def run_timed(
+        self, plan: Strategy, rng: np.random.Generator, *, null: bool = False
+    ) -> RunResult:
+        """One run with a fault at a drawn moment of the CPU time or duration of the golden run.
+
+        Args:
+            null: leave out the flip.
+        """
         start = time.perf_counter()
         cpu = plan.rule is Rule.CPU_TIME
         moment_s = float(rng.uniform(0.0, self.golden.cpu_s if cpu else self.golden.wall_s))
@@ -125,7 +132,8 @@ class Attacker:
         try:
             fault, reason = self._fault_at_moment(tracee, plan, rng, moment_s)
             if fault is not None:
-                return self._corrupt(start, tracee, fault)
+                struck = replace(fault, corruption=None) if null else fault
+                return self._corrupt(start, tracee, struck)
             with self._deadline(tracee) if tracee.ended is None else nullcontext():
                 ended = run_out(tracee)
             return self._result(start, ended, None, None, NOTHING, reason)

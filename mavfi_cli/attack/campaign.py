@@ -25,8 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.attack.attacker import Attacker, RunResult, golden_run
+from mavfi_cli.attack.attacker import Attacker, RunResult, Task, golden_run
 from mavfi_cli.attack.journal import Journal, read_plan, read_runs
+from mavfi_cli.attack.null_runs import NullRuns, Profiles, Run, make_null_runs, require_golden_again
 from mavfi_cli.attack.profile import TargetProfile, started
 from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, Watch, places_of
 from mavfi_cli.core.errors import (
@@ -86,7 +87,8 @@ class TargetRuns:
     target: AttackTarget
     context: Mapping[str, Any]  # entries of every record about the target
     goldens: tuple[Golden, ...]  # of each input
-    profiles: tuple[TargetProfile | None, ...]  # of each input; None for time rules
+    profiles: Profiles
+    null_runs: NullRuns
     records: tuple[Record, ...] = ()
     prepare_s: float
     wall_s: float = 0.0
@@ -155,10 +157,27 @@ def _attack(
     begun = time.perf_counter()
     progress(target.name, 0)
     with one_processor():
-        prepared, place = _prepare(plan, target, stage, notice)
-    stage(f"drawing {plan.runs} faults")
-    bench = _Bench(plan=plan, target=target, golden=prepared.goldens)
+        place, goldens, profiles = _prepare(plan, target, stage, notice)
+    stream = {"kernel": target.stream[0]} if target.stream else {}
+    context = stream | place.context()
+    bench = _Bench(plan=plan, target=target, golden=goldens)
     workers.take(bench, place)
+    stage("null runs")
+    profiles, null_runs = make_null_runs(target.name, profiles, bench.draw, workers.null(bench))
+    for method in null_runs.unused:
+        notice(
+            f"{target.name} reads its own code as data: its output changes without a flip if a "
+            f"{method} counts, so none is used"
+        )
+    prepared = TargetRuns(
+        target=target,
+        context=context,
+        goldens=goldens,
+        profiles=profiles,
+        null_runs=null_runs,
+        prepare_s=time.perf_counter() - begun,
+    )
+    stage(f"drawing {plan.runs} faults")
     planned = _draw(plan, bench, prepared)
     done: dict[int, Record] = {}
     if journal is not None:
@@ -169,20 +188,21 @@ def _attack(
         for index, entry in enumerate(planned)
         if index not in done
     ]
-    for index, result in workers.run(bench, tasks):
-        done[index] = result.completed(planned[index])
-        if journal is not None:
-            journal.append(done[index])
-        progress(target.name, len(done))
+    for first in range(0, len(tasks), _RECHECKED):
+        for index, result in workers.run(bench, tasks[first : first + _RECHECKED]):
+            done[index] = result.completed(planned[index])
+            if journal is not None:
+                journal.append(done[index])
+            progress(target.name, len(done))
+        require_golden_again(target.name, null_runs, workers.null(bench))
     records = tuple(done[index] for index in sorted(done))
     return replace(prepared, records=records, wall_s=time.perf_counter() - begun)
 
 
 def _prepare(
     plan: Plan, target: AttackTarget, stage: Stage, notice: Stage
-) -> tuple[TargetRuns, JudgedPlace]:
-    """Make golden run and profile; return them with the place where they were made."""
-    begun = time.perf_counter()
+) -> tuple[JudgedPlace, tuple[Golden, ...], Profiles]:
+    """Open the target and make golden run and profile of each input."""
     stage("loading")
     with contextlib.ExitStack() as undo:
         place = target.open()
@@ -192,23 +212,15 @@ def _prepare(
         for text in dict.fromkeys(text for run in golden for text in run.notices):
             notice(text)
         rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
-        profiles: list[TargetProfile | None] = [None] * len(golden)
+        profiles: Profiles = (None,) * len(golden)
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
-            profiles = [
+            profiles = tuple(
                 each.profile(rng, windows=plan.windows, watch=_steps_told(stage))
                 for each in places_of(place)
-            ]
+            )
         undo.pop_all()
-    stream = {"kernel": target.stream[0]} if target.stream else {}
-    prepared = TargetRuns(
-        target=target,
-        context=stream | place.context(),
-        goldens=golden,
-        profiles=tuple(profiles),
-        prepare_s=time.perf_counter() - begun,
-    )
-    return prepared, place
+    return place, golden, profiles
 
 
 def _steps_told(stage: Callable[[str], None]) -> Watch:
@@ -230,15 +242,14 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
     chosen, records = plan.strategy(), []
     for index in range(plan.runs):
         number = prepared.input_of(index)
-        profile = prepared.profiles[number]
+        profile, fault = prepared.profiles[number], bench.draw(prepared.profiles, index)
         what = {"run": index, "seed": plan.seed, "sampling": chosen.name, **prepared.context}
         if len(prepared.goldens) > 1:
             what["input"] = number
-        if profile is None:
+        if profile is None or fault is None:
             records.append({"version": record.VERSION, "state": "planned", "trigger": []} | what)
             continue
         assert profile.image is not None
-        fault = profile.draw(chosen, bench.generator(index))
         struck = replace(fault, corruption=None) if plan.null else fault
         records.append(record.planned(struck, profile.image, **what))
     return records
@@ -247,7 +258,7 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
 # -- worker processes
 
 _CHUNK = 32  # tasks that are sent to a worker at once
-Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
+_RECHECKED = 1000  # runs after which a null run is repeated
 
 
 _claims: list[socket.socket] = []  # of this process
@@ -304,6 +315,13 @@ class _Bench:
         """The target's own random numbers; those of fault number i depend on i only."""
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
+    def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
+        """Fault number i; None for a time rule."""
+        profile = profiles[index % len(profiles)]
+        if profile is None:
+            return None
+        return profile.draw(self.plan.strategy(), self.generator(index))
+
 
 _opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the one target of this process
 
@@ -328,8 +346,8 @@ def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
         if fault is not None:
             results.append((index, attacker.run(fault)))
         else:
-            timed = attacker.run_timed(bench.plan.strategy(), bench.generator(index))
-            results.append((index, timed))
+            plan, rng = bench.plan, bench.generator(index)
+            results.append((index, attacker.run_timed(plan.strategy(), rng, null=plan.null)))
     return results
 
 
@@ -363,6 +381,16 @@ class _AttackWorkers:
         else:
             place.close()
             _give_up_processor()
+
+    def null(self, bench: _Bench) -> Run:
+        """A function that runs tasks without their flips."""
+        without = replace(bench, plan=replace(bench.plan, null=True))
+
+        def run(tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
+            faults = [(n, fault and replace(fault, corruption=None)) for n, fault in tasks]
+            return self.run(without, faults)
+
+        return run
 
     def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
         """The results in the order of the tasks.

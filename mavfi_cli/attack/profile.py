@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,7 +31,7 @@ from mavfi_cli.attack.callgrind import UNNAMED, Executions
 from mavfi_cli.attack.target import AttackPlace, Watch
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Detour
+from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Counting, Detour
 from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
 from mavfi_cli.fi.tracer.sampling import Segment, Stratum, draw_fault, record_window
@@ -168,6 +168,13 @@ class TargetProfile:
             return replace(stratum, segments=tuple(segments))
 
         return replace(self, strata=tuple(map(later, self.strata)))
+
+    def without(self, methods: Container[Counting]) -> TargetProfile:
+        """Make the same profile without some counting methods on the way to a fault."""
+        strata = self.strata
+        if Counting.DETOUR in methods:
+            strata = tuple(stratum.without_detours() for stratum in strata)
+        return replace(self, strata=strata, counted=self.counted and self.counted.without(methods))
 
     def in_words(self) -> str:
         """How the population of faults was found, in words."""

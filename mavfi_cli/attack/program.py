@@ -153,7 +153,6 @@ class _Workplace:
     def __init__(self, target: ProgramTarget) -> None:
         _require_attackable(Path(target.command.argv[0]))
         self.target, self.name, self.limits = target, target.name, target.limits
-        self.context = target.context
         self._golden: Golden | None = None
         self._watched: Watched | None = None
         self._scratch = ScratchFolder("kernels")
@@ -162,6 +161,12 @@ class _Workplace:
         self._counts = scratch / "counts"
         self._folder = WorkFolder(scratch, target.folder, target.files, self.name)
         self._command = replace(target.command, directory=self._folder.path)
+
+    def context(self) -> dict[str, Any]:
+        exact = self.target.comparison.tolerance == 0.0
+        return self.target.context() | (
+            {"golden_sha256": self._known_golden().sha256} if exact else {}
+        )
 
     def start(self) -> Tracee:
         """Start the program, stopped at its entry point.

@@ -16,7 +16,7 @@ from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.report.columns import blocks, csv_text
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
-from mavfi_cli.stats.shares import Cluster, clustered_share
+from mavfi_cli.stats.shares import Cluster, clustered_share, unseen_share
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +38,14 @@ _SHOWN = tuple(RunOutcome)
 def _counts(runs: TargetRuns) -> dict[str, Any]:
     """The counts of one target; shares are those of the *injected* runs."""
     records = runs.records
+    null_runs = runs.null_runs
     return {
+        "null_runs": {
+            "runs": null_runs.reached,
+            "counting": dict(sorted(null_runs.counting.items())),
+            "unused": list(null_runs.unused),
+            "differing95": unseen_share(null_runs.reached),
+        },
         "outcomes": {
             outcome.value: _share(
                 runs,
@@ -104,6 +111,14 @@ def _crash(entry: Mapping[str, Any]) -> str:
 
 
 def _count_lines(counts: Mapping[str, Any], indent: str) -> Iterator[str]:
+    null_runs = counts["null_runs"]
+    methods = ", ".join(f"{name} {count}" for name, count in null_runs["counting"].items())
+    yield (
+        f"{indent}null runs: {null_runs['runs']} equal ({methods}); without a flip at most "
+        f"{100 * null_runs['differing95']:.1f} % differ (95 % bound)"
+    )
+    if null_runs["unused"]:
+        yield f"{indent}not used, because it changes the output: {', '.join(null_runs['unused'])}"
     for title in ("crashes", "not_injected", "activation"):
         if counts[title]:
             parts = ", ".join(f"{name} {count}" for name, count in counts[title].items())
@@ -284,6 +299,9 @@ def _program_table(summary: Mapping[str, Any]) -> str:
         lines.append(
             f"{RunOutcome(name).title:<14}{row['count']:>7}{share:>9}   {low:.1f} to {high:.1f} %"
         )
+        if name == RunOutcome.SDC.value:
+            bound = 100 * summary["null_runs"]["differing95"]
+            lines[-1] += f"   (without a flip: 0.0 to {bound:.1f} %)"
     lines.append(f"sampling: {summary['sampling']}; scope: {', '.join(summary['scope'])}")
     if summary["executed_in_scope"] is not None:
         lines.append(

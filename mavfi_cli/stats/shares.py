@@ -122,6 +122,14 @@ def wilson(
     )
 
 
+def unseen_share(total: int, confidence: float = 0.95) -> float:
+    """The largest share that explains why none of `total` independent runs is a hit.
+
+    The one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 without runs.
+    """
+    return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0
+
+
 def z_of(confidence: float) -> float:
     """The two-sided normal quantile of a confidence between 0 and 1.
 

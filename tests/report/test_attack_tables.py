@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 from mavfi_cli.attack.campaign import Plan
+from mavfi_cli.attack.null_runs import NullRuns
 from mavfi_cli.report.attacks import summarise
 
 
@@ -25,6 +26,7 @@ def outcomes(told, *, windows=None):
     runs = SimpleNamespace(
         target=None, records=records, context={}, golden=golden, profile=profile, wall_s=0.0,
         profiles=[profile], input_of=lambda _run: 0,
+        null_runs=NullRuns(tasks=(), counting={}, unused=()),
     )  # fmt: skip
     return summarise(Plan(runs=len(told), seed=1), [runs])["outcomes"]
 

@@ -17,6 +17,7 @@ from mavfi_cli.stats.shares import (
     mixture,
     pairs_for_difference,
     rate,
+    unseen_share,
     wilson,
 )
 
@@ -232,3 +233,12 @@ def test_wilson_against_scipy(count, total):
     theirs = stats.binomtest(count, total).proportion_ci(method="wilson")
     assert ours.low == pytest.approx(theirs.low, abs=1e-12)
     assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+@pytest.mark.parametrize("total", [1, 20, 300])
+def test_an_unseen_share_is_the_largest_that_leaves_no_hit_once_in_twenty(total):
+    share = unseen_share(total)
+    assert (1.0 - share) ** total == pytest.approx(0.05)
+    assert unseen_share(0) == 1.0
+    if total > 100:
+        assert share == pytest.approx(3.0 / total, rel=0.01)  # the rule of three

@@ -17,8 +17,9 @@ from __future__ import annotations
 import functools
 import struct
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,14 @@ class _DetourCode:
     stop: int  # the instruction pointer when the count is over
 
 
+class Counting(Enum):
+    """How executions are counted, from the quickest, which changes the most code."""
+
+    FAR_DETOUR = "detour over unused bytes"
+    DETOUR = "detour"
+    BREAKPOINT = "breakpoint"
+
+
 @dataclass(frozen=True, slots=True)
 class Detour:
     """The place of a detour that counts the executions of an instruction.
@@ -61,6 +70,11 @@ class Detour:
 
     size: int
     via: int = 0
+
+    @property
+    def counting(self) -> Counting:
+        """The counting method."""
+        return Counting.FAR_DETOUR if self.via else Counting.DETOUR
 
     @classmethod
     def at(cls, address: int, code_at: CodeAt, executions: Executions) -> Detour | None:
@@ -199,12 +213,14 @@ class CountedRun:
         counts: (n,) executions of each.
         places: (n,) index of the instruction at which each is counted.
         detours: for each instruction, the detour that counts it; None if none fits.
+        joined: for each instruction, whether it always leads to the next, and nothing else does.
     """
 
     addresses: NDArray[np.int64]
     counts: NDArray[np.int64]
     places: NDArray[np.int64]
     detours: tuple[Detour | None, ...]
+    joined: tuple[bool, ...]
 
     @classmethod
     def of(cls, executions: Mapping[int, int], code_at: CodeAt) -> CountedRun:
@@ -221,7 +237,14 @@ class CountedRun:
             counts=np.array(counts, np.int64),
             places=np.array(_places(detours, joined), np.int64),
             detours=detours,
+            joined=tuple(joined),
         )
+
+    def without(self, methods: Container[Counting]) -> CountedRun:
+        """The same run, of which fewer executions are reached, without some counting methods."""
+        detours = [None if each and each.counting in methods else each for each in self.detours]
+        places = np.array(_places(detours, self.joined), np.int64)
+        return replace(self, detours=tuple(detours), places=places)
 
     @functools.cached_property
     def reached(self) -> NDArray[np.int64]:
@@ -343,7 +366,7 @@ def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> De
     return None
 
 
-def _places(detours: Sequence[Detour | None], joined: list[bool]) -> list[int]:
+def _places(detours: Sequence[Detour | None], joined: Sequence[bool]) -> list[int]:
     """The index at which each is counted: its own, or the first possible of its block."""
     places: list[int] = []
     start = 0

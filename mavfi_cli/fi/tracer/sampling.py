@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -59,6 +59,15 @@ class Stratum:
     segments: tuple[Segment, ...]
     windows_in_run: int  # windows of the run; if more than were stepped, they are a sample
     marker: Location | None = None  # None: the start of the run
+    detours: bool = True  # whether detours count executions
+
+    def without_detours(self) -> Stratum:
+        """The same windows, without detours on the way to an execution."""
+        segments = (
+            replace(each, start=tuple(replace(stop, detour=None) for stop in each.start))
+            for each in self.segments
+        )
+        return replace(self, segments=tuple(segments), detours=False)
 
     @property
     def instructions(self) -> float:
@@ -84,7 +93,7 @@ class Stratum:
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
         """The trigger of one executed instruction, and k, the number of its execution."""
-        return _plan_trigger(*self._at(position), locate, code_at)
+        return _plan_trigger(*self._at(position), locate, code_at if self.detours else None)
 
     def _at(self, position: int) -> tuple[Segment, int]:
         """The segment and index of one executed instruction, counted over all segments."""
@@ -211,12 +220,15 @@ _cost = attrgetter("cost")
 
 
 def _plan_trigger(
-    segment: Segment, index: int, locate: Locate, code_at: CodeAt
+    segment: Segment, index: int, locate: Locate, code_at: CodeAt | None
 ) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
 
     Each counted hit costs the same. So a rarely executed instruction shortly before the target is
     reached first, and the target's executions are counted from there, or a detour counts.
+
+    Args:
+        code_at: 16 bytes of code at an address; None if there may be no detours.
 
     Returns:
         The trigger, and k, the number of the execution of its instruction in the segment.
@@ -225,7 +237,7 @@ def _plan_trigger(
     best = _Way(cost=k, stages=(CountedStop(target, k),))
     if best.cost > _STAGE_COST:
         best = min([best, *_anchored(segment, index, locate)], key=_cost)
-    if best.cost > DETOUR_COST:
+    if best.cost > DETOUR_COST and code_at is not None:
         best = min([best, *_detoured(segment, index, locate, code_at)], key=_cost)
     return (*segment.start, *best.stages), k
 

@@ -1,0 +1,173 @@
+"""Null runs: everything but the flip. They show whether the runs of a target repeat.
+
+An outcome means something only if a run without a flip ends as the golden run did. A target may
+depend on time or on chance. It may also read its own code as data. Then a detour, which counts
+executions by changing code, changes its output. So a campaign begins with null runs of its first
+faults, by turns from every counting method, and goes on without detours that change the output.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+from mavfi_cli.attack.attacker import RunResult, Task
+from mavfi_cli.attack.profile import TargetProfile
+from mavfi_cli.attack.target import RunOutcome
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.fi.tracer.counted import CountedStop, Counting
+from mavfi_cli.fi.tracer.fault import InstructionFault
+from mavfi_cli.fi.tracer.image import Location
+from mavfi_cli.fi.tracer.tracee import DETOUR_COST
+
+NULL_RUNS = 20
+_FAULTS = 64  # of the campaign, from which null runs are chosen
+_REPEATED = 3  # runs of a null fault that differed, to tell a detour from chance
+_TIMER = "timer"
+_DETOURS = (Counting.FAR_DETOUR, Counting.DETOUR)
+Profiles = tuple[TargetProfile | None, ...]  # of each input; None for time rules
+Run = Callable[[Sequence[Task]], Iterable[tuple[int, RunResult]]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NullRuns:
+    """The null runs of a target. All ended as the golden run did.
+
+    Attributes:
+        tasks: the faults whose flips were left out.
+        counting: null runs that reached their fault, by the name of the counting method.
+        unused: names of the counting methods that change the output and so are not used.
+    """
+
+    tasks: tuple[Task, ...]
+    counting: Mapping[str, int]
+    unused: tuple[str, ...]
+
+    @property
+    def reached(self) -> int:
+        """Null runs that reached their fault."""
+        return sum(self.counting.values())
+
+
+def make_null_runs(
+    name: str,
+    profiles: Profiles,
+    draw: Callable[[Profiles, int], InstructionFault | None],
+    run: Run,
+) -> tuple[Profiles, NullRuns]:
+    """Make null runs of a target, and leave out detours that change its output.
+
+    Args:
+        name: the target's name for errors.
+        draw: function from profiles and a number to the fault of this number; None for time rules.
+        run: runs tasks without their flips.
+
+    Returns:
+        The profiles without the counting methods that are not used, and the null runs.
+
+    Raises:
+        TargetError: null runs end differently from the golden run; names the counting methods.
+    """
+    unused: tuple[Counting, ...] = ()
+    while True:
+        tasks = _by_turns([(number, draw(profiles, number)) for number in range(_FAULTS)])
+        made = _make(tasks, run)
+        differing = [each for each in made if each.differs]
+        if not differing:
+            return profiles, NullRuns(
+                tasks=tasks,
+                counting=Counter(each.method for each in made if each.reached),
+                unused=tuple(method.value for method in unused),
+            )
+        methods = {each.method for each in differing}
+        spoiling = [at for at, method in enumerate(_DETOURS) if method.value in methods]
+        again = [each.differs for each in _make([differing[0].task] * _REPEATED, run)]
+        if len(spoiling) < len(methods) or not all(again):
+            raise TargetError(name, _problem(made))
+        unused = _DETOURS[: spoiling[-1] + 1]
+        profiles = tuple(each and each.without(unused) for each in profiles)
+
+
+def require_golden_again(name: str, null_runs: NullRuns, run: Run) -> None:
+    """Repeat a null run later, because a difference may come late, such as that of a date.
+
+    Raises:
+        TargetError: it ends differently from the golden run now.
+    """
+    if any(each.differs for each in _make(null_runs.tasks[:1], run)):
+        raise TargetError(
+            name,
+            "a run without a flip ends differently from the golden run now, which it did not at "
+            "first: it depends on time or on what runs leave behind, so outcomes cannot be told",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _NullRun:
+    task: Task
+    outcome: RunOutcome
+    reached: bool
+
+    @property
+    def differs(self) -> bool:
+        """Whether it ended differently from the golden run."""
+        return self.outcome is not RunOutcome.BENIGN
+
+    @property
+    def method(self) -> str:
+        """The name of the counting method: of several that which changes the most code."""
+        if self.task[1] is None:
+            return _TIMER
+        return _counting(self.task[1]).value
+
+
+def _make(tasks: Sequence[Task], run: Run) -> list[_NullRun]:
+    return [
+        _NullRun(task, result.verdict.outcome, result.fault is None or not result.reason)
+        for task, (_, result) in zip(tasks, run(tasks), strict=True)
+    ]
+
+
+def _problem(made: Iterable[_NullRun]) -> str:
+    """Why the outcomes of a target cannot be told."""
+    methods: dict[str, list[_NullRun]] = defaultdict(list)
+    for each in made:
+        methods[each.method].append(each)
+    parts = []
+    for method, runs in methods.items():
+        ends = Counter(each.outcome.title for each in runs if each.differs)
+        text = ", ".join(f"{title} {count}" for title, count in ends.items())
+        parts.append(f"{method}: {ends.total()} of {len(runs)}{text and f' ({text})'}")
+    return (
+        "runs without a flip end differently from the golden run, so outcomes cannot be told; by "
+        f"counting method: {'; '.join(parts)}; --ignore-lines leaves out lines of a program that "
+        "change"
+    )
+
+
+def _by_turns(faults: Sequence[Task]) -> tuple[Task, ...]:
+    """Choose null runs by turns from all counting methods, and from all places of each."""
+    methods: dict[Counting, dict[Location | None, list[Task]]] = {}
+    for task in faults:
+        stops = _detours(task[1])
+        places = methods.setdefault(_counting(task[1]), {})
+        places.setdefault(stops[0].location if stops else None, []).append(task)
+    return tuple(_in_turn([_in_turn(each.values()) for each in methods.values()])[:NULL_RUNS])
+
+
+def _in_turn(lists: Iterable[Sequence[Task]]) -> list[Task]:
+    return [task for row in zip_longest(*lists) for task in row if task is not None]
+
+
+def _detours(fault: InstructionFault | None) -> list[CountedStop]:
+    """The stages of a fault's trigger that a detour counts."""
+    stages = () if fault is None else fault.trigger
+    return [each for each in stages if each.detour is not None and each.count >= DETOUR_COST]
+
+
+def _counting(fault: InstructionFault | None) -> Counting:
+    """The counting method of a fault, of several that which changes the most code."""
+    used = {each.detour.counting for each in _detours(fault) if each.detour is not None}
+    return next((each for each in Counting if each in used), Counting.BREAKPOINT)
