@@ -13,7 +13,9 @@ import functools
 import multiprocessing
 import os
 import pickle
+import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -21,7 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -38,6 +40,7 @@ from mavfi_cli.core.errors import (
     TargetError,
 )
 from mavfi_cli.core.files import own_digest
+from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
@@ -258,6 +261,7 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
 # -- worker processes
 
 _CHUNK = 32  # tasks that are sent to a worker at once
+_TERMINATED = 128 + signal.SIGTERM
 _RECHECKED = 1000  # runs after which a null run is repeated
 
 
@@ -337,6 +341,14 @@ def _close() -> None:
         _opened.popitem()[1][0].place.close()
 
 
+def _work_in_pool(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
+    try:
+        return _work(job)
+    except SystemExit:  # the pool would send it to the client, and begin the next chunk
+        _close()
+        os._exit(_TERMINATED)
+
+
 def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     bench, tasks = job
     attackers = _opened.get(bench.target.stream) or _keep_open(bench, bench.target.open())
@@ -351,8 +363,17 @@ def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     return results
 
 
-def _settle() -> None:
+def _settle(campaign: int) -> None:
+    """Make a worker process ready; SIGTERM ends it without leaving a process or a folder."""
+    die_with(campaign)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the campaign
+    signal.signal(signal.SIGTERM, _leave)
     os.sched_setaffinity(0, [_claimed_processor()])
+
+
+def _leave(*_: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(_TERMINATED)
 
 
 class _AttackWorkers:
@@ -365,12 +386,17 @@ class _AttackWorkers:
     def __enter__(self) -> _AttackWorkers:
         if self._jobs > 1:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._jobs, mp_context=context, initializer=_settle)
+            self._pool = ProcessPoolExecutor(
+                self._jobs, mp_context=context, initializer=_settle, initargs=(os.getpid(),)
+            )
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         _close()
         if self._pool is not None:
+            # A chunk may last for an hour. Python 3.14 has `terminate_workers`.
+            for worker in list(self._pool._processes.values()) if error is not None else ():
+                worker.terminate()
             self._pool.shutdown(cancel_futures=True)
         _give_up_processor()
 
@@ -413,7 +439,7 @@ class _AttackWorkers:
         size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
         jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
         try:
-            for results in self._pool.map(_work, jobs):
+            for results in self._pool.map(_work_in_pool, jobs):
                 yield from results
         except BrokenProcessPool:
             raise FaultError("a worker process was killed; the campaign is incomplete") from None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
+import signal
 import sys
 from typing import NoReturn
 
@@ -34,6 +36,8 @@ _COMMANDS = {
     "view": ("mavfi_cli.cli.view", "Look at a recorded run in rerun or Foxglove."),
     "doctor": ("mavfi_cli.cli.inventory", "Test what works on this machine."),
 }
+
+_terminated: list[bool] = []  # by SIGTERM
 
 
 class _LazyGroup(click.Group):
@@ -96,6 +100,8 @@ def main() -> NoReturn:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
     choose_caches()
+    with contextlib.suppress(ValueError):  # not the main thread
+        signal.signal(signal.SIGTERM, _interrupt)
     try:  # not standalone: click hands back the code of an Exit instead of leaving with it
         code = cli.main(prog_name="mavfi", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -109,7 +115,7 @@ def main() -> NoReturn:
         sys.exit(error.exit_code)
     except (Interrupted, KeyboardInterrupt, click.Abort) as error:
         click.echo(str(error) or "interrupted", err=True)
-        sys.exit(130)
+        sys.exit(128 + (signal.SIGTERM if _terminated else signal.SIGINT))
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
@@ -117,6 +123,13 @@ def main() -> NoReturn:
         click.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _interrupt(*_: object) -> NoReturn:
+    """End as Ctrl-C does, so that no process and no temporary folder stays."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    _terminated.append(True)
+    raise KeyboardInterrupt
 
 
 def _no_such_option(error: click.NoSuchOption) -> str:
