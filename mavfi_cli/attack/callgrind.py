@@ -8,6 +8,7 @@ say how fast it counts. The native CPU time that leads to the same counts says h
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
@@ -20,6 +21,7 @@ from pathlib import Path
 
 from mavfi_cli.attack.target import Golden
 from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.fi.tracer.spawn import Program
 
 # By the path of an object, or UNNAMED: the executions of each linked address.
@@ -69,6 +71,7 @@ def count_executions(
         process = subprocess.Popen(
             [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
             stdin=given, stdout=out, stderr=err, start_new_session=True,
+            preexec_fn=functools.partial(die_with, os.getpid()),
         )  # fmt: skip
     count = _Count(counts=counts, golden=golden, native_s=native_s)
     try:

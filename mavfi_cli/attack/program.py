@@ -363,7 +363,7 @@ class _Workplace:
         ignored = [
             Path(os.path.relpath(each, self._folder.path))
             for each in written
-            if each not in (*outside, *compared) and each.is_file()
+            if each.is_relative_to(self._folder.path) and each not in compared and each.is_file()
         ]
         if ignored:
             yield (
