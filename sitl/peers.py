@@ -28,8 +28,8 @@ _NEWCOMER_S, _LISTENER_S = 0.2, 3.0
 class Peer(ABC):
     """Somebody at the other end of a transport.
 
-    `Peers` keeps its scheme, when it was last heard and told, and for how long it is told everything
-    after it was heard.
+    `Peers` keeps its scheme, when it was last heard and told, and for how long after it was heard
+    it is told everything.
     """
 
     scheme = ""
@@ -139,9 +139,9 @@ class Peers(Generic[P]):
             self._told = (self._told + 1) % len(self._peers)
             peer, now_s = self._peers[self._told], self._clock()
             silent_s, untold_s = now_s - peer.heard_s, now_s - peer.told_s
-            if peer.scheme != "udpin" or silent_s <= max(peer.listens_s, 2.0 * untold_s):
-                if self._try(peer, action) is not False:
-                    peer.told_s = now_s
+            is_due = peer.scheme != "udpin" or silent_s <= max(peer.listens_s, 2.0 * untold_s)
+            if is_due and self._try(peer, action) is not False:
+                peer.told_s = now_s
             if self._clock() >= until_s:
                 break
 
