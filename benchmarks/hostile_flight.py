@@ -2,7 +2,7 @@
 
     python benchmarks/hostile_flight.py --frames 1000000
 
-Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all datagrams on.
+Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all on.
 Once the vehicle is in OFFBOARD, the router adds hostile frames. So they come from the autopilot's
 own address, and nothing is signed. They have right checksums and are of every message that the
 companion handles, with NaN, infinities, extremes and zeros. In three of four flights they are of
@@ -152,7 +152,7 @@ def fly(kind: str, seed: int, rate_hz: float) -> tuple[str, str, int]:
         finally:
             for process in (companion, vehicle):
                 process.terminate()
-            told, errors = companion.communicate()
+            errors = companion.communicate()[1]
             vehicle.wait()
             router.close()
         if companion.returncode != 0:
