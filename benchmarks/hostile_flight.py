@@ -80,6 +80,8 @@ class Router:
         )
         self.vehicle.bind(("127.0.0.1", 0))
         self.companion.connect(("127.0.0.1", companion_port))
+        for each in (self.vehicle, self.companion):
+            each.settimeout(0.0)
         self._frames, self._rate_hz = frames, rate_hz
         self._codec, self._begun_s, self._sent = Codec(255, 255), 0.0, 0
         self._peer: Any = None
@@ -95,7 +97,7 @@ class Router:
                 self._peer = peer
                 self._look(data)
                 self.companion.send(data)
-            except ConnectionError:  # the companion does not listen yet, or has ended
+            except OSError:  # the companion does not listen yet, or has ended
                 continue
         due = (time.monotonic() - self._begun_s) * self._rate_hz if self._begun_s else 0.0
         while self._sent < due:
