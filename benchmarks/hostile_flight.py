@@ -5,8 +5,8 @@
 Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all on.
 Once the vehicle is in OFFBOARD, the router adds hostile frames. So they come from the autopilot's
 own address, and nothing is signed. They have right checksums and are of every message that the
-companion handles, with NaN, infinities, extremes and zeros. In three of four flights they are of
-other systems and components, and the flight has to succeed. In the fourth they have the ids of the
+companion handles, with NaN, infinities, extremes and zeros. They are of other systems and
+components, and the flight has to succeed. In the first flights (`--own`) they have the ids of the
 autopilot and its camera, and the flight may succeed or end as `failsafe`. Frames count if the
 companion has decoded them, which its tlog tells. The command ends with 1 after any other outcome.
 """
@@ -168,11 +168,12 @@ def main() -> None:
     """Fly until enough frames were heard, and report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--own", type=int, default=0, help="flights with the autopilot's own ids")
     parser.add_argument("--rate", type=float, default=4000.0, help="frames a second")
     given = parser.parse_args()
     counts, ends, flown, wrong = Counter[str](), Counter[tuple[str, str]](), 0, 0
-    while sum(counts.values()) < given.frames:
-        kind = "own ids" if flown % 4 == 3 else "others"
+    while counts["others"] < given.frames or flown < given.own:
+        kind = "own ids" if flown < given.own else "others"
         outcome, reason, count = fly(kind, flown, given.rate)
         flown, wrong = flown + 1, wrong + (outcome not in _ALLOWED[kind])
         counts[kind] += count
