@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import require_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +43,7 @@ def fly(
         MavfiError: The mission could not begin, or its record could not be written.
     """
     mission = _mission(config, settings)
+    require_folder(Path(out))
     if mission.instruction is not None:  # the attacked node loads as long as this process
         from mavfi_cli.attack.served import ServedProcess
         from mavfi_cli.mission.instruction import PROGRAM
@@ -72,10 +74,10 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Campaign:
-    """A campaign read from its folder.
+    """A campaign read from its folder or from an exported file.
 
     Attributes:
-        folder: Folder of the campaign.
+        folder: Folder of the campaign, or its exported file.
         table: One row per mission that is over, in the order of the campaign's list, with the
             columns that `mavfi campaign export` writes.
     """
@@ -112,16 +114,15 @@ def campaign(what: str | Path) -> Campaign:
     """Read a campaign, also while it runs.
 
     Args:
-        what: Folder of a campaign, or the preset or TOML file whose folder is campaigns/NAME.
+        what: Folder or exported .parquet file of a campaign, or the preset or TOML file whose
+            folder is campaigns/NAME.
 
     Raises:
         UnknownName: There is no such folder or preset.
         MavfiError: The folder holds no campaign, or its records cannot be read.
     """
     from mavfi_cli.analysis.flights import exported
-    from mavfi_cli.campaigns.begin import folder_of
-    from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.campaigns.begin import opened
 
-    folder = folder_of(str(what))
-    with Ledger(folder) as ledger:
-        return Campaign(folder=folder, table=exported(ledger))
+    with opened(what) as ledger:
+        return Campaign(folder=ledger.folder, table=exported(ledger))

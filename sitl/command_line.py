@@ -76,6 +76,13 @@ def _options(*each: Decorator) -> Decorator:
     return decorate
 
 
+def complete_world(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """The named worlds that begin as typed, for the shell."""
+    from sitl.world.world import named_worlds
+
+    return [name for name in named_worlds() if name.startswith(incomplete)]
+
+
 places = _options(
     click.option("--seed", type=click.IntRange(min=0), default=3, help="Seed of the world."),
     click.option("--start", "start_enu_m", type=Place(), help="Start, ENU m. See --goal."),

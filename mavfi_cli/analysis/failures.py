@@ -19,7 +19,7 @@ import numpy as np
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
-from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.core.errors import ConfigError, RecordError, lack_of
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import Share, cross_layer, rate
 
@@ -37,7 +37,7 @@ def kernel_summary(path: Path) -> Mapping[str, Any]:
     except OSError as error:
         raise RecordError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({error!r})") from None
+        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack_of(error)})") from None
     return found
 
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger, stored_export, stored_provenance
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
@@ -29,7 +29,6 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.measures import (
     QUALITY,
@@ -77,6 +76,9 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     Args:
         among: numbers of the missions to choose from; None means all.
     """
+    if isinstance(ledger, ExportedLedger):
+        table = _updated(ledger.table, ledger.folder)
+        return table if among is None else chosen(table, number=(*among,))
     labels = sorted({name for cell in ledger.cells() for name in cell})
     rows = [_row(entry, labels) for entry in ledger.results(among)]
     names = _row(_NOTHING, labels)  # the columns of a ledger without results, too
@@ -176,6 +178,8 @@ def exported(ledger: Ledger) -> pa.Table:
     The metadata of the table hold its provenance.
     """
     whole = flights(ledger)
+    if isinstance(ledger, ExportedLedger):
+        return whole
     labels = [name for name in whole.column_names if name.startswith("label_")]
     mine = _typed(whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]]))
     return mine.replace_schema_metadata({_METADATA: canonical(provenance(ledger))})
@@ -187,7 +191,10 @@ def read_export(path: Path) -> pa.Table:
     Raises:
         RecordError: the file is missing or damaged.
     """
-    table = read_parquet(path, "export of a campaign")
+    return _updated(stored_export(path), path)
+
+
+def _updated(table: pa.Table, path: Path) -> pa.Table:
     place = table.schema.get_field_index("struck_bits")
     if place >= 0 and pa.types.is_string(table.schema.field(place).type):  # as in "53;1 55"
         try:
@@ -227,7 +234,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
         the `host` of the first record `machine`, `cores` and `started`.
     """
     if isinstance(source, pa.Table):
-        return dict(json.loads((source.schema.metadata or {}).get(_METADATA.encode(), b"{}")))
+        return stored_provenance(source)
     first = next(source.results(), None)
     record = record_of({} if first is None else first.result)
     return {
@@ -297,21 +304,24 @@ def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str,
         RecordError: there is no campaign, or it cannot be read.
         ConfigError: no such mission has flown.
     """
-    if campaign.is_file():
-        table = read_export(campaign)
-        if missing := {"number", "outcome", "changes"} - {*table.column_names}:
-            told = f"no export of a campaign: it has no column {', '.join(sorted(missing))}"
-            raise RecordError(f"{campaign}: {told}")
-        for row in chosen(table, number=number).to_pylist():
-            if row["outcome"] is not None:
-                return structure(json.loads(row["changes"]), MissionConfig), row
-    else:
-        with Ledger(campaign) as ledger:
+    with ExportedLedger(campaign) if campaign.is_file() else Ledger(campaign) as ledger:
+        if isinstance(ledger, ExportedLedger):
+            for row in chosen(flights(ledger), number=number).to_pylist():
+                if row["outcome"] is not None:
+                    return structure(json.loads(row["changes"]), MissionConfig), row
+        else:
             for entry in ledger.results([number]):
                 if entry.outcome is not None:
                     row = {**measures_of(entry.result), "outcome": entry.outcome}
                     return entry.mission.config, row
-    raise ConfigError(f"has no mission {number} that has flown", path=campaign)
+        problem = f"has no mission {number} that has flown ({number_span(ledger)})"
+    raise ConfigError(problem, path=campaign)
+
+
+def number_span(ledger: Ledger) -> str:
+    """The numbers of a campaign's missions, such as `0 to 199`."""
+    numbers = [number for number, *_ in ledger.rows()]
+    return f"{min(numbers)} to {max(numbers)}" if numbers else "it has none"
 
 
 def differing(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:

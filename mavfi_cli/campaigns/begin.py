@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.autonomy import planners
-from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.ledger import LEDGER, ExportedLedger, Ledger, is_export
 from mavfi_cli.campaigns.missions import (
     PlannedMission,
     canonical,
@@ -123,18 +123,33 @@ def folder_of(what: str) -> Path:
     return DEFAULT / load_spec(what).name
 
 
+def opened(what: str | Path) -> Ledger:
+    """Open a campaign for reading: a preset, a TOML file, a folder, or an exported .parquet file.
+
+    Raises:
+        MavfiError: as `folder_of`, `Ledger` and `ExportedLedger`.
+    """
+    return ExportedLedger(Path(what)) if is_export(Path(what)) else Ledger(folder_of(str(what)))
+
+
 def _folder(what: str) -> Path | None:
     """The named campaign's folder; None for a preset or a file."""
     folder = Path(what)
     if what in PRESETS.names:
         return None
+    if is_export(folder):
+        raise ConfigError("an export has no list of missions to fly", path=folder)
     if folder.is_dir() or (os.sep in what and folder.suffix != ".toml"):
         return folder
     if folder.suffix == ".toml":
         return None
-    begun = sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
-    meant = [each for each in begun if Path(each).name == what]
-    raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun])
+    meant = [each for each in begun() if Path(each).name == what]
+    raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun()])
+
+
+def begun() -> list[str]:
+    """The folders of all campaigns in the default place."""
+    return sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
 
 
 def _require_one_meaning(what: str) -> None:

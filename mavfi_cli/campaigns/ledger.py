@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.campaigns.missions import (
     Injected,
@@ -32,9 +32,12 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import inflate, open_own, plain, writing
+from mavfi_cli.core.files import inflate, open_own, plain, read_parquet, writing
 from mavfi_cli.mission.measures import fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SCHEMA = 1
 LEDGER, LOCK, RUNS = "ledger.sqlite", "ledger.lock", "runs"
@@ -80,29 +83,31 @@ class Ledger:
     A context manager that closes it. Any number may read while one writes.
     """
 
-    def __init__(self, folder: Path, *, writing: bool = False) -> None:
+    def __init__(self, folder: Path, *, writing: bool = False, memory: bool = False) -> None:
         """Open the ledger of a folder; a writer creates it if there is none.
+
+        `memory` makes an empty one in memory; `folder` is then only for messages.
 
         Raises:
             RecordError: there is none, it is damaged, or it cannot be opened.
             ConfigError: another version of mavfi wrote it, or another process is its writer.
         """
         self.folder = folder
-        self._path = folder / LEDGER
+        self._path = folder if memory else folder / LEDGER
         self._lock: int | None = None  # descriptor
         self._writing = writing
         with contextlib.ExitStack() as undo:
             if writing:
                 self._become_writer()
                 undo.callback(self._unlock)
-            elif not self._path.is_file():
+            elif not (memory or self._path.is_file()):
                 raise RecordError(f"{folder}: no campaign there (no {LEDGER})")
-            if self._path.is_symlink():
+            if not memory and self._path.is_symlink():
                 raise RecordError(f"{self._path}: is a link")
             try:
-                self._db = self._connect()
+                self._db = self._connect(memory)
                 undo.callback(self._db.close)
-                self._check()
+                self._check(new=writing or memory)
             except sqlite3.Error as error:
                 raise RecordError(f"{self._path}: {error}") from None
             undo.pop_all()
@@ -133,7 +138,9 @@ class Ledger:
             os.close(self._lock)
             self._lock = None
 
-    def _connect(self) -> sqlite3.Connection:
+    def _connect(self, memory: bool) -> sqlite3.Connection:
+        if memory:
+            return sqlite3.connect(":memory:", isolation_level=None)
         mode = "rwc" if self._writing else "rw"  # a reader of a WAL file writes its index
         uri = f"{self._path.absolute().as_uri()}?mode={mode}"
         connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30.0)
@@ -144,9 +151,9 @@ class Ledger:
             connection.execute("PRAGMA query_only = ON")
         return connection
 
-    def _check(self) -> None:
+    def _check(self, *, new: bool) -> None:
         tables = {row[0] for row in self._db.execute("SELECT name FROM sqlite_master")}
-        if not tables and self._writing:
+        if not tables and new:
             with self._transaction():
                 for statement in _TABLES.split(";"):
                     self._db.execute(statement)
@@ -213,6 +220,33 @@ class Ledger:
                 row = (first + count - 1, known[labels], pair, changes)
                 self._db.execute("INSERT INTO missions VALUES (?, ?, ?, ?)", row)
         return count
+
+    def fill(
+        self,
+        name: str,
+        cells: Mapping[str, int],
+        missions: Iterable[tuple[int, int, str, str]],
+        results: Iterable[Mapping[str, Any]],
+    ) -> None:
+        """Store the rows of a whole campaign without its records.
+
+        Args:
+            cells: the settings' labels with their numbers.
+            missions: number, cell, pair and changes of each.
+            results: the columns of the table `results` by name; a missing one is empty.
+
+        Raises:
+            RecordError: the rows are of other types, or a number is there twice.
+        """
+        own = [column[1] for column in self._rows("PRAGMA table_info(results)")]
+        marks = ", ".join("?" * len(own))
+        given = ([each.get(column) for column in own] for each in results)
+        with self._transaction():
+            self._db.execute("INSERT INTO meta VALUES ('name', ?)", (name,))
+            rows = ((number, labels) for labels, number in cells.items())
+            self._db.executemany("INSERT INTO cells VALUES (?, ?)", rows)
+            self._db.executemany("INSERT INTO missions VALUES (?, ?, ?, ?)", missions)
+            self._db.executemany(f"INSERT INTO results VALUES ({marks})", given)
 
     def planned(self) -> int:
         """Number of missions in the list."""
@@ -380,3 +414,70 @@ class Ledger:
         """Number of missions of each cell."""
         rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]
+
+
+# Exports ------------------------------------------------------------------------------------------
+
+EXPORT = ".parquet"
+_METADATA = b"mavfi"  # key of an export's provenance
+_NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
+_LABEL = "label_"
+
+
+def is_export(path: Path) -> bool:
+    """True if a path names an export rather than a folder."""
+    return path.suffix == EXPORT and not path.is_dir()
+
+
+def stored_export(path: Path) -> pa.Table:
+    """Read an export.
+
+    Raises:
+        RecordError: the file is missing or damaged, or has other columns.
+    """
+    if not path.is_file():
+        raise RecordError(f"{path}: no such file")
+    table = read_parquet(path, "export of a campaign")
+    for name in _NEEDED:
+        if name not in table.column_names:
+            raise RecordError(f"{path}: not an export of a campaign (it has no column {name!r})")
+    return table
+
+
+def stored_provenance(table: pa.Table) -> dict[str, Any]:
+    """Return the provenance in the metadata of an export; {} if it has none."""
+    found: dict[str, Any] = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
+    return found
+
+
+class ExportedLedger(Ledger):
+    """A ledger in memory with the missions of an export. It has no records of flights.
+
+    Raises:
+        RecordError: the file is no export.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.table = stored_export(path)
+        super().__init__(path, memory=True)
+        origin = stored_provenance(self.table)
+        labels = [name for name in self.table.column_names if name.startswith(_LABEL)]
+        cells: dict[str, int] = {}
+        missions = []
+        rows = self.table.to_pylist()
+        for row in rows:
+            own = {name.removeprefix(_LABEL): row[name] for name in labels if row[name] is not None}
+            cell = cells.setdefault(canonical(own), len(cells))
+            missions.append((row["number"], cell, row["pair"], row["changes"]))
+        name = str(origin.get("name") or path.stem)
+        self.fill(name, cells, missions, rows)
+
+    def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
+        """An export has no records of flights.
+
+        Raises:
+            RecordError: always.
+        """
+        raise RecordError(
+            f"{self.folder}: an export has no records of flights; name the campaign's folder"
+        )

@@ -149,7 +149,10 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
         if key in seen:
             raise ConfigError(f"{key} is set twice", key="set")
         seen.add(key)
-        _replace(data, key, _values(key, text))
+        try:
+            _replace(data, key, _values(key, text))
+        except ConfigError as error:
+            raise ConfigError(str(error), key="set") from None
         data["name"] += "-" + folder_name(change)
     if len(data["name"]) > _LONGEST:
         digest = hashlib.sha256("\n".join(changes).encode()).hexdigest()[:8]

@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import shlex
 import signal
+import subprocess
 import sys
 from typing import NoReturn
 
 import click
+from click.shell_completion import CompletionItem
 
 from mavfi_cli.core.caches import choose_caches
 from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
@@ -62,6 +65,15 @@ class _LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete a command from the table, because importing every command would be slow."""
+        found = [
+            CompletionItem(name, help=text)
+            for name, (_, text) in _COMMANDS.items()
+            if name.startswith(incomplete)
+        ]
+        return found or click.Command.shell_complete(self, ctx, incomplete)
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
@@ -69,6 +81,27 @@ class _LazyGroup(click.Group):
         if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
             ctx.fail(str(UnknownName("command", args[0], _COMMANDS)))
         return super().resolve_command(ctx, args)
+
+
+class _VehicleSide(click.Command):
+    """A command of the vehicle's side. What follows `mavfi world` is completed by its program."""
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Ask the program; `mavfi sitl` completes nothing, because it would start the vehicle."""
+        from mavfi_cli.core.processes import PYTHON
+
+        if self.name != "world":
+            return []
+        words = [self.name, *ctx.params["arguments"]]
+        asked = {
+            "_MAVFI WORLD_COMPLETE": "bash_complete",
+            "COMP_WORDS": shlex.join([*words, incomplete]),
+            "COMP_CWORD": str(len(words)),
+        }
+        line = [*PYTHON, "-m", _COMMANDS[self.name][0]]
+        done = subprocess.run(line, env=os.environ | asked, capture_output=True, text=True)
+        items = (answer.partition(",") for answer in done.stdout.splitlines())
+        return [CompletionItem(value, type=kind) for kind, _, value in items]
 
 
 def _vehicle_side(name: str, module: str) -> click.Command:
@@ -81,9 +114,12 @@ def _vehicle_side(name: str, module: str) -> click.Command:
         sys.stderr.flush()
         os.execv(sys.executable, [*PYTHON, "-m", module, *arguments])
 
-    arguments = click.Argument(["arguments"], nargs=-1, type=click.UNPROCESSED)
+    arguments = click.Argument(
+        ["arguments"], nargs=-1, type=click.UNPROCESSED,
+        shell_complete=lambda ctx, _param, incomplete: ctx.command.shell_complete(ctx, incomplete),
+    )  # fmt: skip
     settings = {"ignore_unknown_options": True, "help_option_names": []}
-    return click.Command(name, settings, become, [arguments], add_help_option=False)
+    return _VehicleSide(name, settings, become, [arguments], add_help_option=False)
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

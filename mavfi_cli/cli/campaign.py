@@ -15,7 +15,23 @@ from mavfi_cli.cli.grouped import (
     GroupedOption,
     GroupOfCommands,
     given_options,
+    refuse_given,
 )
+from mavfi_cli.cli.parameters import (
+    ABOVE_ZERO,
+    CAMPAIGN,
+    CONFIDENCE,
+    ITEM,
+    JOBS,
+    NUMBER,
+    OUT,
+    SCALE,
+    SHARE,
+    UPSETS,
+    Number,
+    OutFile,
+)
+from mavfi_cli.report.drawing import PICTURES
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
@@ -50,14 +66,14 @@ def campaign() -> None:
 
 
 @campaign.command(cls=GroupedCommand)
-@click.argument("what", metavar="WHAT")
-@_what("--scale", type=float, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
+@click.argument("what", metavar="WHAT", type=CAMPAIGN)
+@_what("--scale", type=SCALE, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
 @_SET
 @_what("--missing-only", is_flag=True,
        help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
 @_what("--append", is_flag=True, help="Add the missions that the folder's list lacks.")
 @_what("--retry-errors", is_flag=True, help="Repeat the missions that could not begin.")
-@_execution("--jobs", type=click.IntRange(min=1),
+@_execution("--jobs", type=JOBS,
             help="Number of parallel missions  [one per core].")  # fmt: skip
 @_execution("--cluster", metavar="URL",
             help="Fly on a dask.distributed scheduler, such as tls://host:8786.")  # fmt: skip
@@ -66,11 +82,11 @@ def campaign() -> None:
 @_execution("--firmware", metavar="PATH",
             help="SITL binary that the missions of a folder name. It is executed only if it is "
                  "this one, or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
-@_execution("--limit", "limit_s", type=click.FloatRange(min=0.0, min_open=True), default=900.0,
+@_execution("--limit", "limit_s", type=ABOVE_ZERO, default=900.0,
             show_default=True,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
                  "`hang`.")  # fmt: skip
-@_output("--out", type=_FOLDER, help="Folder of the campaign  [campaigns/NAME].")
+@_output("--out", type=OUT, help="Folder of the campaign  [campaigns/NAME].")
 @_output("--keep", type=click.Choice(_KEEP),
          help="Run folders to keep  [as the campaign says].")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
@@ -113,10 +129,10 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT")
+@click.argument("what", metavar="WHAT", type=CAMPAIGN)
 @click.option("--by", metavar="LABEL,LABEL", help="Group settings by these labels  [all].")
 @click.option("--confidence", default=0.95, show_default=True,
-              type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+              type=CONFIDENCE,
               help="Confidence level of the intervals.")  # fmt: skip
 @click.option("--quality", is_flag=True,
               help="Add intervals and extremes of time, distance, energy and replans.")  # fmt: skip
@@ -128,7 +144,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 @click.option("--kernels", type=_FOLDER,
               help="With --failures: folder of `mavfi kernels --out`. Adds the probability of "
                    "failure given an SDC of a kernel.")  # fmt: skip
-@click.option("--upsets", type=click.FloatRange(min=0.0),
+@click.option("--upsets", type=UPSETS,
               help="With --failures: bit flips per hour that reach the injection sites. "
                    "Adds failures per flight hour.")  # fmt: skip
 @click.option("--full", is_flag=True,
@@ -141,25 +157,24 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
     The table is the paper's if the campaign is a preset of the paper, else that of the settings.
     `mavfi campaign report` prints it in other formats and draws it.
     """
-    from mavfi_cli.campaigns.begin import folder_of
-    from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.campaigns.begin import opened
 
     if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
         raise click.UsageError("--kernels and --upsets go with --failures")
     full = bool(given_options().keys() & _FULL)
-    with Ledger(folder_of(what)) as ledger:
+    with opened(what) as ledger:
         names = [name for name in (by or "").split(",") if name]
         _show(ledger, names, confidence, as_json=as_json, more=options, full=full)
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT")
-@click.option("--item", metavar="ITEM",
+@click.argument("what", metavar="WHAT", type=CAMPAIGN)
+@click.option("--item", type=ITEM, metavar="ITEM",
               help="Figure or table of the paper, such as fig12 of table4; needed in the folder "
                    "of `mavfi reproduce`  [that of the preset].")  # fmt: skip
 @click.option("--format", "form", type=click.Choice(["text", "markdown", "latex", "csv"]),
               default="text", show_default=True, help="Format of the table.")  # fmt: skip
-@click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+@click.option("--output", metavar="FILE", type=OutFile(PICTURES),
               help="Draw the figure into this .svg, .pdf or .png file.")  # fmt: skip
 @click.option("--columns", type=click.Choice(["one", "two"]), default="one", show_default=True,
               help="Width of the figure in columns of a printed page.")  # fmt: skip
@@ -168,17 +183,13 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 
     A campaign that is not in the paper has the table of its settings.
     """
-    from mavfi_cli.campaigns.begin import folder_of
-    from mavfi_cli.campaigns.ledger import Ledger
-    from mavfi_cli.core.files import require_output
+    from mavfi_cli.campaigns.begin import opened
     from mavfi_cli.paper.figures import draw
     from mavfi_cli.paper.status import shown
-    from mavfi_cli.report.drawing import PICTURES, write_figure
+    from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.paper import FORMATS
 
-    if output is not None:
-        require_output(output, PICTURES)
-    with Ledger(folder_of(what)) as ledger:
+    with opened(what) as ledger:
         table, flights = shown(ledger, item)
         click.echo(FORMATS[form](table), nl=False)
         if output is not None:
@@ -187,30 +198,36 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT")
-@click.argument("path", type=click.Path(path_type=Path, dir_okay=False, allow_dash=True))
-def export(what: str, path: Path) -> None:
+@click.argument("what", metavar="WHAT", type=CAMPAIGN)
+@click.argument("path", type=OutFile((".parquet", ".csv"), allow_dash=True))
+@click.option("--json", "as_json", is_flag=True,
+              help="Print the file and the number of its missions as JSON.")  # fmt: skip
+def export(what: str, path: Path, as_json: bool) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
     from mavfi_cli.core.files import write_atomically
     from mavfi_cli.report.campaign import flights_file
 
+    if as_json and path == Path("-"):
+        raise click.UsageError("--json needs a file, because - is stdout")
     table = library.campaign(what).table
     content = flights_file(table, path)
     if path == Path("-"):
         click.echo(content, nl=False)
     else:
         write_atomically(path, lambda file: file.write(content))
-        click.echo(f"{table.num_rows} missions in {path}")
+        told = {"file": str(path), "missions": table.num_rows, "columns": table.column_names}
+        text = f"{table.num_rows} missions in {path}"
+        click.echo(json.dumps(told, indent=2) if as_json else text)
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT")
-@click.option("--pair", "number", type=click.IntRange(min=0), metavar="NUMBER",
+@click.argument("what", metavar="WHAT", type=CAMPAIGN)
+@click.option("--pair", "number", type=NUMBER, metavar="NUMBER",
               help="Draw the pair of this mission. The number is the first part of the run "
                    "folder's name  [the pair in which a fault costs most flight "
                    "time].")  # fmt: skip
-@click.option("--output", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+@click.option("--output", metavar="FILE", type=OutFile(PICTURES),
               required=True, help="The .svg, .pdf or .png file to write.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
 def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
@@ -219,13 +236,12 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     Reads the kept run folders of all settings of the pair. Each fault has a panel.
     """
     from mavfi_cli.analysis.trajectories import pair
-    from mavfi_cli.campaigns.begin import folder_of
-    from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.campaigns.begin import opened
     from mavfi_cli.core.files import plain
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.top_view import Trajectories
 
-    with Ledger(folder_of(what)) as ledger:
+    with opened(what) as ledger:
         chosen = pair(ledger, number)
     flown = Trajectories.of(chosen)
     write_figure(flown.draw(), output)
@@ -238,22 +254,22 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
 
 @campaign.command(cls=GroupedCommand)
-@click.argument("what", metavar="[WHAT]", required=False)
-@_what("--scale", type=float, help="Fraction of the repetitions to run.")
+@click.argument("what", metavar="[WHAT]", required=False, type=CAMPAIGN)
+@_what("--scale", type=SCALE, help="Fraction of the repetitions to run.")
 @_SET
-@_size("--margin", type=float,
+@_size("--margin", type=Number(1.0e-6, 0.5, max_open=True),
               help="Print the number of missions per setting for a confidence interval of this "
                    "half-width.")  # fmt: skip
-@_size("--expect", "expected", default=0.5, show_default=True,
+@_size("--expect", "expected", default=0.5, show_default=True, type=SHARE,
               help="With --margin: expected success rate.")  # fmt: skip
-@_size("--difference", type=float,
+@_size("--difference", type=Number(-1.0, 1.0),
               help="Print the number of pairs that detects this difference of success "
                    "rates.")  # fmt: skip
-@_size("--discordant", default=0.2, show_default=True,
+@_size("--discordant", default=0.2, show_default=True, type=SHARE,
               help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
-@_size("--power", default=0.8, show_default=True,
+@_size("--power", default=0.8, show_default=True, type=CONFIDENCE,
               help="With --difference: probability of detecting it.")  # fmt: skip
-@_size("--confidence", default=0.95, show_default=True,
+@_size("--confidence", default=0.95, show_default=True, type=CONFIDENCE,
               help="Confidence level.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print as JSON.")
 def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
@@ -263,6 +279,14 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
     """
     from mavfi_cli.stats.shares import missions_for_margin, pairs_for_difference
 
+    needs = {"margin": ("expected",), "difference": ("discordant", "power")}
+    for name, others in needs.items():
+        if options[name] is None:
+            refuse_given(others, f"needs --{name}")
+    if options["margin"] is options["difference"] is None:
+        refuse_given(("confidence",), "needs --margin or --difference")
+    if what is None:
+        refuse_given(("scale", "changes"), "needs a campaign")
     told: dict[str, Any] = {}
     lines: list[str] = []
     names = ("margin", "expected", "difference", "discordant", "power", "confidence")

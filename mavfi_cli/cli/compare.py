@@ -10,6 +10,19 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, names_in
+from mavfi_cli.cli.parameters import (
+    DETECTORS,
+    FIELD,
+    FIRST_SEED,
+    JOBS,
+    MISSIONS,
+    OUT,
+    PLATFORM,
+    SEED,
+    STACK,
+    TARGETS,
+    WORLD,
+)
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")
 _settings = partial(click.option, cls=GroupedOption, group="Faults and detectors")
@@ -17,29 +30,29 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 
 @click.command(cls=GroupedCommand)
-@_missions("--platform", "platforms", multiple=True, metavar="NAME|FILE",
+@_missions("--platform", "platforms", multiple=True, type=PLATFORM, metavar="NAME|FILE",
            help="Platform; may be repeated. The others are compared with the first  "
                 "[x86, tx2].")  # fmt: skip
-@_missions("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+@_missions("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
            help="Stack on all platforms; `mavfi stacks` lists them.")  # fmt: skip
-@_missions("--world", default="sparse", show_default=True, metavar="NAME|FILE",
+@_missions("--world", type=WORLD, default="sparse", show_default=True, metavar="NAME|FILE",
            help="World of the missions.")  # fmt: skip
-@_missions("--missions", default=100, show_default=True,
+@_missions("--missions", default=100, show_default=True, type=MISSIONS,
            help="Missions per platform, setting and target.")  # fmt: skip
-@_missions("--first-seed", default=1, show_default=True,
+@_missions("--first-seed", default=1, show_default=True, type=FIRST_SEED,
            help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
-@_missions("--jobs", type=click.IntRange(min=1),
+@_missions("--jobs", type=JOBS,
            help="Number of parallel missions  [one per core].")  # fmt: skip
-@_settings("--inject", metavar="TARGET,TARGET",
+@_settings("--inject", type=TARGETS, metavar="TARGET,TARGET",
            help="Stages, states or groups to corrupt, one per mission; none flies golden runs "
                 "only  [perception,planning,control].")  # fmt: skip
-@_settings("--field", help="Field of the bits: sign, exponent, mantissa  [any].")
-@_settings("--seed", default=1, show_default=True, help="Seed of the faults.")
-@_settings("--detector", "detectors", metavar="NAME,NAME",
+@_settings("--field", type=FIELD, help="Field of the bits: sign, exponent, mantissa  [any].")
+@_settings("--seed", default=1, show_default=True, type=SEED,
+           help="Seed of the faults.")  # fmt: skip
+@_settings("--detector", "detectors", type=DETECTORS, metavar="NAME,NAME",
            help="Detectors; none, the flight without detector, is always included  "
                 "[none,gad,aad].")  # fmt: skip
-@_output("--out", type=click.Path(path_type=Path, file_okay=False),
-         default=Path("comparison"), show_default=True,
+@_output("--out", type=OUT, default=Path("comparison"), show_default=True,
          help="Folder of flights, tables and pictures. Recorded missions are not flown "
               "again.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")

@@ -10,6 +10,19 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, GroupOfCommands, names_in
+from mavfi_cli.cli.parameters import (
+    DETECTORS,
+    FIELDS,
+    FIRST_SEED,
+    JOBS,
+    MISSIONS,
+    OUT,
+    PLATFORM,
+    SEED,
+    STACK,
+    STAGES,
+    WORLD,
+)
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -46,36 +59,39 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 
 @detect.command(cls=GroupedCommand)
-@_missions("--world", "worlds", multiple=True, metavar="NAME|FILE",
+@_missions("--world", "worlds", multiple=True, type=WORLD, metavar="NAME|FILE",
            help="World; may be repeated  [sparse, dense, factory, farm].")  # fmt: skip
-@_missions("--flights", default=25, show_default=True, type=click.IntRange(min=0),
+@_missions("--flights", default=25, show_default=True, type=click.IntRange(0, MISSIONS.max),
            help="Faulty missions per world. Each is flown once per kind of fault.")  # fmt: skip
-@_missions("--golden-flights", default=100, show_default=True, type=click.IntRange(min=1),
+@_missions("--golden-flights", default=100, show_default=True, type=MISSIONS,
            help="Error-free missions per world, at least --flights.")  # fmt: skip
-@_missions("--first-seed", default=500_000, show_default=True, type=click.IntRange(min=0),
+@_missions("--first-seed", default=500_000, show_default=True, type=FIRST_SEED,
            help="Seed of the first mission; each further mission adds 1. Seeds that trained a "
                 "model are rejected.")  # fmt: skip
-@_missions("--platform", metavar="NAME|FILE", help="Platform of the companion  [x86].")
-@_missions("--stack", metavar="NAME|FILE",
+@_missions(
+    "--platform", type=PLATFORM, metavar="NAME|FILE", help="Platform of the companion  [x86]."
+)
+@_missions("--stack", type=STACK, metavar="NAME|FILE",
            help="Stack; its shipped models are used. `mavfi stacks` lists them  "
                 "[mavbench].")  # fmt: skip
-@_missions("--jobs", type=click.IntRange(min=1),
+@_missions("--jobs", type=JOBS,
            help="Number of parallel missions  [one per core].")  # fmt: skip
 @_fault("--level", type=click.Choice(["source", "instruction"]), default="source",
         show_default=True,
         help="`source` corrupts states between kernels, `instruction` operands of a node's "
              "instructions.")  # fmt: skip
-@_fault("--field", "fields", default="sign,exponent,mantissa,integer", show_default=True,
+@_fault("--field", "fields", type=FIELDS, default="sign,exponent,mantissa,integer",
+        show_default=True,
         help="Fields of the bits at source level; integer means states that have no other "
              "field.")  # fmt: skip
-@_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+@_fault("--seed", default=1, show_default=True, type=SEED,
         help="Seed of the faults.")  # fmt: skip
-@_detector("--detector", "detectors", metavar="NAME,NAME",
+@_detector("--detector", "detectors", type=DETECTORS, metavar="NAME,NAME",
            help="Detectors to evaluate  [none,range,l2,gad,aad].")  # fmt: skip
 @_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
-@_detector("--protect", default="perception,planning,control", show_default=True,
+@_detector("--protect", type=STAGES, default="perception,planning,control", show_default=True,
            help="Stages that the detectors watch.")  # fmt: skip
-@_output("--out", type=_FOLDER, default=Path("evaluation"), show_default=True,
+@_output("--out", type=OUT, default=Path("evaluation"), show_default=True,
          help="Folder of flights, tables and pictures. Recorded missions are not flown "
               "again.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the evaluation as JSON.")

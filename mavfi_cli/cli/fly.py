@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -18,17 +19,46 @@ from mavfi_cli.cli.grouped import (
     refuse_given,
     spelling,
 )
+from mavfi_cli.cli.parameters import (
+    ABOVE_ZERO,
+    AUTOPILOT,
+    BIT,
+    BITS,
+    DETECTOR,
+    EFFECT,
+    FIELD,
+    OUT,
+    PERSISTENCE,
+    PLANNER,
+    PLATFORM,
+    ROLE,
+    SEED,
+    SITE,
+    STACK,
+    STAGES,
+    TARGET,
+    VEHICLE,
+    WATCH,
+    WORLD,
+)
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
 
 if TYPE_CHECKING:
+    from mavfi_cli.mission.run_folder import Run
     from mavfi_cli.spec.detector import DetectorConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
 
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together"}
+_DYING = "needs nodes that can die: --inject process.NODE, or --level instruction"
 _EITHER = {"bits", "field", "fault_seed"}
 _INSTRUCTION = {"sites", "roles"}
 _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
+_SMALL = 1.0e-3  # change of a value, of the value itself or of 1 in its unit
+_LARGE = [
+    "--inject", "waypoint_position", "--all-components", "--field", "exponent",
+    "--fault-seed", "20",
+]  # fmt: skip
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
@@ -53,20 +83,20 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_mission("--config", metavar="FILE", type=click.Path(path_type=Path, exists=True, dir_okay=False),
           help="TOML file of the whole mission. Other options override it. "
                "docs/reference/settings.md lists its keys.")  # fmt: skip
-@_mission("--world", default="dense", metavar="NAME|FILE",
+@_mission("--world", type=WORLD, default="dense", metavar="NAME|FILE",
           help="World, or a TOML file of boxes; `mavfi world list` lists the worlds.")  # fmt: skip
 @_mission("--seed", default=3, help="Root seed of all random draws.")
 @_mission("--world-seed", type=int, help="Seed of the world only  [--seed].")
-@_mission("--planner", default="rrtstar",
+@_mission("--planner", type=PLANNER, default="rrtstar",
           help="Planner: rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
-@_mission("--platform", default="x86", metavar="NAME|FILE|measured:FACTOR",
+@_mission("--platform", type=PLATFORM, default="x86", metavar="NAME|FILE|measured:FACTOR",
           help="Computer whose latencies the kernels have; `mavfi platforms` lists them. "
                "`measured` takes the kernel times of this host times FACTOR and needs "
                "--realtime.")  # fmt: skip
-@_mission("--stack", default="mavbench", metavar="NAME|FILE",
+@_mission("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
           help="Structure, checks and gains of the companion; `mavfi stacks` lists the "
                "stacks.")  # fmt: skip
-@_mission("--vehicle", default="solo", metavar="NAME|FILE",
+@_mission("--vehicle", type=VEHICLE, default="solo", metavar="NAME|FILE",
           help="Simulated vehicle: solo, spark, or a TOML file.")  # fmt: skip
 @_mission(
     "--start", metavar="X,Y,Z", callback=_place, help="Take-off position, ENU, m  [the world's]."
@@ -87,7 +117,7 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_mission("--origin", metavar="X,Y,Z", callback=_place,
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
-@_mission("--autopilot", default="ours", metavar="ours|px4|ardupilot",
+@_mission("--autopilot", type=AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",
           help="Autopilot of the simulated vehicle. px4 and ardupilot are started and ended with "
                "the mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
@@ -98,29 +128,29 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
           help="Time without a new state or depth frame after which --link counts as lost, s. It "
                "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
-          help="Land and disarm at the goal  [only with --link].")  # fmt: skip
-@_fault("--inject", metavar="STAGE|STATE|GROUP",
+          help="Land and disarm at the goal  [with --link, otherwise not].")  # fmt: skip
+@_fault("--inject", type=TARGET, metavar="STAGE|STATE|GROUP",
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
              "process.NODE (the node's process is killed).")  # fmt: skip
 @_fault("--at", default="random",
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
-@_fault("--fault-seed", default=1, type=click.IntRange(min=0),
+@_fault("--fault-seed", default=1, type=SEED,
         help="Seed of all random draws of the fault.")  # fmt: skip
-@_fault("--bits", default=1, help="Number of bits to flip.")
-@_fault("--field", default="any",
+@_fault("--bits", default=1, type=BITS, help="Number of bits to flip.")
+@_fault("--field", default="any", type=FIELD,
         help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
-@_fault("--bit", "exact_bits", multiple=True, type=int,
+@_fault("--bit", "exact_bits", multiple=True, type=BIT,
         help="Flip this bit instead of a random one; 0 is the lowest. May be "
              "repeated.")  # fmt: skip
 @_fault("--all-components", "together", is_flag=True,
         help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
-@_fault("--effect", default="flip",
+@_fault("--effect", default="flip", type=EFFECT,
         help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
-@_fault("--persistence", default="transient",
+@_fault("--persistence", default="transient", type=PERSISTENCE,
         help="Persistence: transient (once), stuck-at (held), intermittent (again).")  # fmt: skip
-@_fault("--duration", "duration_s", type=float,
+@_fault("--duration", "duration_s", type=ABOVE_ZERO,
         help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0,
         help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
@@ -128,15 +158,15 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
               help="`instruction` corrupts an operand of one machine instruction of a kernel. "
                    "--inject is then point_cloud, octomap, collision_check, planner, control, "
                    "perception or planning.")  # fmt: skip
-@_instruction("--site", "sites", multiple=True,
+@_instruction("--site", "sites", multiple=True, type=SITE,
               help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, "
                    "opcode, memory. May be repeated  [the first five: registers].")  # fmt: skip
-@_instruction("--role", "roles", multiple=True,
+@_instruction("--role", "roles", multiple=True, type=ROLE,
               help="Role of the operand: source or destination  [both].")  # fmt: skip
-@_detector("--detector", metavar="NAME",
+@_detector("--detector", type=DETECTOR, metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
-@_detector("--protect", metavar="STAGE,...", default="perception,planning,control",
+@_detector("--protect", type=STAGES, metavar="STAGE,...", default="perception,planning,control",
            callback=lambda _ctx, _param, value: names_in(value),
            help="Stages that the detector watches.")  # fmt: skip
 @_detector("--threshold", type=float,
@@ -147,10 +177,10 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_detector("--any-stack-model", "any_stack", is_flag=True,
            help="Accept a model of another stack. Without --model, use the model of the base "
                 "stack.")  # fmt: skip
-@_detector("--watch", default="paper", metavar="paper|extended",
+@_detector("--watch", type=WATCH, default="paper", metavar="paper|extended",
            help="States that the detector watches. paper has the 13 of the paper; extended adds "
                 "collision and the sequence numbers of plans.")  # fmt: skip
-@_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
+@_output("--out", type=OUT, default=Path("runs"),
          help="Parent of the new run folder.")  # fmt: skip
 @_output("--record", metavar="mcap|rrd", type=click.Choice(["mcap", "rrd"]),
          help="Also record depth frames, clouds and maps: flight.mcap for Foxglove, flight.rrd "
@@ -201,12 +231,34 @@ def fly(
         click.echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:
         drawn = folder_lines(run, folder.picture if picture else None)
-        click.echo("\n".join([*summary_lines(run.result), *drawn]))
+        click.echo("\n".join([*summary_lines(run.result), *drawn, *_hint(run)]))
     if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
     if expect is not None and run.record.outcome != expect:
         click.echo(f"error: expected {expect}, got {outcome_line(run.result)}", err=True)
         raise click.exceptions.Exit(1)
+
+
+def _hint(run: Run) -> list[str]:
+    """Name a fault that moves a waypoint far, after one in a state that changed hardly anything."""
+    fault, config = run.record.fault, run.record.config
+    changes = [each for strike in fault.get("strikes", []) for each in strike["changes"]]
+    small = (
+        abs(each["after"] - each["before"]) <= _SMALL * max(1.0, abs(each["before"]))
+        for each in changes
+    )
+    if run.record.outcome != "success" or config["detector"] or not (changes and all(small)):
+        return []
+    line = ["mavfi", "fly"]
+    for name, value in given_options().items():
+        if name in _SOURCE | _EITHER | {"inject"}:
+            continue
+        if isinstance(value, bool):
+            line += [spelling(name)] if value else []
+        else:
+            text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+            line += [spelling(name), text]
+    return ["", f"This flip is too small to see. try: {shlex.join([*line, *_LARGE])}"]
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
@@ -249,6 +301,10 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
         land=land,
         **{name: value for name, value in given.items() if name in own},
     )
+    if fault is not None and fault.persistence == "transient":
+        refuse_given({"duration_s"}, "needs --persistence stuck-at or intermittent")
+    if not (instruction or mission.isolate or (fault is not None and fault.killed_node)):
+        refuse_given({"node_restart_s"}, _DYING)
     mission.loaded_stack()
     if mission.detector is not None:
         mission.detector.built(mission.stack)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, MavfiError
 
 
 class GroupedOption(click.Option):
@@ -26,11 +26,11 @@ class GroupedCommand(click.Command):
         """Call the command. An invalid value is a usage error that names the option."""
         try:
             return super().invoke(ctx)
-        except ConfigError as error:
-            option = "" if error.path or not error.key else spelling(error.key)
+        except MavfiError as error:
+            option, problem = _blamed(error)
             if not option.startswith("--"):
                 raise
-            raise click.UsageError(f"{option}: {error.problem}") from None
+            raise click.UsageError(f"{option}: {problem}") from None
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write one section per group, in the order of declaration."""
@@ -49,6 +49,8 @@ class GroupedCommand(click.Command):
 class GroupOfCommands(click.Group):
     """A group whose help shows the whole first sentence of each command."""
 
+    command_class = GroupedCommand
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands."""
         with formatter.section("Commands"):
@@ -58,6 +60,20 @@ class GroupOfCommands(click.Group):
                     for name, command in sorted(self.commands.items())
                 ]
             )
+
+
+def _blamed(error: MavfiError) -> tuple[str, str]:
+    """The option or argument whose value an error is about, and the problem; both may be empty."""
+    if isinstance(error, ConfigError) and error.key and not error.path:
+        return spelling(error.key), error.problem
+    for name, value in given_options().items() if error.exit_code == 2 else ():
+        texts = value if isinstance(value, tuple) else (value,)
+        names = (
+            each for text in texts if isinstance(text, str) for each in (text, *names_in(text))
+        )
+        if any(repr(each) in str(error) for each in names):
+            return spelling(name), str(error)
+    return "", ""
 
 
 def given_options() -> dict[str, Any]:

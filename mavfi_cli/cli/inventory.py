@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mavfi_cli.cli.grouped import GroupedCommand
+from mavfi_cli.cli.parameters import PLATFORM, STACK
 from mavfi_cli.report.columns import WIDTH, columns
 
 if TYPE_CHECKING:
     from mavfi_cli.spec.platform import PlatformProfile
     from mavfi_cli.spec.stack import Stack
-
-_names = click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
 
 
 def _print_json(rows: Iterable[Any]) -> None:
@@ -34,7 +34,7 @@ _FOUND = 29  # column of a check's finding
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
 
 
-@click.command()
+@click.command(cls=GroupedCommand)
 @click.option("--json", "as_json", is_flag=True, help="Print the checks as JSON.")
 def doctor(as_json: bool) -> None:
     """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
@@ -74,8 +74,8 @@ result.json has the medians. Such a flight does not repeat: `mavfi fly --realtim
 only, neither in campaigns nor with `mavfi replay`."""
 
 
-@click.command()
-@_names
+@click.command(cls=GroupedCommand)
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]...", type=PLATFORM)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def platforms(names: tuple[str, ...], as_json: bool) -> None:
     """List the compute platforms, or show the named ones kernel by kernel."""
@@ -159,8 +159,8 @@ _MORE_STACKS = """
 NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true."""
 
 
-@click.command()
-@_names
+@click.command(cls=GroupedCommand)
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]...", type=STACK)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def stacks(names: tuple[str, ...], as_json: bool) -> None:
     """List the stacks, explain the keys of one, or show the keys in which several differ.
@@ -227,7 +227,7 @@ def _told(value: Any) -> str:
 # States -------------------------------------------------------------------------------------------
 
 
-@click.command()
+@click.command(cls=GroupedCommand)
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def states(as_json: bool) -> None:
     """List the monitored states, which are the injection sites of source-level faults."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import shlex
 from collections.abc import Sequence
@@ -15,6 +14,21 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
+from mavfi_cli.cli.parameters import (
+    ABOVE_ZERO,
+    COMPAT,
+    FIELD,
+    JOBS,
+    KERNEL,
+    MISSIONS,
+    OUT,
+    ROLE,
+    SAMPLING,
+    SEED,
+    SITE,
+    WORLD,
+    Number,
+)
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import ScratchFolder
 
@@ -28,6 +42,7 @@ _OF_PROGRAM = (
 )  # fmt: skip
 
 
+_WIDEST = 4096  # bits of the longest operand, that of fxsave
 _target = partial(click.option, cls=GroupedOption, group="Kernels")
 _native = partial(click.option, cls=GroupedOption, group="Native program")
 _fault = partial(click.option, cls=GroupedOption, group="Fault")
@@ -36,13 +51,14 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 
 @click.command(cls=GroupedCommand)
-@_target("--kernel", multiple=True, metavar="NAME",
+@_target("--kernel", multiple=True, type=KERNEL, metavar="NAME",
          help="Kernel to attack: point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar, "
               "control, or a Python file with your own kernel. May be repeated  "
               "[all].")  # fmt: skip
-@_target("--world", default="dense", show_default=True, metavar="NAME|FILE",
+@_target("--world", type=WORLD, default="dense", show_default=True, metavar="NAME|FILE",
          help="World of the golden run that supplies the kernels' inputs.")  # fmt: skip
-@_target("--world-seed", default=3, show_default=True, help="Seed of that golden run.")
+@_target("--world-seed", default=3, show_default=True, type=SEED,
+         help="Seed of that golden run.")  # fmt: skip
 @_native("--program", help="Native program to attack instead of the kernels.")
 @_native("--args", help="Arguments of the program, quoted as in a shell.")
 @_native("--stdin", "stdin_file", metavar="FILE",
@@ -59,36 +75,37 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_native("--env", multiple=True, metavar="NAME=VALUE",
          help="Environment variable of the program. May be repeated.")  # fmt: skip
 @_native("--memory", default=2.0, show_default=True, metavar="GB",
-         type=click.FloatRange(min=0.0, min_open=True),
+         type=ABOVE_ZERO,
          help="Limit on the memory of the program.")  # fmt: skip
 @_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
 @_native("--function", help="Attack only code that executes during calls of this function.")
-@_fault("--sampling", default="instruction-uniform", show_default=True,
+@_fault("--sampling", default="instruction-uniform", show_default=True, type=SAMPLING,
         help="Sampling rule: instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
-@_fault("--site", multiple=True,
+@_fault("--site", multiple=True, type=SITE,
         help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, opcode, "
              "memory. May be repeated  [the first five: registers].")  # fmt: skip
-@_fault("--role", multiple=True, help="Role of the operand: source or destination  [both].")
-@_fault("--field", default="any", show_default=True,
+@_fault("--role", multiple=True, type=ROLE,
+        help="Role of the operand: source or destination  [both].")  # fmt: skip
+@_fault("--field", default="any", show_default=True, type=FIELD,
         help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
-@_fault("--bits", default=1, show_default=True, type=click.IntRange(min=1),
+@_fault("--bits", default=1, show_default=True, type=click.IntRange(1, _WIDEST),
         help="Number of bits to flip.")  # fmt: skip
-@_fault("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+@_fault("--seed", default=1, show_default=True, type=SEED,
         help="Seed of the faults.")  # fmt: skip
-@_fault("--compat", metavar="INJECTOR",
+@_fault("--compat", type=COMPAT, metavar="INJECTOR",
         help="Follow the rules of another injector: pinfi, pinfi-bugs, rosfi-2021.")  # fmt: skip
 @_fault("--null", is_flag=True, help="Do everything except the flip.")
-@_runs("--runs", default=1000, show_default=True, type=click.IntRange(min=1),
+@_runs("--runs", default=1000, show_default=True, type=MISSIONS,
        help="Runs per kernel, or of the program. Each run has one fault.")  # fmt: skip
-@_runs("--jobs", default=1, show_default=True, type=click.IntRange(min=1),
+@_runs("--jobs", default=1, show_default=True, type=JOBS,
        help="Number of parallel runs. It does not change the results.")  # fmt: skip
-@_runs("--tolerance", default=0.0, type=click.FloatRange(min=0.0),
+@_runs("--tolerance", default=0.0, type=Number(0.0, 1.0e6),
        help="Relative error still counted as benign.")  # fmt: skip
 @_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
        help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
             "--runs limits the runs of each. For runs of a program, give the options of the "
             "program again.")  # fmt: skip
-@_output("--out", type=click.Path(path_type=Path, file_okay=False),
+@_output("--out", type=OUT,
          help="Folder for records, JSON, CSV and plot. Recorded runs are not "
               "repeated.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
@@ -99,9 +116,6 @@ def kernels(**options: Any) -> None:
 
     Outcomes: benign, crash, hang, SDC (silent data corruption), not injected.
     """
-    for name in ("memory", "tolerance"):
-        if not math.isfinite(options[name]):
-            raise ConfigError("must be a finite number", key=name)
     if options["compat"] is not None:
         chosen = ("sampling", "site", "role", "field", "bits")
         refuse_given(chosen, "goes without --compat, which chooses it by its own rule")

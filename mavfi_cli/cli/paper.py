@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
+from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS, Number, OutFile
 
 _what = partial(click.option, cls=GroupedOption, group="Missions")
 _execution = partial(click.option, cls=GroupedOption, group="Execution")
@@ -16,19 +19,20 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 
 @click.command(cls=GroupedCommand)
-@click.argument("names", metavar="[ITEM...]", nargs=-1)
-@_what("--scale", type=click.FloatRange(min=0.0, min_open=True, max=1.0), default=1.0,
+@click.argument("names", metavar="[ITEM...]", nargs=-1, type=ITEM)
+@_what("--scale", type=Number(0.0, 1.0, min_open=True), default=1.0,
        show_default=True,
        help="Fraction of the paper's number of missions. A folder may grow to a larger "
             "one.")  # fmt: skip
-@_what("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+@_what("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
-@_execution("--jobs", type=click.IntRange(min=1),
+@_execution("--jobs", type=JOBS,
             help="Number of parallel missions  [one per core].")  # fmt: skip
-@_output("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("reproduction"),
+@_output("--out", type=OUT, default=Path("reproduction"),
          show_default=True, help="Folder in which each stack has a folder.")  # fmt: skip
+@_output("--json", "as_json", is_flag=True, help="Print the tables and their folder as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
-def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
+def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Fly the experiments of the paper, and print the results beside the paper's.
 
     ITEM is fig6 fig7 fig8 fig9 fig11 fig12 fig13 fig14 fig15 fig16 table3 table4 table5; all of
@@ -37,10 +41,13 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
     """
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
+    from mavfi_cli.core.files import plain
     from mavfi_cli.paper.flying import reproduce as run
     from mavfi_cli.paper.items import FlightsPlan, items_named
     from mavfi_cli.paper.status import tables
+    from mavfi_cli.spec.stack import load_stack
 
+    load_stack(options["stack"])  # before what takes long
     plan = FlightsPlan(
         items=items_named(names), stack=options["stack"], scale=options["scale"], out=options["out"]
     )
@@ -51,6 +58,11 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
             view,
             lambda forecast: view.on_note(forecast.told),
         )
+    if as_json:
+        told = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
+                "items": [asdict(table) for table in tables(plan)]}  # fmt: skip
+        click.echo(json.dumps(plain(told), indent=2, default=str))
+        return
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
         click.echo(table.text() if len(plan.items) == 1 else one_line, nl=False)
@@ -59,15 +71,18 @@ def reproduce(names: tuple[str, ...], quiet: bool, **options: Any) -> None:
         click.echo(f"The page            mavfi report {plan.out} -o report.html")
 
 
-@click.command()
+@click.command(cls=GroupedCommand)
 @click.argument("places", nargs=-1, required=True, metavar="DIR...",
                 type=click.Path(path_type=Path))  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="FILE", help="HTML file to write.",
-              type=click.Path(path_type=Path, dir_okay=False))  # fmt: skip
-@click.option("--upsets", type=click.FloatRange(min=0.0), default=1.0, show_default=True,
+              type=OutFile())  # fmt: skip
+@click.option("--upsets", type=UPSETS, default=1.0, show_default=True,
               help="Bit flips per hour that reach the injection sites, for the table of "
                    "failures per flight hour.")  # fmt: skip
-def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
+@click.option("--json", "as_json", is_flag=True,
+              help="Print the file, its missions, and how many claims have which verdict, as "
+                   "JSON.")  # fmt: skip
+def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool) -> None:
     """Write one HTML file: the paper's claims, tables and figures beside flown missions.
 
     DIR is the folder of a campaign or of `mavfi kernels`, a folder of such folders, as `mavfi
@@ -84,7 +99,17 @@ def report(places: tuple[Path, ...], output: Path, upsets: float) -> None:
     evidence = Evidence.gather(places)
     for problem in evidence.problems:
         click.echo(f"note: {problem}", err=True)
-    page = render(document(evidence, upsets))
+    told = document(evidence, upsets)
+    page = render(told)
     write_text(output, page)
-    missions = len(evidence.flights())
-    click.echo(f"{missions:,} missions in {output} ({len(page.encode()) / 1e6:.1f} MB)")
+    missions, size = len(evidence.flights()), len(page.encode())
+    if as_json:
+        verdicts = {
+            where: {verdict.value: count for verdict, count in counts.items()}
+            for where, counts in told["verdicts"].items()
+        }
+        told = {"file": str(output), "bytes": size, "missions": missions, "verdicts": verdicts,
+                "problems": [*evidence.problems]}  # fmt: skip
+        click.echo(json.dumps(told, indent=2))
+    else:
+        click.echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")

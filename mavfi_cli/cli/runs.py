@@ -8,6 +8,10 @@ from typing import Any
 
 import click
 
+from mavfi_cli.cli.grouped import GroupedCommand
+from mavfi_cli.cli.parameters import NUMBER, OUT, OutFile, RunPath
+from mavfi_cli.report.drawing import PICTURES
+
 _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
 
 
@@ -15,14 +19,14 @@ def _note(text: str) -> None:
     click.echo(text, err=True)
 
 
-@click.command()
-@click.argument("run", type=click.Path(path_type=Path))
+@click.command(cls=GroupedCommand)
+@click.argument("run", type=RunPath())
 @click.option("--json", "as_json", is_flag=True, help="Print result.json unchanged.")
 @click.option("--pair", is_flag=True,
               help="Fly the golden run of the pair, keep it, and report what the fault "
                    "changed.")  # fmt: skip
 @click.option("--events", is_flag=True, help="Add a list of all events of the flight.")
-@click.option("--picture", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+@click.option("--picture", metavar="FILE", type=OutFile(PICTURES),
               help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Summarise RUN, a run folder."""
@@ -33,6 +37,8 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     if as_json and (pair or events):
         raise click.UsageError("--json prints the record alone: leave out --pair and --events")
     recorded = load_run(run)
+    if pair and not recorded.record.fault:
+        raise click.UsageError("--pair needs a run with a fault")
     if picture is not None:
         from mavfi_cli.report.drawing import write_figure
         from mavfi_cli.report.top_view import draw_top_view
@@ -53,13 +59,13 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     click.echo("\n".join([*lines, *folder_lines(recorded, picture)]))
 
 
-@click.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option("--mission", "number", type=click.IntRange(min=0), metavar="NUMBER",
+@click.command(cls=GroupedCommand)
+@click.argument("run", type=RunPath())
+@click.option("--mission", "number", type=NUMBER, metavar="NUMBER",
               help="RUN is a campaign's folder or exported .parquet: repeat its mission of this "
                    "number.")  # fmt: skip
 @click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
+@click.option("--out", type=OUT, default=Path("runs"),
               show_default=True, help="Parent of the new run folder.")  # fmt: skip
 @click.option("--firmware", metavar="PATH",
               help="SITL binary that RUN names. It is executed only if it is this one, or that of "
@@ -77,6 +83,14 @@ def replay(
     effect of the fault. An interrupted replay leaves no files. With --mission, the measures of the
     repetition are compared with those that the campaign recorded.
     """
+    from mavfi_cli.analysis.flights import number_span
+    from mavfi_cli.campaigns.begin import opened
+    from mavfi_cli.campaigns.ledger import LEDGER, is_export
+
+    if number is None and (is_export(run) or (run / LEDGER).is_file()):
+        with opened(run) as ledger:
+            span = number_span(ledger)
+        raise click.UsageError(f"{run} is a campaign: add --mission NUMBER ({span})")
     options: Any = {"with_fault": not how["without_fault"], "firmware": firmware}
     if number is None:
         comparison, lines = _repeat_run(run, out, gdb=how["gdb"], **options)

@@ -9,35 +9,48 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, refuse_given
+from mavfi_cli.cli.parameters import (
+    ABOVE_ZERO,
+    AUTOPILOT,
+    DETECTOR,
+    FIRST_SEED,
+    JOBS,
+    MISSIONS,
+    OUT,
+    SEED,
+    STACK,
+    WORLD,
+)
 
 _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 
 
 @click.command(cls=GroupedCommand)
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("training"),
+@click.option("--out", type=OUT, default=Path("training"),
               show_default=True, help="Folder for flights, data set and models.")  # fmt: skip
-@click.option("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+@click.option("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
               help="Stack to fly and to fit models for; `mavfi stacks` lists them.")  # fmt: skip
-@click.option("--world", "worlds", multiple=True, metavar="NAME|FILE",
+@click.option("--world", "worlds", multiple=True, type=WORLD, metavar="NAME|FILE",
               help="World; may be repeated  [the paper's four: two densities, two "
                    "sizes].")  # fmt: skip
-@click.option("--flights", type=click.IntRange(min=1), default=25, show_default=True,
+@click.option("--flights", type=MISSIONS, default=25, show_default=True,
               help="Flights per world.")  # fmt: skip
-@click.option("--first-seed", default=10_000, show_default=True,
+@click.option("--first-seed", default=10_000, show_default=True, type=FIRST_SEED,
               help="Seed of the first flight; each further flight adds 1.")  # fmt: skip
-@click.option("--autopilot", default="ours", show_default=True, metavar="ours|px4|ardupilot",
+@click.option("--autopilot", type=AUTOPILOT, default="ours", show_default=True,
+              metavar="ours|px4|ardupilot",
               help="Autopilot that flies the missions.")  # fmt: skip
 @click.option("--firmware", metavar="PATH",
               help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
               help="Fit to the error-free flights in this folder of run folders, of any "
                    "autopilot, instead of flying.")  # fmt: skip
-@click.option("--kind", "kinds", multiple=True,
+@click.option("--kind", "kinds", multiple=True, type=DETECTOR,
               help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
-@click.option("--n-sigma", type=float, help="Threshold of the Gaussian model  [its default].")
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0),
+@click.option("--n-sigma", type=ABOVE_ZERO, help="Threshold of the Gaussian model  [its default].")
+@click.option("--seed", default=1, show_default=True, type=SEED,
               help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
-@click.option("--jobs", type=click.IntRange(min=1),
+@click.option("--jobs", type=JOBS,
               help="Number of parallel missions  [one per core].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the provenance of the models as JSON.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")

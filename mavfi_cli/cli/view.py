@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from mavfi_cli.cli.grouped import GroupedCommand
+from mavfi_cli.cli.parameters import OutFile, RunPath
 from mavfi_cli.core.errors import RecordError
 
 if TYPE_CHECKING:
@@ -14,29 +17,30 @@ if TYPE_CHECKING:
     from mavfi_cli.mission.run_folder import Run
 
 
-@click.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option("--save", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False),
+@click.command(cls=GroupedCommand)
+@click.argument("run", type=RunPath())
+@click.option("--save", metavar="FILE", type=OutFile((".rrd", ".mcap")),
               help="Write a file instead of opening a window: .rrd for rerun, .mcap for "
                    "Foxglove.")  # fmt: skip
-@click.option("--layout", metavar="FILE.json", type=click.Path(path_type=Path, dir_okay=False),
+@click.option("--layout", metavar="FILE.json", type=OutFile((".json",)),
               help="With --save FILE.mcap: also write a layout that Foxglove imports.")  # fmt: skip
-def view(run: Path, save: Path | None, layout: Path | None) -> None:
+@click.option("--json", "as_json", is_flag=True,
+              help="With --save: print the file and its flights as JSON.")  # fmt: skip
+def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> None:
     """Show RUN, a run folder, in rerun: world, camera, map, plans, path and all states over time.
 
     The mission is flown again, because depth frames, clouds and maps are not in the record. A
     flight with a fault is shown together with its golden flight, which is flown once and kept.
     """
-    from mavfi_cli.core.files import require_output
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report import view as viewers
     from mavfi_cli.report.view import ViewedFlight
 
+    if as_json and save is None:
+        raise click.UsageError("--json needs --save FILE")
     viewers.require_viewer(save)
-    if layout is not None:
-        if save is None or save.suffix.lower() != ".mcap":
-            raise click.UsageError("--layout goes with --save FILE.mcap")
-        require_output(layout, (".json",))
+    if layout is not None and (save is None or save.suffix.lower() != ".mcap"):
+        raise click.UsageError("--layout goes with --save FILE.mcap")
     recorded = load_run(run)
     golden = _golden(recorded) if recorded.record.fault else None
     named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}
@@ -44,13 +48,21 @@ def view(run: Path, save: Path | None, layout: Path | None) -> None:
         ViewedFlight(name=name, run=each, recorder=_again(each)) for name, each in named.items()
     ]
     viewers.save(flights, save)
-    if save is not None:
+    if as_json:
+        told = [
+            {"name": each.name, "run": str(each.run.folder.path),
+             "outcome": each.run.record.outcome, "frames": each.recorder is not None}
+            for each in flights
+        ]  # fmt: skip
+        click.echo(json.dumps({"file": str(save), "flights": told}, indent=2))
+    elif save is not None:
         click.echo(save)
     if layout is not None:
         from mavfi_cli.report.view.mcap_file import write_layout
 
         write_layout(flights, layout)
-        click.echo(layout)
+        if not as_json:
+            click.echo(layout)
 
 
 def _golden(run: Run) -> Run | None:

@@ -11,21 +11,19 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
-
-
-class _Positive(click.FloatRange):
-    """A number from a millionth to a million; click's own range accepts "nan"."""
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """Convert as click does, and reject NaN."""
-        number = float(super().convert(value, param, ctx))
-        return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
-
+from mavfi_cli.cli.parameters import (
+    ABOVE_ZERO,
+    BOARD,
+    JOBS,
+    MISSIONS,
+    MODEL_VEHICLE,
+    OUT,
+    PLATFORM,
+    STACK,
+    WORLD,
+)
 
 _FLYING = ("worlds", "stack", "missions", "first_seed", "models", "train", "jobs", "quiet")
-_ABOVE_ZERO = _Positive(min=1.0e-6, max=1.0e6)
 
 
 _model = partial(click.option, cls=GroupedOption, group="Model")
@@ -34,22 +32,22 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 
 
 @click.command(cls=GroupedCommand)
-@_model("--vehicle", "vehicles", multiple=True, metavar="NAME|FILE",
+@_model("--vehicle", "vehicles", multiple=True, type=MODEL_VEHICLE, metavar="NAME|FILE",
         help="airsim, spark, cal20 or a TOML file; may be repeated  "
              "[airsim, spark: the paper's Fig. 15].")  # fmt: skip
-@_model("--platform", metavar="NAME|FILE",
+@_model("--platform", type=PLATFORM, metavar="NAME|FILE",
         help="Platform whose latencies give the response time and whose board the vehicle "
              "carries  [the vehicle's own].")  # fmt: skip
 @_model("--chain", type=click.Choice(["serial", "pipelined"]), default="serial",
         show_default=True,
         help="Response time of --platform: the sum of its kernels' latencies, or the largest of "
              "them.")  # fmt: skip
-@_model("--board", metavar="NAME|FILE",
+@_model("--board", type=BOARD, metavar="NAME|FILE",
         help="Mass and power of a computer: a57, ncs, raspi3b, tx2, xavier or a TOML "
              "file  [the platform's, or the vehicle's own].")  # fmt: skip
-@_model("--response", type=_ABOVE_ZERO, metavar="S", help="Response time of the computer, s.")
-@_model("--range", "range_", type=_ABOVE_ZERO, metavar="M", help="Sensing range, m.")
-@_model("--distance", type=_ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
+@_model("--response", type=ABOVE_ZERO, metavar="S", help="Response time of the computer, s.")
+@_model("--range", "range_", type=ABOVE_ZERO, metavar="M", help="Sensing range, m.")
+@_model("--distance", type=ABOVE_ZERO, default=50.0, show_default=True, metavar="M",
         help="Length of a mission, m.")  # fmt: skip
 @_model("--overhead", "overheads", multiple=True, metavar="DETECTOR=PERCENT|PATH",
         help="Compute overhead of gad or aad: a percentage, or a run folder, campaign or "
@@ -58,9 +56,9 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_flights("--fly", "fly", is_flag=True,
           help="Fly every row in JSBSim with its mass at its safe velocity, and compare model and "
                "flight.")  # fmt: skip
-@_flights("--world", "worlds", multiple=True, metavar="NAME|FILE",
+@_flights("--world", "worlds", multiple=True, type=WORLD, metavar="NAME|FILE",
           help="World; may be repeated  [sparse, dense].")  # fmt: skip
-@_flights("--stack", default="mavbench", show_default=True, metavar="NAME|FILE",
+@_flights("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
           help="Stack; `mavfi stacks` lists them.")  # fmt: skip
 @_flights("--missions", type=click.IntRange(1, 100_000), default=10, show_default=True,
           help="Missions per scheme and world.")  # fmt: skip
@@ -68,13 +66,14 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
           help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
 @_flights("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
           help="Folder of detector models NAME.json  [the shipped].")  # fmt: skip
-@_flights("--train", type=click.IntRange(min=0), default=0, metavar="FLIGHTS",
+@_flights("--train", type=click.IntRange(0, MISSIONS.max), default=0,
+          metavar="FLIGHTS",
           help="First fit the detectors for each vehicle to this many error-free flights of each "
                "training world at its safe velocity  [0: none].")  # fmt: skip
-@_flights("--jobs", type=click.IntRange(min=1),
+@_flights("--jobs", type=JOBS,
           help="Number of parallel missions  [one per core].")  # fmt: skip
 @_flights("--quiet", is_flag=True, help="No progress on stderr.")
-@_output("--out", type=click.Path(path_type=Path, file_okay=False),
+@_output("--out", type=OUT,
          help="Folder for vpm.json, vpm.csv and pictures; with --fly also for the flights, "
               "which are not flown again  [none; --fly: vpm].")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the report as JSON.")

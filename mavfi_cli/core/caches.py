@@ -9,7 +9,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from mavfi_cli.core.files import PACKAGE
+from mavfi_cli.core.files import PACKAGE, can_write
 
 
 @cache
@@ -22,13 +22,13 @@ def choose_caches() -> None:
     MPLCONFIGDIR. Writable folders that the user chose by these variables stay.
     """
     beside = PACKAGE / "core" / "__pycache__"
-    if not (_writable(os.environ.get("NUMBA_CACHE_DIR", "")) or _writable(beside)):
+    if not (can_write(Path(os.environ.get("NUMBA_CACHE_DIR") or beside)) or can_write(beside)):
         os.environ["NUMBA_CACHE_DIR"] = str(_folder())
         if (numba := sys.modules.get("numba")) is not None:  # it has read the environment
             numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
     own = os.environ.get("MPLCONFIGDIR")
     homes = _home("XDG_CONFIG_HOME", ".config"), _home("XDG_CACHE_HOME", ".cache")
-    if not all(map(_writable, [own] if own else [home / "matplotlib" for home in homes])):
+    if not all(map(can_write, [Path(own)] if own else [home / "matplotlib" for home in homes])):
         os.environ["MPLCONFIGDIR"] = str(_folder() / "matplotlib")
 
 
@@ -38,18 +38,10 @@ def _home(variable: str, name: str) -> Path:
     return given if given.is_absolute() else Path(os.path.expanduser("~"), name)
 
 
-def _writable(folder: str | Path) -> bool:
-    """True if a folder can be written in, or made if it does not exist."""
-    place = Path(folder)
-    while place != place.parent and not os.path.lexists(place):
-        place = place.parent
-    return place.is_absolute() and place.is_dir() and os.access(place, os.W_OK | os.X_OK)
-
-
 def _folder() -> Path:
     """The folder for both caches: the first that can be written."""
     home = _home("XDG_CACHE_HOME", ".cache") / "mavfi"
-    if _writable(home):
+    if home.is_absolute() and can_write(home):
         return home
     folder = Path(tempfile.gettempdir(), f"mavfi-{os.getuid()}")
     try:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -56,38 +54,23 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         raise ConfigError(f"{problem} ({column})", path=path, line=int(line)) from None
 
 
-_BARE = re.compile(r"[A-Za-z0-9_-]+")  # a key that needs no quotes
-
-
 def toml_text(values: Mapping[str, Any]) -> str:
     """Write TOML that reads back as equal values; empty tables are left out.
 
     Args:
         values: Texts, finite numbers, truth values, arrays of them, tables, and arrays of tables.
     """
-    return "\n".join(_toml_lines(values, ())) + "\n"
+    import tomli_w
+
+    return tomli_w.dumps(_without_empty_tables(values), indent=2)
 
 
-def _toml_lines(table: Mapping[str, Any], name: Sequence[str]) -> list[str]:
-    lines, inner = [], []
-    for key, value in table.items():
-        own = key if _BARE.fullmatch(key) else _toml_value(key)
-        path = (*name, own)
-        if isinstance(value, Mapping):
-            body = _toml_lines(value, path) if value else []
-            head = [] if body[:1] in ([], [""]) else ["", f"[{'.'.join(path)}]"]
-            inner += head + body
-        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            for each in value:
-                inner += ["", f"[[{'.'.join(path)}]]", *_toml_lines(each, path)]
-        else:
-            lines.append(f"{own} = {_toml_value(value)}")
-    return lines + inner
-
-
-def _toml_value(value: Any) -> str:
-    """Texts, numbers, truth values and arrays are written as in JSON, which leaves out DEL."""
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _without_empty_tables(values: Mapping[str, Any]) -> dict[str, Any]:
+    inner = {
+        key: _without_empty_tables(value) if isinstance(value, Mapping) else value
+        for key, value in values.items()
+    }
+    return {key: value for key, value in inner.items() if value != {}}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

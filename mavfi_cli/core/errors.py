@@ -22,6 +22,11 @@ def described(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
 
 
+def lack_of(error: Exception) -> str:
+    """Return what is wrong with a file's contents, by the error that their use has raised."""
+    return f"it has no {error}" if isinstance(error, KeyError) else described(error)
+
+
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name most similar to `name`, ignoring case and folder, or None."""
     for each in known:

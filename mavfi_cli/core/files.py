@@ -210,6 +210,31 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
         raise RecordError(f"{path}: name a file that ends in {known}")
     if not path.absolute().parent.is_dir():
         raise RecordError(f"{path}: its folder does not exist")
+    if path.exists() and not path.is_file():
+        raise RecordError(f"{path}: not a regular file")
+    require_folder(path.parent)
+
+
+def require_folder(folder: Path) -> None:
+    """Reject a folder that cannot be made or written, before its contents are computed.
+
+    Raises:
+        RecordError: Its name is not UTF-8, which tables need, or it cannot be made or written.
+    """
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        raise RecordError(f"{str(folder)!r}: not a UTF-8 name") from None
+    if not can_write(folder):
+        raise RecordError(f"{folder}: not a folder that can be made or written")
+
+
+def can_write(folder: Path) -> bool:
+    """True if a folder can be written, or made if it does not exist."""
+    place = folder.absolute()
+    while place != place.parent and not os.path.lexists(place):
+        place = place.parent
+    return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
 
 
 def write_text(path: Path, text: str) -> None:

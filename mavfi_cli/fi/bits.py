@@ -13,7 +13,7 @@ from enum import Enum
 
 import numpy as np
 
-from mavfi_cli.core.errors import FaultError
+from mavfi_cli.core.errors import FaultSpecError
 
 Scalar = float | int | bool
 
@@ -52,26 +52,26 @@ class BitType:
         """The bits of `field`.
 
         Raises:
-            FaultError: the type has no such field.
+            FaultSpecError: the type has no such field.
         """
         try:
             return self.fields[field]
         except KeyError:
             raise self._lacks(field.value, [known.value for known in self.fields]) from None
 
-    def _lacks(self, field: str, known: Iterable[str]) -> FaultError:
-        return FaultError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
+    def _lacks(self, field: str, known: Iterable[str]) -> FaultSpecError:
+        return FaultSpecError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
 
     def mask(self, bits: Iterable[int]) -> int:
         """The xor mask of distinct bits.
 
         Raises:
-            FaultError: a bit that the type does not have.
+            FaultSpecError: a bit that the type does not have.
         """
         mask = 0
         for bit in bits:
             if not 0 <= bit < self.width:
-                raise FaultError(
+                raise FaultSpecError(
                     f"bit {bit} is outside {self.name}, which has bits 0 to {self.width - 1}"
                 )
             mask |= 1 << bit
@@ -83,7 +83,7 @@ class BitType:
         """`count` distinct bits of a field, uniformly, ascending.
 
         Raises:
-            FaultError: the type has no such field, or the field has fewer than `count` bits.
+            FaultSpecError: the type has no such field, or the field has fewer than `count` bits.
         """
         candidates = self.field_bits(field)
         if not 1 <= count <= len(candidates):

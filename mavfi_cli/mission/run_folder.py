@@ -422,7 +422,9 @@ def load_run(path: str | Path) -> Run:
         trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
     except (OSError, ValueError) as error:
         raise RecordError(f"{folder.path}: damaged ({error})") from None
-    if not isinstance(result, dict) or result.get("schema") != 1:
+    if not isinstance(result, dict):
+        raise RecordError(f"{folder.result}: not the record of a run")
+    if result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")

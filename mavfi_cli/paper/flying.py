@@ -55,9 +55,9 @@ class Forecast:
     def told(self) -> str:
         """The forecast in one line."""
         left = self.missions - self.over
-        parts = [f"{self.missions} missions, {self.over} of them flown"]
+        parts = [f"{self.missions} missions, {self.over} of them flown"] if self.missions else []
         parts += [f"{self.runs} runs of kernels"] if self.runs else []
-        done = "; ".join(parts)
+        done = "; ".join(parts) or "nothing to fly: the model computes the items"
         if not (left or self.runs):
             return done
         if left and not self.measured:

@@ -17,7 +17,7 @@ from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
-from mavfi_cli.core.errors import MavfiError, RecordError
+from mavfi_cli.core.errors import MavfiError, RecordError, lack_of
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.flights import Flights
@@ -25,7 +25,6 @@ from mavfi_cli.paper.items import FlightsPlan
 from mavfi_cli.paper.status import of_kernels
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
-_NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _EXPORT, _SPEC = ".parquet", ".toml"
 _Kernels = Mapping[str, Any]
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
@@ -173,15 +172,14 @@ def _from_summary(path: Path) -> _Kernels:
         of_kernels(summary), [part["runs"] + 0 for part in summary["kernels"]]
         summary["plan"]["seed"], summary["plan"]["flight"]
     except (KeyError, TypeError, ValueError) as error:
-        raise RecordError(f"{path}: not a whole summary of `mavfi kernels` ({error!r})") from None
+        raise RecordError(
+            f"{path}: not a whole summary of `mavfi kernels` ({lack_of(error)})"
+        ) from None
     return {"path": path, "summary": summary}
 
 
 def _from_export(path: Path) -> CampaignSource:
     table = read_export(path)
-    lacking = [name for name in _NEEDED if name not in table.column_names]
-    if lacking:
-        raise RecordError(f"{path}: not an export of a campaign (it has no column {lacking[0]!r})")
     spec = _spec_beside(path)
     try:
         origin, digest = provenance(table), file_digest(path)

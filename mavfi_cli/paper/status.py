@@ -12,7 +12,7 @@ from typing import Any
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.summary import groups
-from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import PRESETS
 from mavfi_cli.core.errors import RecordError, UnknownName
@@ -219,7 +219,11 @@ def progress_lines(ledger: Ledger) -> list[str]:
     """What is done, and the time left at the pace so far."""
     planned, over = ledger.planned(), ledger.over()
     errors = sum(ledger.errors_by_cell().values())
-    lines = [f"{ledger.meta('name') or ledger.folder.name}: {over} of {planned} missions"]
+    name = ledger.meta("name") or ledger.folder.name
+    if isinstance(ledger, ExportedLedger):
+        lines = [f"{name}: {over} missions in an export"]
+    else:
+        lines = [f"{name}: {over} of {planned} missions"]
     if errors:
         lines.append(f"{errors} could not begin; run --retry-errors repeats them")
     if over < planned:

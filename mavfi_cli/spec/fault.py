@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import BY_NAME
+from mavfi_cli.core.types import BY_NAME, Stage
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.fault import (
     GROUPS,
@@ -196,6 +196,17 @@ class FaultConfig:
             together=self.together,
             bits=self.exact_bits,
         )
+
+
+def target_names(*, instruction: bool = False) -> list[str]:
+    """Return all injection sites of the level: nodes, or states, groups and processes."""
+    if instruction:
+        return [*_NODES]
+    stages = [stage.value for stage in Stage]
+    return [
+        *stages, *dict.fromkeys((*BY_NAME, *GROUPS)), DETECTOR,
+        *(f"{QUEUE}.{name}" for name in _QUEUED), *(f"{PROCESS}.{node}" for node in KERNELS),
+    ]  # fmt: skip
 
 
 def _check_seed(seed: int) -> None:

@@ -38,6 +38,7 @@ NOT_OF_GOLDEN: Mapping[str, Any] = {
 """Settings that a golden mission lacks, with its values."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
+_REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
 MARGIN_M = 30.0  # flight bounds round home and goal without a known world
 _MOUNT_FLU_M = (0.1, 0.0, 0.0)  # of the stand-alone camera, unless it is told another one
@@ -143,8 +144,11 @@ class MissionConfig:
             if value is not None and not low <= value <= high:
                 raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
         for name in ("start", "goal", "origin"):
-            if not all(map(math.isfinite, getattr(self, name) or ())):
+            place = getattr(self, name) or ()
+            if not all(map(math.isfinite, place)):
                 raise ConfigError("must be three finite numbers", key=name)
+            if not all(abs(coordinate) <= _REMOTE_M for coordinate in place):
+                raise ConfigError(f"must be within {_REMOTE_M:g} m of the origin", key=name)
         if self.fault is not None and self.instruction is not None:
             raise ConfigError("one mission takes one fault", key="instruction")
         if self.fault is not None:

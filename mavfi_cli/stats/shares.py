@@ -202,8 +202,9 @@ def pairs_for_difference(
     """
     if not _LEAST <= abs(difference) <= discordant <= 1.0:
         raise ConfigError(
-            f"a difference d and a share q of pairs that differ need {_LEAST:g} <= d <= q <= 1, "
-            f"got d = {difference:g}, q = {discordant:g}"
+            f"must be at least {_LEAST:g}, and at most the share of pairs that differ "
+            f"(--discordant {discordant:g}), got {difference:g}",
+            key="difference",
         )
     if not 0.0 < power < 1.0:
         raise ConfigError(f"must be between 0 and 1, got {power:g}", key="power")

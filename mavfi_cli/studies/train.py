@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.analysis.scores import flown_samples
+from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import RUNS
 from mavfi_cli.campaigns.progress import Spectator
@@ -36,6 +37,7 @@ def train(
             flown, unless too many flights fail. Or no flight is error-free.
         ConfigError: n sigma is out of range, the folder has the flights of another plan, or nothing
             names the binary of a real autopilot.
+        MavfiError: no mission can be flown in a world.
         RecordError: a file cannot be written.
     """
     stack = load_stack(plan.base.stack).mark
@@ -44,6 +46,7 @@ def train(
         check(plan.kinds, len(missions), plan.n_sigma)
         plan = replace(plan, base=plan.base.with_firmware())
         kept = replace(options, keep=Keep.ALL)
+        check_kinds(plan.missions())
         run_campaign(plan.missions(), folder / FLIGHTS, kept, spectator).close()
         flights, _, autopilots = flown_samples(folder / FLIGHTS / RUNS, stack)
         failed = len(missions) - len(flights)

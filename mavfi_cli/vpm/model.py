@@ -24,8 +24,8 @@ from mavfi_cli.spec.platform import HARDWARE, LARGEST, PlatformProfile, check_ha
 CALIBRATED = ("rotor_pull_n", "response_s")  # the parameters that a calibration may set
 SMALLEST = 1.0e-6  # in any unit; a smaller value is probably in the wrong unit
 SMALL_KG = 0.67  # geometric mean of the simulated vehicles, 0.3 kg and 1.5 kg
-_VEHICLES = Shipped("vehicle", Path(__file__).parent / "vehicles")
-_BOARDS = Shipped("board", Path(__file__).parent / "boards")
+VEHICLES = Shipped("vehicle", Path(__file__).parent / "vehicles")
+BOARDS = Shipped("board", Path(__file__).parent / "boards")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ class ModelVehicle:
             UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
             ConfigError: the file cannot be used.
         """
-        return load_toml(_VEHICLES.path(name_or_path), cls)
+        return load_toml(VEHICLES.path(name_or_path), cls)
 
     @property
     def stand_in(self) -> str:
@@ -130,7 +130,7 @@ class Board:
     @classmethod
     def load(cls, name_or_path: str) -> Board:
         """A shipped board by name, or a user's own by path. Raises as `ModelVehicle.load`."""
-        return load_toml(_BOARDS.path(name_or_path), cls)
+        return load_toml(BOARDS.path(name_or_path), cls)
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
@@ -191,7 +191,7 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme
             raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent <= LARGEST:
             raise ConfigError(
-                f"must be within 0 and {LARGEST:g} %, is {percent:g} %", key=f"overhead of {name}"
+                f"{name} must be within 0 and {LARGEST:g} %, is {percent:g} %", key="overhead"
             )
         schemes[name] = replace(schemes[name], overhead=percent / 100.0, source=source)
     return schemes

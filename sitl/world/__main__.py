@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
-from sitl.command_line import CONTEXT, Triple, exit_code, places
+from sitl.command_line import CONTEXT, Triple, complete_world, exit_code, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg
 from sitl.world.world import World, load_world, named_worlds, show
 
@@ -21,7 +21,7 @@ _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a T
 
 
 def _on_world(command: Callable[..., None]) -> Callable[..., Any]:
-    @click.argument("name", metavar="WORLD")
+    @click.argument("name", metavar="WORLD", shell_complete=complete_world)
     @places
     @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
     @functools.wraps(command)

@@ -6,6 +6,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+import tomllib
 import xml.etree.ElementTree as ET
 
 import pyarrow.parquet as pq
@@ -116,7 +117,7 @@ def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
     assert run.stdout == (tmp_path / "table.csv").read_text()
     assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
     refused = mavfi("campaign", "export", folder, tmp_path / "table.xls")
-    assert "must end in .parquet or .csv, or - for CSV on stdout" in refused.stderr
+    assert "name a file that ends in .parquet or .csv" in refused.stderr
 
 
 @pytest.mark.parametrize(("chosen", "seed"), [((), 1), (("--pair", "3"), 2)])
@@ -179,7 +180,9 @@ def refused(mavfi, tmp_path):
     def run(*arguments):
         before = sorted(tmp_path.iterdir())
         done = mavfi("campaign", *arguments, cwd=tmp_path)
-        code = 2 if done.stderr.startswith(("error: unknown ", "error: --")) else 1
+        code = (
+            2 if done.stderr.startswith(("error: unknown ", "error: --", "error: Invalid")) else 1
+        )
         assert (done.returncode, done.stdout) == (code, ""), done.stderr
         (line,) = done.stderr.splitlines()
         assert sorted(tmp_path.iterdir()) == before
@@ -231,7 +234,7 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     assert "no campaign was begun there" in refused(
         "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
     )
-    assert "--scale: must be above 0" in refused("run", "table3", "--scale", "0")
+    assert "'--scale': 0.0 is not in the range" in refused("run", "table3", "--scale", "0")
 
 
 def test_a_ledger_of_another_version_gets_one_line(mavfi, tmp_path):
@@ -266,7 +269,8 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     assert done.exit_code == 0, done.output
     changed = tmp_path / "campaigns" / "short-field=sign-exponent"
     assert sorted(changed.parent.iterdir()) == [changed.parent / "short", changed]
-    assert 'field = ["sign", "exponent"]' in (changed / "campaign.toml").read_text()
+    spec = tomllib.loads((changed / "campaign.toml").read_text())
+    assert spec["setting"][1]["field"] == ["sign", "exponent"]
     again = invoke(command.campaign, ["run", str(changed), "--quiet"])
     assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
     both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])

@@ -47,11 +47,13 @@ def refused(command_line, tmp_path, monkeypatch):
 )
 def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest):
     line = refused(option, given, code=2)
-    assert line.startswith(f"unknown {kind} {given!r}; did you mean {nearest!r}? Known: ")
+    assert line.startswith(f"{option}: unknown {kind} {given!r}; did you mean {nearest!r}? Known: ")
 
 
 def test_a_name_like_no_other_gets_the_list(refused):
-    assert refused("--stack", "zzz", code=2).startswith("unknown stack 'zzz'; known: hardened, ")
+    assert refused("--stack", "zzz", code=2).startswith(
+        "--stack: unknown stack 'zzz'; known: hardened, "
+    )
 
 
 @pytest.mark.parametrize(
@@ -77,6 +79,8 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--time-limit", "inf"), "--time-limit: must be within"),
         (("--seed", "-1"), "--seed: must be within 0 and 2^31 - 1, got -1"),
         (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
+        (("--inject", "planning", "--bit", "64"), "Invalid value for '--bit': 64 is not in"),
+        (("--goal", "1e9,0,5"), "--goal: must be within 1e+07 m of the origin"),
         (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
         (("--start", "1,inf,2"), "--start: must be three finite numbers"),
         (("--stack", "mavbench:foo=3"), "foo: unknown key; known: "),
@@ -240,8 +244,19 @@ def test_a_full_disk_in_flight(command_line):
 
 def test_a_folder_that_cannot_be_made(refused, tmp_path):
     (tmp_path / "file").write_text("")
-    line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs")
-    assert line.startswith("file/runs: ")
+    line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs", code=2)
+    assert "'--out': file/runs: not a folder that can be made or written" in line
+
+
+@pytest.mark.parametrize(
+    ("out", "why"),
+    [
+        ("/dev/null", "/dev/null: not a folder that can be made or written"),
+        (b"caf\xe9".decode(errors="surrogateescape"), r"'caf\udce9': not a UTF-8 name"),
+    ],
+)
+def test_a_folder_that_could_not_be_read_again_is_refused_before_the_flight(refused, out, why):
+    assert f"'--out': {why}" in refused(*SHORT_LINE[1:], "--quiet", "--out", out, code=2)
 
 
 def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
@@ -261,6 +276,8 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
+        (["--inject", "planning", "--restart", "5"], "--restart needs nodes that can die"),
+        (["--inject", "planning", "--duration", "5"], "--duration needs --persistence stuck-at"),
         (["--inject", "detector"], "--inject detector needs --detector NAME"),
         (["--link", "udpin:127.0.0.1:14540"], "--link: needs --goal X,Y,Z"),
         (["--platform", "measured:2"], "--platform: measured:2 needs --realtime"),

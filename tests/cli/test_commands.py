@@ -88,9 +88,21 @@ def test_show_draws_a_run_that_has_no_picture(command_line, short_flight, tmp_pa
 
 def test_show_refuses_a_picture_of_no_known_format(command_line, short_flight, tmp_path):
     code, out, err = command_line("show", short_flight.path, "--picture", "above.jpg")
-    said = "error: above.jpg: name a file that ends in .svg, .pdf or .png\n"
-    assert (code, out, err) == (1, "", said)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: Invalid value for '--picture': above.jpg: name a file that ends")
     assert not (tmp_path / "above.jpg").exists()
+
+
+def test_show_of_a_golden_run_has_no_pair(command_line, short_flight):
+    code, out, err = command_line("show", short_flight.path, "--pair")
+    assert (code, out, err) == (2, "", "error: --pair needs a run with a fault\n")
+
+
+def test_a_record_that_is_none_says_so(command_line, short_flight, tmp_path):
+    (tmp_path / "result.json").write_text("[1, 2]")
+    code, _, err = command_line("show", tmp_path)
+    assert code == 1
+    assert err.endswith("result.json: not the record of a run\n")
 
 
 def test_show_events_and_json(command_line, troubled_flight):
@@ -127,7 +139,7 @@ def copied(short_flight, tmp_path):
     [
         (lambda f: (f / "result.json").write_text('{"schema": 1, '), "damaged"),
         (lambda f: (f / "result.json").write_bytes(b"\xff\xfe"), "damaged"),
-        (lambda f: (f / "result.json").write_text("[]"), "another version"),
+        (lambda f: (f / "result.json").write_text("[]"), "not the record of a run"),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
         (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "damaged"),

@@ -1,6 +1,7 @@
 """`mavfi fly`: what it prints, and with which code it leaves."""
 
 import json
+import shlex
 
 import pytest
 from missions import RECORD, SHORT_LINE
@@ -121,3 +122,21 @@ def test_a_mistake_names_the_file_or_the_option(command_line, tmp_path, text, op
     left, out, err = command_line("fly", "--config", "mission.toml", *options)
     assert (left, out, len(err.splitlines())) == (code, "", 1)
     assert said in err
+
+
+@pytest.mark.parametrize(("bit", "hinted"), [("0", True), ("62", False)])
+def test_a_flip_that_is_too_small_to_see_names_one_that_shows(command_line, bit, hinted):
+    line = [*SHORT_LINE, "--inject", "waypoint_yaw", "--bit", bit, "--no-picture", "--quiet"]
+    code, out, _ = command_line(*line)
+    assert code == 0
+    last = out.splitlines()[-1]
+    assert last.startswith("This flip is too small to see. try: mavfi fly ") == hinted
+    if hinted:
+        words = shlex.split(last.partition("try: mavfi ")[2])
+        assert words[:5] == ["fly", "--world", "farm", "--seed", "5"]
+        assert words[5:9] == ["--start", "2.0,2.0,0.0", "--goal", "10.0,6.0,5.0"]
+        assert words[-7:] == [
+            "--inject", "waypoint_position", "--all-components", "--field", "exponent",
+            "--fault-seed", "20",
+        ]  # fmt: skip
+        assert "waypoint_yaw" not in words

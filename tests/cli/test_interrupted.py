@@ -97,7 +97,11 @@ def test_an_interrupted_mission_of_a_campaign_leaves_nothing(
     command_line, short_flight, cut_once, tmp_path
 ):
     changes = canonical(changes_of(load_run(short_flight.path).mission()))
-    columns = {"number": [0], "outcome": ["success"], "changes": [changes]}
+    columns = {
+        "number": [0], "pair": ["0"], "world": ["farm"], "seed": [5], "stack": ["mavbench"],
+        "state": ["flown"], "outcome": ["success"], "injected": ["golden"], "reason": [""],
+        "wall_s": [1.0], "attempts": [1], "changes": [changes],
+    }  # fmt: skip
     write_parquet(tmp_path / "campaign.parquet", pa.table(columns))
     cut_once("mavfi_cli.mission.run")
     asked = ("replay", "campaign.parquet", "--mission", "0", "--out", "again")

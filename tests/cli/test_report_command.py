@@ -1,9 +1,12 @@
 """`mavfi report`: one file, and one line for what is wrong."""
 
+import json
 import sys
 from pathlib import Path
 
 import pytest
+
+from mavfi_cli.stats.paired import ClaimVerdict
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -15,6 +18,18 @@ def test_it_writes_one_page(command_line, tmp_path):
     assert out.startswith(f"40 missions in {page} (")
     assert [each.name for each in tmp_path.iterdir()] == ["page.html"]
     assert page.read_text(encoding="utf-8").rstrip().endswith("</html>")
+
+
+def test_a_script_gets_the_verdicts(command_line, tmp_path):
+    page, place = tmp_path / "page.html", RESULTS / "latency-part1.parquet"
+    left, out, err = command_line("report", place, "-o", page, "--json")
+    told = json.loads(out)
+    assert (left, err, told["file"], told["missions"]) == (0, "", str(page), 40)
+    assert told["bytes"] == page.stat().st_size
+    assert set(told["verdicts"]) == {"mavbench", "hardened", "isolated kernels"}
+    known = {verdict.value for verdict in ClaimVerdict}
+    assert all(set(counts) == known for counts in told["verdicts"].values())
+    assert sum(told["verdicts"]["mavbench"].values()) > 0
 
 
 def test_what_is_missing_is_on_stderr_and_in_the_page(command_line, tmp_path):
@@ -34,7 +49,6 @@ def test_what_is_missing_is_on_stderr_and_in_the_page(command_line, tmp_path):
     [
         ("absent", "page.html", "absent: does not exist"),
         (".", "page.html", "holds no campaign, no export"),
-        (str(RESULTS / "latency-part1.parquet"), "no/where.html", "its folder does not exist"),
         (str(RESULTS / "README.md"), "page.html", "README.md"),
     ],
 )
@@ -46,6 +60,17 @@ def test_bad_input_is_one_line(command_line, tmp_path, monkeypatch, place, outpu
     assert line.startswith("error: ")
     assert told in line
     assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("output", "told"),
+    [("no/where.html", "its folder does not exist"), ("/dev/null", "not a regular file")],
+)
+def test_a_page_that_cannot_be_written_is_wrong_usage(command_line, output, told):
+    left, out, err = command_line("report", ".", "-o", output)
+    assert (left, out) == (2, "")
+    assert err.startswith("error: Invalid value for '-o' / '--output': ")
+    assert told in err
 
 
 @pytest.mark.parametrize("library", ["jinja2", "scipy"])

@@ -48,6 +48,12 @@ def test_a_fault_is_seen_beside_its_golden_flight(struck, mavfi, tmp_path):
     for name in ("pair.mcap", "pair.rrd"):
         done = mavfi("view", struck, "--save", tmp_path / name)
         assert (done.returncode, done.stdout) == (0, f"{tmp_path / name}\n"), done.stderr
+    done = mavfi("view", struck, "--save", tmp_path / "pair.mcap", "--json")
+    told = json.loads(done.stdout)
+    assert told["file"] == str(tmp_path / "pair.mcap")
+    assert [(each["name"], each["frames"]) for each in told["flights"]] == [
+        ("golden", True), ("faulty", True),
+    ]  # fmt: skip
     told = topics(tmp_path / "pair.mcap")
     for flight in ("golden", "faulty"):
         assert {f"/{flight}/{each}" for each in ("camera/depth", "map", "states")} <= told

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 
 import pytest
 from test_reproductions import TASK, flown, no_vehicle, plan  # noqa: F401
@@ -48,10 +49,26 @@ def test_a_reproduction_ends_with_a_line_an_item(folder, mavfi):
 
 def test_one_item_is_shown_whole(tmp_path, mavfi):
     run = mavfi("reproduce", "fig15", "--out", tmp_path / "new")
-    assert run.returncode == 0
+    assert (run.returncode, run.stderr) == (0, "nothing to fly: the model computes the items\n")
     assert "tmr" in run.stdout
     assert "campaign report" not in run.stdout
     assert not (tmp_path / "new").exists()  # the model flies nothing
+
+
+def test_a_script_gets_the_tables(tmp_path, mavfi):
+    run = mavfi("reproduce", "fig15", "--out", tmp_path / "new", "--json", "--quiet")
+    told = json.loads(run.stdout)
+    (item,) = told["items"]
+    assert (told["stack"], told["scale"], item["name"]) == ("mavbench", 1.0, "fig15")
+    (tmr,) = (row for row in item["rows"] if row["labels"] == ["tmr"])
+    assert [round(cell["value"], 2) for cell in tmr["cells"]] == [1.06, 1.91]
+
+
+@pytest.mark.parametrize("scale", ["nan", "0", "1.5"])
+def test_a_scale_that_cannot_be_is_wrong_usage(tmp_path, mavfi, scale):
+    run = mavfi("reproduce", "fig15", "--scale", scale, "--out", tmp_path)
+    assert (run.returncode, run.stdout, len(run.stderr.splitlines())) == (2, "", 1)
+    assert "'--scale'" in run.stderr
 
 
 def test_the_forecast_is_one_line():

@@ -292,13 +292,13 @@ class Strategy:
             FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
         """
         if compat is not None:
-            if compat not in _COMPAT:
-                raise UnknownName("compatibility mode", compat, _COMPAT)
+            if compat not in COMPAT:
+                raise UnknownName("compatibility mode", compat, COMPAT)
             if model not in (None, FaultModel()):
                 raise FaultSpecError(
                     f"{compat} chooses sites, roles, field and bits by its own rule"
                 )
-            return _COMPAT[compat]
+            return COMPAT[compat]
         rule = named_member(Rule, "sampling rule", name)
         return cls(name=rule.value, rule=rule, model=model or FaultModel())
 
@@ -404,7 +404,7 @@ def _flags(struck: tuple[int, ...]) -> InstructionCorruption:
     )
 
 
-_COMPAT = {
+COMPAT = {
     "rosfi-2021": Strategy(
         name="rosfi-2021 (wall-clock, low byte only, most registers refused)",
         rule=Rule.WALL_CLOCK,

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import BuildMismatch, RecordError
+from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
 from mavfi_cli.core.files import write_text
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
@@ -98,7 +98,7 @@ def fault_of(record: Mapping[str, Any]) -> InstructionFault:
             corruption=None if corruption is None else _corruption_of(corruption),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise RecordError(f"the fault record is damaged: {error!r}") from None
+        raise RecordError(f"the fault record is damaged: {lack_of(error)}") from None
 
 
 def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:

@@ -1,0 +1,213 @@
+"""Types of options: bounded numbers, names that the shell completes, and files to write."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import json
+import subprocess
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from enum import EnumType
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import PACKAGE, require_folder, require_output
+
+# Numbers ------------------------------------------------------------------------------------------
+
+
+class Number(click.FloatRange):
+    """A finite number within two bounds; click's own range accepts NaN."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Convert as click does, and reject NaN."""
+        number = float(super().convert(value, param, ctx))
+        return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
+
+
+JOBS = click.IntRange(1, 1024)
+MISSIONS = click.IntRange(1, 1_000_000)  # flights or runs; a campaign has no more
+SEED = click.IntRange(0, 2**31 - 1)
+FIRST_SEED = click.IntRange(0, 2**31 - 1_000_001)  # each further mission adds 1
+BITS, BIT = click.IntRange(1, 64), click.IntRange(0, 63)  # of a state
+ABOVE_ZERO = Number(min=1.0e-6, max=1.0e6)
+CONFIDENCE = Number(0.0, 1.0, min_open=True, max_open=True)
+SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)
+NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its list
+UPSETS = Number(0.0, 1.0e12)
+
+# Names --------------------------------------------------------------------------------------------
+
+
+Names = str | Callable[[click.Context], Iterable[str]]
+
+
+class Name(click.ParamType[str]):
+    """A name that the shell completes. The program itself rejects unknown names.
+
+    Args:
+        names: All names, as MODULE:ATTRIBUTE, or from the options that precede on the command line.
+        several: Names are separated by commas.
+        files: A path may replace the name.
+    """
+
+    name = "text"
+
+    def __init__(self, *names: Names, several: bool = False, files: bool = False) -> None:
+        self._names, self._several, self._files = names, several, files
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the names that begin as typed, or have the shell complete a path."""
+        typed, comma, begun = incomplete.rpartition(",") if self._several else ("", "", incomplete)
+        known = (_loaded(each) if isinstance(each, str) else each(ctx) for each in self._names)
+        found = [
+            CompletionItem(f"{typed}{comma}{name}")
+            for name in dict.fromkeys(itertools.chain.from_iterable(known))
+            if name.startswith(begun) and name not in typed.split(",")
+        ]
+        return found or ([CompletionItem(incomplete, type="file")] if self._files else [])
+
+
+def _loaded(place: str) -> Iterable[str]:
+    """Names from MODULE:ATTRIBUTE: an enumeration, shipped files, plug-ins, or a container."""
+    module, _, attribute = place.partition(":")
+    found: Any = getattr(importlib.import_module(module), attribute)
+    if isinstance(found, EnumType):
+        members: Any = found
+        return [str(member.value) for member in members]
+    return list(getattr(found, "names", found))
+
+
+def _worlds(_ctx: click.Context) -> Iterable[str]:
+    """The worlds' names from the vehicle's side, which this side does not import."""
+    from mavfi_cli.core.processes import PYTHON
+
+    line = [*PYTHON, "-m", "sitl.world", "list", "--json"]
+    listed = subprocess.run(line, capture_output=True, check=True).stdout
+    return [row["name"] for row in json.loads(listed)]
+
+
+def _vehicles(_ctx: click.Context) -> Iterable[str]:
+    from mavfi_cli.core.config import Shipped
+
+    return Shipped("vehicle", PACKAGE.parent / "sitl" / "vehicle" / "profiles").names
+
+
+def _targets(ctx: click.Context) -> Iterable[str]:
+    from mavfi_cli.spec.fault import target_names
+
+    return target_names(instruction=ctx.params.get("level") == "instruction")
+
+
+def _fixed(*names: str) -> Callable[[click.Context], Iterable[str]]:
+    return lambda _ctx: names
+
+
+_STAGES = "mavfi_cli.core.types:Stage"
+_DETECTORS = _fixed("none"), "mavfi_cli.detect.base:PLUG_INS"
+WORLD, VEHICLE = Name(_worlds, files=True), Name(_vehicles, files=True)
+MODEL_VEHICLE = Name("mavfi_cli.vpm.model:VEHICLES", files=True)
+BOARD = Name("mavfi_cli.vpm.model:BOARDS", files=True)
+PLATFORM = Name("mavfi_cli.spec.platform:PLATFORMS", files=True)
+STACK = Name("mavfi_cli.spec.stack:STACKS", files=True)
+PLANNER = Name("mavfi_cli.autonomy.planners:PLANNERS")
+AUTOPILOT = Name(_fixed("ours"), "mavfi_cli.spec.mission:FIRMWARE")
+DETECTOR, DETECTORS = Name(*_DETECTORS), Name(*_DETECTORS, several=True)
+STAGES, WATCH = Name(_STAGES, several=True), Name("mavfi_cli.spec.detector:WATCHES")
+TARGET, TARGETS = Name(_targets), Name(_fixed("none"), _targets, several=True)
+FIELD = Name("mavfi_cli.fi.bits:Field")
+FIELDS = Name("mavfi_cli.fi.bits:Field", _fixed("integer"), several=True)
+EFFECT = Name("mavfi_cli.fi.fault:Effect")
+PERSISTENCE = Name("mavfi_cli.fi.fault:Persistence")
+SITE, ROLE = Name("mavfi_cli.fi.tracer.fault:Site"), Name("mavfi_cli.fi.tracer.fault:Role")
+SAMPLING = Name("mavfi_cli.fi.tracer.fault:Rule")
+COMPAT = Name("mavfi_cli.fi.tracer.fault:COMPAT")
+KERNEL = Name("mavfi_cli.attack.kernels.catalogue:KERNELS", files=True)
+ITEM = Name("mavfi_cli.paper.items:BY_NAME")
+CAMPAIGN = Name(
+    "mavfi_cli.campaigns.specification_file:PRESETS",
+    lambda _ctx: importlib.import_module("mavfi_cli.campaigns.begin").begun(),
+    files=True,
+)
+
+# Files --------------------------------------------------------------------------------------------
+
+_MOST = 1000  # entries of a folder that completion looks at
+
+
+class RunPath(click.Path):
+    """The path of a run folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the run folders whose paths begin as typed, also one level below."""
+        found = [CompletionItem(str(path)) for path in sorted(_runs(incomplete))]
+        return found or super().shell_complete(ctx, param, incomplete)
+
+
+def _runs(begun: str) -> Iterator[Path]:
+    from mavfi_cli.mission.run_folder import RESULT
+
+    parent, stem = Path(f"{begun}.").parent, begun.rpartition("/")[2]
+    for path in _folders(parent):
+        if not path.name.startswith(stem) or (path.name.startswith(".") and not stem):
+            continue
+        yield from (each for each in (path, *_folders(path)) if (each / RESULT).is_file())
+
+
+def _folders(parent: Path) -> list[Path]:
+    try:
+        entries = itertools.islice(parent.iterdir(), _MOST)
+        return [path for path in entries if path.name.isprintable() and path.is_dir()]
+    except OSError:
+        return []
+
+
+class OutFolder(click.Path):
+    """A folder for results, which is made if it does not exist."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the path, or fail if the folder cannot be written."""
+        path = super().convert(value, param, ctx)
+        try:
+            require_folder(Path(str(path)))
+        except RecordError as error:
+            self.fail(f"{error}.", param, ctx)
+        return path
+
+
+class OutFile(click.Path):
+    """A file to write, with one of some suffixes."""
+
+    def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
+        super().__init__(path_type=Path, dir_okay=False, allow_dash=allow_dash)
+        self._suffixes = suffixes
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the path, or fail if the file cannot be written."""
+        path = super().convert(value, param, ctx)
+        if self.allow_dash and str(path) == "-":
+            return path
+        try:
+            require_output(Path(str(path)), self._suffixes)
+        except RecordError as error:
+            self.fail(f"{error}.", param, ctx)
+        return path
+
+
+OUT = OutFolder()
