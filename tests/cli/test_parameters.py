@@ -44,6 +44,7 @@ def refused(command_line, monkeypatch):
     def accepted(*_arguments, **_options):
         raise AssertionError("the value was accepted")
 
+    monkeypatch.setattr("mavfi_cli.autonomy.warm.is_compiled", lambda: True)  # else a line says so
     monkeypatch.setattr(Flight, "fly", accepted)
     for module in (attacks, begin):
         monkeypatch.setattr(module, "run_campaign", accepted)
