@@ -9,7 +9,7 @@ from string import Template
 
 import jsbsim
 
-from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.core.errors import RecordError, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
 from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
@@ -133,7 +133,7 @@ class Physics:
         try:
             with ScratchFolder("vehicle") as folder:
                 self._fdm = _load(profile, folder, dt_s)
-        except (OSError, jsbsim.BaseError) as error:
+        except (OSError, RecordError, jsbsim.BaseError) as error:
             problem = f"cannot make the model of vehicle {profile.name!r}: {error}"
             raise VehicleProcessError(problem) from None
         _place(self._fdm, position_ned_m, heading_rad)

@@ -71,7 +71,7 @@ def works(_, out):
         pytest.param(signal.SIGKILL, 20_000_000, 1, counts, marks=counting),
         pytest.param(signal.SIGTERM, 20_000_000, 1, counts, marks=[counting, pytest.mark.slow]),
         pytest.param(signal.SIGKILL, 30, 2, works, marks=pytest.mark.slow),
-        (signal.SIGTERM, 30, 2, works),
+        pytest.param(signal.SIGTERM, 30, 2, works, marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, 30, 1, works, marks=pytest.mark.slow),
     ],
 )

@@ -121,7 +121,10 @@ def test_a_time_rule_leaves_out_flips_too(target):
     (runs,) = run_campaign(plan, [target("counting", "4000000")])
     assert any(entry.get("instruction") for entry in runs.records)
     assert not any(entry["injection"]["applied"] for entry in runs.records)
-    assert {entry["outcome"] for entry in runs.records} == {"benign"}
+    # A run that ended before its moment came is `not_injected`.
+    outcomes = {entry["outcome"] for entry in runs.records}
+    assert "benign" in outcomes
+    assert outcomes <= {"benign", "not_injected"}
 
 
 def test_an_output_that_differs_by_chance_is_not_put_down_to_a_detour(target):

@@ -48,6 +48,7 @@ def prints(notebook):
     return texts, [sorted(each.data) for each in outputs if "data" in each]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", list(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_prints_what_it_is_stored_with(path, tmp_path, monkeypatch):
     for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "IPYTHONDIR"):

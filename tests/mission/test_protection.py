@@ -279,6 +279,7 @@ def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     assert run.result["fault"]["activation"]["activation"] == "read"
 
 
+@pytest.mark.slow
 def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     """The threshold's highest exponent bit: 8 becomes a number beyond all deltas."""
     fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(62,))

@@ -55,6 +55,7 @@ def made(asked):
     return forecast, steps.texts
 
 
+@pytest.mark.slow
 def test_runs_are_made_once_and_become_the_table(tmp_path):
     forecast, texts = made(plan(tmp_path))
     assert forecast.runs == RUNS

@@ -99,6 +99,7 @@ def test_what_was_measured_is_never_left_out(attack, control_copy, kernels, runs
     assert {path.name: path.read_bytes() for path in control_copy.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_more_runs_and_kernels_go_on_from_fewer(attack, control_campaign, control_copy):
     _, (first,) = control_campaign
     _, (control, cloud) = attack("control", "point_cloud", runs=31, folder=control_copy)
@@ -157,12 +158,14 @@ def test_time_rules_say_what_they_missed(attack):
     assert {each["complete"] for each in kernel["inputs"]} == {None}
 
 
+@pytest.mark.slow
 def test_the_planner_is_attacked_in_its_own_library(attack):
     _, (runs,) = attack("rrtconnect", runs=10)
     assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
     assert all(each.complete for each in runs.profiles)
 
 
+@pytest.mark.slow
 def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
     (tmp_path / "inputs.npz").write_bytes(kernel_inputs.read_bytes())
@@ -182,6 +185,7 @@ def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, mon
     assert all(not replay.differs for replay in replay_runs(tmp_path))
 
 
+@pytest.mark.slow
 def test_the_writing_of_the_tree_is_not_attacked_but_the_whole_tree_is_compared(
     attack, monkeypatch
 ):
