@@ -89,9 +89,10 @@ def report(mavfi, tmp_path):
 
 COMMANDS = {
     # Renewed when an export got the costs of detection and recovery, and when kernels became code
-    # of x86-64-v3 on every processor, so that a fault in an instruction strikes the same one.
+    # of x86-64-v3 on every processor, so that a fault in an instruction strikes the same one, and
+    # when `struck_bits` became a list.
     "campaign": (
-        "a9f3f665e394336f",
+        "27e9b1da03e0f467",
         ["campaign", "run", "hashed.toml", "--quiet", "--out", "c", "--json"],
         ["campaign", "status", "c", "--quality", "--failures", "--json"],
         ["campaign", "export", "c", "-"],
