@@ -200,7 +200,9 @@ def _updated(table: pa.Table, path: Path) -> pa.Table:
         try:
             bits = [_parsed(text) for text in table["struck_bits"].to_pylist()]
         except ValueError as error:
-            raise RecordError(f"{path}: damaged, no export can be read ({error})") from None
+            raise RecordError(
+                f"{path}: the export of a campaign cannot be read ({error})"
+            ) from None
         table = table.set_column(place, "struck_bits", pa.array(bits, BITS))
     return _typed(table)
 
@@ -308,7 +310,7 @@ def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str,
         if isinstance(ledger, ExportedLedger):
             for row in chosen(flights(ledger), number=number).to_pylist():
                 if row["outcome"] is not None:
-                    return structure(json.loads(row["changes"]), MissionConfig), row
+                    return _config(row, campaign), row
         else:
             for entry in ledger.results([number]):
                 if entry.outcome is not None:
@@ -316,6 +318,14 @@ def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str,
                     return entry.mission.config, row
         problem = f"has no mission {number} that has flown ({number_span(ledger)})"
     raise ConfigError(problem, path=campaign)
+
+
+def _config(row: Mapping[str, Any], export: Path) -> MissionConfig:
+    try:
+        return structure(json.loads(row["changes"]), MissionConfig)
+    except (TypeError, ValueError, ConfigError) as error:
+        problem = f"the changes of mission {row['number']} cannot be used ({error})"
+        raise RecordError(f"{export}: {problem}") from None
 
 
 def number_span(ledger: Ledger) -> str:

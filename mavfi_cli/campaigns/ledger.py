@@ -440,14 +440,21 @@ def stored_export(path: Path) -> pa.Table:
     table = read_parquet(path, "export of a campaign")
     for name in _NEEDED:
         if name not in table.column_names:
-            raise RecordError(f"{path}: not an export of a campaign (it has no column {name!r})")
+            raise _no_export(path, f"it has no column {name!r}")
+    try:
+        stored_provenance(table)
+    except (TypeError, ValueError):
+        raise _no_export(path, "its metadata are damaged") from None
     return table
+
+
+def _no_export(path: Path, why: object) -> RecordError:
+    return RecordError(f"{path}: not an export of a campaign ({why})")
 
 
 def stored_provenance(table: pa.Table) -> dict[str, Any]:
     """Return the provenance in the metadata of an export; {} if it has none."""
-    found: dict[str, Any] = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
-    return found
+    return dict(json.loads((table.schema.metadata or {}).get(_METADATA, b"{}")))
 
 
 class ExportedLedger(Ledger):
@@ -467,7 +474,10 @@ class ExportedLedger(Ledger):
         rows = self.table.to_pylist()
         for row in rows:
             own = {name.removeprefix(_LABEL): row[name] for name in labels if row[name] is not None}
-            cell = cells.setdefault(canonical(own), len(cells))
+            try:
+                cell = cells.setdefault(canonical(own), len(cells))
+            except TypeError as error:  # a label of a foreign type
+                raise _no_export(path, error) from None
             missions.append((row["number"], cell, row["pair"], row["changes"]))
         name = str(origin.get("name") or path.stem)
         self.fill(name, cells, missions, rows)

@@ -100,7 +100,7 @@ class _VehicleSide(click.Command):
         }
         line = [*PYTHON, "-m", _COMMANDS[self.name][0]]
         done = subprocess.run(line, env=os.environ | asked, capture_output=True, text=True)
-        items = (answer.partition(",") for answer in done.stdout.splitlines())
+        items = (answer.partition(",") for answer in done.stdout.splitlines() if answer)
         return [CompletionItem(value, type=kind) for kind, _, value in items]
 
 

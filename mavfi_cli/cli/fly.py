@@ -249,6 +249,8 @@ def _hint(run: Run) -> list[str]:
     )
     if run.record.outcome != "success" or config["detector"] or not (changes and all(small)):
         return []
+    if "config" in given_options():  # its faults would change the one that is named
+        return []
     line = ["mavfi", "fly"]
     for name, value in given_options().items():
         if name in _SOURCE | _EITHER | {"inject"}:
@@ -258,7 +260,7 @@ def _hint(run: Run) -> list[str]:
         else:
             text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
             line += [spelling(name), text]
-    return ["", f"This flip is too small to see. try: {shlex.join([*line, *_LARGE])}"]
+    return ["", f"This flip is too small to see; try: {shlex.join([*line, *_LARGE])}"]
 
 
 def _mission_of(path: Path | None) -> MissionConfig:

@@ -38,9 +38,9 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
 
     if as_json and save is None:
         raise click.UsageError("--json needs --save FILE")
-    viewers.require_viewer(save)
     if layout is not None and (save is None or save.suffix.lower() != ".mcap"):
         raise click.UsageError("--layout goes with --save FILE.mcap")
+    viewers.require_viewer(save)
     recorded = load_run(run)
     golden = _golden(recorded) if recorded.record.fault else None
     named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}

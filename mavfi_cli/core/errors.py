@@ -91,7 +91,13 @@ class ConfigError(MavfiError):
 
 
 class WorldError(MavfiError):
-    """Start or goal is blocked or outside the world, or the boxes are invalid."""
+    """The boxes of a world, or the numbers that it is generated from, are invalid."""
+
+
+class PlaceError(WorldError):
+    """Start or goal is blocked or outside the world: wrong usage."""
+
+    exit_code = 2
 
 
 class LinkError(MavfiError):

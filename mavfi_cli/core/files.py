@@ -272,7 +272,7 @@ def read_parquet(path: Path, what: str) -> Any:
                 raise RecordError(f"{path}: has more than {_LARGEST >> 20} MB")
         return pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise RecordError(f"{path}: damaged, no {what} can be read ({error})") from None
+        raise RecordError(f"{path}: the {what} cannot be read ({error})") from None
 
 
 def plain(value: Any) -> Any:

@@ -156,7 +156,7 @@ def _columns(path: Path, what: str, names: Sequence[str]) -> dict[str, np.ndarra
     try:
         return {name: table[name].to_numpy() for name in names}
     except KeyError as error:
-        raise RecordError(f"{path}: no {what} can be read ({error})") from None
+        raise RecordError(f"{path}: the {what} cannot be read ({error})") from None
 
 
 # Trace --------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import load_toml, toml_text
-from mavfi_cli.core.errors import RecordError, UnknownName, WorldError
+from mavfi_cli.core.errors import PlaceError, RecordError, UnknownName, WorldError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream
@@ -75,7 +75,8 @@ class World:
     """Boxes, bounds, start and goal in ENU. The ground is the plane z = 0.
 
     Raises:
-        WorldError: Start or goal is outside the bounds or blocked, or a box has no volume.
+        PlaceError: Start or goal is outside the bounds or blocked.
+        WorldError: A box has no volume.
     """
 
     name: str
@@ -133,12 +134,12 @@ class World:
 
 
 def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
-    """Raise WorldError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
+    """Raise PlaceError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
 
     A start is blocked if a box (n, 6) is too near to stand there, a goal if it is inside a box.
     """
     if not _inside(bounds, place):
-        raise WorldError(
+        raise PlaceError(
             f"world {name!r}: {what} {show(place)} is outside the world, which reaches "
             f"from {show(bounds[:3])} to {show(bounds[3:])} m"
         )
@@ -146,12 +147,12 @@ def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place
     if not gaps.size:
         return
     if what == "start" and gaps.min() < _START_CLEAR_M:
-        raise WorldError(
+        raise PlaceError(
             f"world {name!r}: start {show(place)} is blocked: box {int(gaps.argmin())} is "
             f"{gaps.min():.2f} m away, {_START_CLEAR_M:g} m needed"
         )
     if what == "goal" and gaps.min() <= 0.0:
-        raise WorldError(
+        raise PlaceError(
             f"world {name!r}: goal {show(place)} is inside an obstacle (box {int(gaps.argmin())})"
         )
 
@@ -174,7 +175,8 @@ def load_world(
 
     Raises:
         UnknownName: No world has this name. Suggests the nearest.
-        WorldError: Start or goal is outside or blocked, or the generator spec is invalid.
+        PlaceError: Start or goal is outside or blocked.
+        WorldError: The generator spec is invalid.
         ConfigError: The file cannot be used. Names file, line and key.
     """
     if seed < 0:
@@ -213,7 +215,7 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
         return None
     array = np.asarray(place, dtype=np.float64)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise WorldError(f"{what} must be three finite numbers (east, north, up in m)")
+        raise PlaceError(f"{what} must be three finite numbers (east, north, up in m)")
     return array
 
 
@@ -266,7 +268,7 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
     """
     places = np.array([start, goal])
     if (np.ptp(places, axis=0) > _MAX_SPAN_M).any():
-        raise WorldError(
+        raise PlaceError(
             f"start {show(start)} and goal {show(goal)} must be at most "
             f"{_MAX_SPAN_M:g} m apart along each axis"
         )

@@ -76,6 +76,15 @@ def test_no_such_mission(folder, export, tmp_path):
         mission_of(tmp_path / "foreign.parquet", 0)
 
 
+@pytest.mark.parametrize("text", ["{", "[1]", '{"wrold": 3}', '{"seed": -1}'])
+def test_a_mission_of_strange_changes_is_refused(export, tmp_path, text):
+    table, path = pq.read_table(export), tmp_path / "strange.parquet"
+    place, texts = table.column_names.index("changes"), pa.array([text] * table.num_rows)
+    pq.write_table(table.set_column(place, "changes", texts), path)
+    with pytest.raises(RecordError, match="the changes of mission 0 cannot be used"):
+        mission_of(path, 0)
+
+
 def test_a_debugger_needs_a_run_folder(folder, mavfi):
     done = mavfi("replay", str(folder), "--mission", "0", "--gdb")
     assert done.returncode == 2
@@ -99,7 +108,7 @@ def test_an_export_of_an_earlier_version_is_read_as_one_of_this(export, tmp_path
     assert read_export(old)["struck_bits"].to_pylist() == [None, [[1, 15], [19, 24]]]
     assert read_export(export).equals(table)
     pq.write_table(table.slice(0, 1).set_column(place, "struck_bits", pa.array(["x"])), old)
-    with pytest.raises(RecordError, match="damaged"):
+    with pytest.raises(RecordError, match="the export of a campaign cannot be read"):
         read_export(old)
 
 

@@ -78,8 +78,9 @@ def test_what_an_export_cannot_do_is_said(mavfi, tmp_path, line, code, said):
         {"number": ["first", "second"]},
         {"pair": [None, None]},
         {"changes": [[1], [2]]},
+        {"label_setting": [b"\xff", b"a"]},
     ],
-    ids=["twice", "texts", "empty", "lists"],
+    ids=["twice", "texts", "empty", "lists", "bytes"],
 )
 def test_a_table_of_other_contents_is_refused_in_one_line(tmp_path, columns):
     whole = pq.read_table(EXPORT).slice(0, 2)
@@ -88,6 +89,14 @@ def test_a_table_of_other_contents_is_refused_in_one_line(tmp_path, columns):
     path = tmp_path / "strange.parquet"
     pq.write_table(whole, path)
     with pytest.raises(RecordError, match="strange"):
+        opened(path)
+
+
+@pytest.mark.parametrize("metadata", ["{", "[1]", "3"])
+def test_damaged_metadata_are_refused(tmp_path, metadata):
+    path = tmp_path / "strange.parquet"
+    pq.write_table(pq.read_table(EXPORT).replace_schema_metadata({"mavfi": metadata}), path)
+    with pytest.raises(RecordError, match=r"not an export .* metadata are damaged"):
         opened(path)
 
 

@@ -64,10 +64,12 @@ def test_a_name_like_no_other_gets_the_list(refused):
         (("--world", "farm", "--goal=-300,10,5"), "goal (-300, 10, 5) is outside"),
         (("--world", "factory", "--start=18,10,0"), "start (18, 10, 0) is blocked"),
         (("--world", "farm", "--start=500,0,0"), "start (500, 0, 0) is outside"),
+        (("--world", "dense", "--goal=30,40,-1"), "goal (30, 40, -1) is outside"),
+        (("--world", "dense", "--goal=1e6,0,5"), "must be at most 1000 m apart"),
     ],
 )
 def test_a_place_where_nobody_can_be(refused, arguments, said):
-    assert said in refused(*arguments)
+    assert said in refused(*arguments, code=2)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +179,7 @@ def test_a_key_file_without_permission(refused, tmp_path, monkeypatch):
 
 
 def test_a_camera_that_cannot_start_says_why(refused):
-    line = refused(*LINK, "--eyes", "--world", "farm", "--goal", "900,0,5")
+    line = refused(*LINK, "--eyes", "--world", "farm", "--goal", "900,0,5", code=2)
     assert "goal (900, 0, 5) is outside the world" in line
 
 

@@ -130,7 +130,7 @@ def test_a_flip_that_is_too_small_to_see_names_one_that_shows(command_line, bit,
     code, out, _ = command_line(*line)
     assert code == 0
     last = out.splitlines()[-1]
-    assert last.startswith("This flip is too small to see. try: mavfi fly ") == hinted
+    assert last.startswith("This flip is too small to see; try: mavfi fly ") == hinted
     if hinted:
         words = shlex.split(last.partition("try: mavfi ")[2])
         assert words[:5] == ["fly", "--world", "farm", "--seed", "5"]

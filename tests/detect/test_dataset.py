@@ -54,10 +54,10 @@ def test_a_flight_can_be_in_a_set_only_once():
 
 def test_what_is_no_data_set_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
-    with pytest.raises(RecordError, match="no data set can be read"):
+    with pytest.raises(RecordError, match="the data set cannot be read"):
         Dataset.load(path)
     path.write_bytes(b"nonsense")
-    with pytest.raises(RecordError, match="no data set can be read"):
+    with pytest.raises(RecordError, match="the data set cannot be read"):
         Dataset.load(path)
     pq.write_table(pa.table({"a": [1]}), path)
     with pytest.raises(ModelError, match="is not a data set of mavfi"):

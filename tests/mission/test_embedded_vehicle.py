@@ -6,7 +6,7 @@ import pytest
 from record_digest import record_digest
 
 from mavfi_cli.campaigns.begin import check_names
-from mavfi_cli.core.errors import UnknownName, VehicleProcessError, WorldError
+from mavfi_cli.core.errors import PlaceError, UnknownName, VehicleProcessError
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.mission.vehicle import Vehicle, VehicleProcess
 from mavfi_cli.spec.detector import DetectorConfig
@@ -79,7 +79,7 @@ def test_a_vehicle_that_breaks_is_a_lost_link_with_its_reason(fly_short, fails_a
     [
         ({"world": "fram"}, UnknownName, "unknown world 'fram'; did you mean 'farm'"),
         ({"vehicle": "sole"}, UnknownName, "unknown vehicle 'sole'"),
-        ({"goal": (1e9, 0.0, 5.0)}, WorldError, "goal"),
+        ({"goal": (1e6, 0.0, 5.0)}, PlaceError, "goal"),
     ],
 )
 def test_what_the_vehicle_refuses_is_one_clear_error(
