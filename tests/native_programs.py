@@ -6,15 +6,19 @@ import subprocess
 import pytest
 
 SOURCES = {
-    # Writes what it reads from standard input, and its double; prints a time. args: the files.
+    # Writes what it reads from standard input, and its double; prints a time. args: the files, also
+    # as NAME=FILE.
     "writing": """
 #include <stdio.h>
+#include <string.h>
 #include <time.h>
 int main(int c, char **v) {
     double x = 7; struct timespec now; clock_gettime(CLOCK_REALTIME, &now);
     if (scanf("%lf", &x) < 0) x = 7;
     for (int i = 1; i < c; i++) {
-        FILE *f = fopen(v[i], "w"); fprintf(f, "%g %g\\n", x, 2 * x); fclose(f);
+        char *at = strchr(v[i], '='); FILE *f = fopen(at ? at + 1 : v[i], "w");
+        if (!f) { puts("no such file"); return 3; }
+        fprintf(f, "%g %g\\n", x, 2 * x); fclose(f);
     }
     printf("Time = %ld.%09ld\\nx = %g\\n", (long) now.tv_sec, now.tv_nsec, x);
     return 0;

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import open_own, read_bounded, write_atomically, write_json, writing
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import open_own, read_json, write_atomically, write_json, writing
 
 PLAN, RUNS = "plan.json", "runs.jsonl"
 _LARGEST_PLAN = 1 << 24  # bytes
@@ -113,12 +113,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
     Raises:
         RecordError: the folder holds no campaign.
     """
-    path = folder / PLAN
-    try:
-        plan: dict[str, Any] = json.loads(read_bounded(path, _LARGEST_PLAN))
-    except ValueError as error:
-        raise RecordError(f"{path}: damaged ({error})") from None
-    return plan
+    return read_json(folder / PLAN, _LARGEST_PLAN)
 
 
 def read_runs(folder: Path) -> list[dict[str, Any]]:
@@ -136,7 +131,7 @@ def read_runs(folder: Path) -> list[dict[str, Any]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     found: dict[tuple[Any, int], dict[str, Any]] = {}
     for line in lines:
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(AttributeError, KeyError, RecursionError, TypeError, ValueError):
             entry = json.loads(line)
             found[entry.get("kernel"), entry["run"]] = entry
     return list(found.values())

@@ -309,7 +309,7 @@ class _Workplace:
             output=_joined(parts), exit_code=ended.exit_code or 0, cpu_s=cpu_s, wall_s=wall_s
         )
         self._golden = self._golden or golden
-        return replace(golden, notices=tuple(self._notices()))
+        return replace(golden, notices=tuple(self._notices(golden.exit_code)))
 
     def _require_sound(self, ended: Ended, parts: Mapping[str, bytes | None]) -> None:
         """Refuse a golden run with which no other can be compared."""
@@ -351,7 +351,12 @@ class _Workplace:
         lines = self._stderr.read_text(errors="replace").strip().splitlines()
         return f" ({lines[-1][:200]})" if lines else ""
 
-    def _notices(self) -> Iterator[str]:
+    def _notices(self, exit_code: int) -> Iterator[str]:
+        if exit_code:
+            yield (
+                f"{self.name} ends with exit code {exit_code} without a fault"
+                f"{self._last_words()}; a run that ends in the same way is benign"
+            )
         written = [Path(each) for each in self._watch().written]
         outside = [each for each in written if not each.is_relative_to(self._folder.tree)]
         if outside:

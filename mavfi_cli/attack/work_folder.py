@@ -25,7 +25,8 @@ def copied_arguments(
 ) -> tuple[list[str], dict[str, Path]]:
     """Make arguments that name the user's files name copies of them.
 
-    An argument that names something below `folder` names its copy. Any other relative argument that
+    What follows the first `=` of an argument, as in `of=out.txt`, counts as an argument too. An
+    argument that names something below `folder` names its copy. Any other relative argument that
     names a file, or that names a folder and contains a slash, names a copy at the same place
     relative to the program's folder. An absolute argument outside `folder` stays.
 
@@ -38,9 +39,13 @@ def copied_arguments(
         folder. A place may begin with `..`.
     """
     arguments, sources = [], {}
+    places = [directory] if folder is None else [directory, folder]
     for argument in argv:
-        name, source = _copied(argument, directory, folder)
-        arguments.append(name)
+        option, equals, value = argument.partition("=")
+        if not value or any(os.path.lexists(os.path.join(at, argument)) for at in places):
+            option, equals, value = "", "", argument
+        name, source = _copied(value, directory, folder)
+        arguments.append(option + equals + name)
         if source is not None:
             sources[os.path.normpath(name)] = source
     return arguments, sources

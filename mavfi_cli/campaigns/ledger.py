@@ -32,7 +32,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import inflate, open_own, plain, read_parquet, writing
+from mavfi_cli.core.files import inflate, open_own, plain, read_parquet, reading, writing
 from mavfi_cli.mission.measures import fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -75,6 +75,14 @@ _SHORT = (
 )  # fmt: skip
 _LARGEST_RECORD = 1 << 27  # bytes of JSON
 _PORTION = 5000  # rows that are read at once
+
+
+def _object(text: str | bytes) -> dict[str, Any]:
+    """Read a JSON object. Raises TypeError or ValueError."""
+    found = json.loads(text)
+    if not isinstance(found, dict):
+        raise TypeError(f"expected a JSON object, got a {type(found).__name__}")
+    return found
 
 
 class Ledger:
@@ -186,7 +194,8 @@ class Ledger:
             RecordError: the ledger is damaged.
         """
         try:
-            yield from self._db.execute(query, values)
+            for row in self._db.execute(query, values):  # noqa: UP028 (it closes, too late)
+                yield row
         except sqlite3.Error as error:
             raise RecordError(f"{self._path}: {error}") from None
 
@@ -254,9 +263,19 @@ class Ledger:
         return int(count)
 
     def cells(self) -> list[dict[str, Any]]:
-        """The settings, by number."""
-        rows = self._rows("SELECT labels FROM cells ORDER BY cell")
-        return [json.loads(labels) for (labels,) in rows]
+        """The settings, by number.
+
+        Raises:
+            RecordError: the ledger is damaged, for example because a mission's setting is missing.
+        """
+        with reading(self._path):
+            cells = [
+                _object(text) for (text,) in self._rows("SELECT labels FROM cells ORDER BY cell")
+            ]
+            for (cell,) in self._rows("SELECT DISTINCT cell FROM missions"):
+                if cell not in range(len(cells)):
+                    raise ValueError(f"it has no setting {cell!r}")
+        return cells
 
     def rows(self) -> Iterator[tuple[int, str, str, str]]:
         """Number, labels, pair and changes of every mission, as they are stored."""
@@ -286,8 +305,10 @@ class Ledger:
                     last,
                 )
             )
-            for number, cell, changes in rows:
-                yield number, cell, json.loads(changes)
+            for number, cell, text in rows:
+                with reading(self._path):
+                    changes = _object(text)
+                yield number, cell, changes
                 last = number
             if not rows:
                 return
@@ -364,29 +385,24 @@ class Ledger:
         with contextlib.closing(rows):  # before the ledger, also after an error
             for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
                 wall_s, attempts, path, blob = rest
-                yield MissionResult(
-                    number=number,
-                    mission=PlannedMission(
-                        config=structure(json.loads(changes), MissionConfig),
-                        labels=json.loads(labels),
-                        pair=pair,
-                    ),
-                    state=ResultState(state),
-                    outcome=outcome,
-                    reason=reason,
-                    result=self._unpacked(blob),
-                    injected=None if injected is None else Injected(injected),
-                    wall_s=wall_s,
-                    attempts=attempts,
-                    path=None if path is None else self.folder.absolute() / path,
-                )
-
-    def _unpacked(self, blob: bytes) -> dict[str, Any]:
-        try:
-            result: dict[str, Any] = json.loads(inflate(blob, _LARGEST_RECORD))
-        except ValueError as error:
-            raise RecordError(f"{self._path}: {error}") from None
-        return result
+                with reading(self._path):
+                    found = MissionResult(
+                        number=number,
+                        mission=PlannedMission(
+                            config=structure(_object(changes), MissionConfig),
+                            labels=_object(labels),
+                            pair=pair,
+                        ),
+                        state=ResultState(state),
+                        outcome=outcome,
+                        reason=reason,
+                        result=_object(inflate(blob, _LARGEST_RECORD)),
+                        injected=None if injected is None else Injected(injected),
+                        wall_s=wall_s,
+                        attempts=attempts,
+                        path=None if path is None else self.folder.absolute() / path,
+                    )
+                yield found
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
         """Columns of every flown mission, in the order of the list and in portions.

@@ -10,6 +10,7 @@ import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import NUMBER, OUT, OutFile, RunPath
+from mavfi_cli.core.errors import printable
 from mavfi_cli.report.drawing import PICTURES
 
 _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
@@ -30,6 +31,7 @@ def _note(text: str) -> None:
               help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Summarise RUN, a run folder."""
+    from mavfi_cli.core.files import reading
     from mavfi_cli.mission.run import paired_golden
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
@@ -43,20 +45,24 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
         from mavfi_cli.report.drawing import write_figure
         from mavfi_cli.report.top_view import draw_top_view
 
-        write_figure(draw_top_view(recorded), picture)
+        with reading(recorded.folder.path):
+            drawn = draw_top_view(recorded)
+        write_figure(drawn, picture)
     if as_json:
         click.echo(json.dumps(recorded.result, indent=2, sort_keys=True))
         return
-    lines = summary_lines(recorded.result)
+    golden = None
     if recorded.record.fault:
         golden = paired_golden(recorded, _note) if pair else recorded.golden
-        if golden is None:
-            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
-        else:
+    with reading(recorded.folder.path):
+        lines = summary_lines(recorded.result)
+        if golden is not None:
             lines += difference_lines(recorded, golden)
-    if events:
-        lines += ["", "Events", *event_lines(recorded.result)]
-    click.echo("\n".join([*lines, *folder_lines(recorded, picture)]))
+        elif recorded.record.fault:
+            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
+        if events:
+            lines += ["", "Events", *event_lines(recorded.result)]
+    click.echo("\n".join(map(printable, [*lines, *folder_lines(recorded, picture)])))
 
 
 @click.command(cls=GroupedCommand)

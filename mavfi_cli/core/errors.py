@@ -22,6 +22,11 @@ def described(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
 
 
+def printable(text: str) -> str:
+    """Return a line without control characters, which could be commands to a terminal."""
+    return "".join(c if c.isprintable() else "\ufffd" for c in text)
+
+
 def lack_of(error: Exception) -> str:
     """Return what is wrong with a file's contents, by the error that their use has raised."""
     return f"it has no {error}" if isinstance(error, KeyError) else described(error)

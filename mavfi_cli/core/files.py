@@ -21,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.errors import RecordError, lack_of
 
 PACKAGE = Path(__file__).parents[1]
 _LARGEST = 1 << 32  # bytes of a table
@@ -48,6 +48,17 @@ def writing(place: Path) -> Iterator[None]:
         raise RecordError(f"{place}: {error.strerror or error}") from None
 
 
+@contextlib.contextmanager
+def reading(place: Path) -> Iterator[None]:
+    """Turn an error that damaged contents of a file raise where they are used into RecordError."""
+    try:
+        yield
+    except (
+        ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+    ) as error:  # fmt: skip
+        raise RecordError(f"{place}: damaged ({lack_of(error)})") from error
+
+
 def read_bounded(path: Path, limit: int) -> bytes:
     """Read a regular file. No link is followed, and no pipe is waited for.
 
@@ -64,6 +75,15 @@ def read_bounded(path: Path, limit: int) -> bytes:
         if about.st_size > limit:
             raise RecordError(f"{path}: has {about.st_size} bytes, more than {limit}")
         return file.read(limit)
+
+
+def read_json(path: Path, limit: int) -> dict[str, Any]:
+    """Read a JSON object from a file. Raises RecordError, as `read_bounded` or if it is damaged."""
+    with reading(path):
+        found = json.loads(read_bounded(path, limit))
+    if not isinstance(found, dict):
+        raise RecordError(f"{path}: not a JSON object")
+    return found
 
 
 def open_own(path: Path, flags: int) -> int:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
+from mavfi_cli.core.errors import printable
 from mavfi_cli.core.frames import (
     FARTHEST_M,
     FASTEST_MPS,
@@ -201,8 +202,7 @@ class _TextCollector:
 
     def _emit(self, severity: int, text: str) -> _Text:
         self.total += 1
-        shown = "".join(c if c.isprintable() else "\ufffd" for c in text.strip())
-        self.texts.append(_Text(severity, shown))
+        self.texts.append(_Text(severity, printable(text.strip())))
         return self.texts[-1]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,14 @@ import numpy as np
 
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import file_digest, read_parquet, write_parquet, writing
+from mavfi_cli.core.files import (
+    file_digest,
+    read_json,
+    read_parquet,
+    reading,
+    write_parquet,
+    writing,
+)
 from mavfi_cli.core.types import (
     BY_NAME,
     STATES,
@@ -36,6 +42,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 RESULT, FAULT, TRACE = "result.json", "fault.json", "trace.parquet"
+_LARGEST_RESULT = 1 << 27  # bytes
 _NEEDED = (
     "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
 )  # fmt: skip
@@ -333,10 +340,12 @@ class Run:
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times does not repeat"
         config = structure(dict(record.config), MissionConfig, path=self.folder.result)
-        for name, digest in {**dict.fromkeys(config.files, ""), **record.files}.items():
-            if not why and not (digest and file_digest(name) == digest):
-                how = "has changed since this flight" if Path(name).exists() else "does not exist"
-                why = f"{name} {how}, so the flight does not repeat"
+        with reading(self.folder.result):
+            for name, digest in {**dict.fromkeys(config.files, ""), **record.files}.items():
+                if not why and not (digest and file_digest(name) == digest):
+                    changed = Path(name).exists()
+                    how = "has changed since this flight" if changed else "does not exist"
+                    why = f"{name} {how}, so the flight does not repeat"
         if why:
             raise RecordError(f"{path}: {why}")
         config.require_firmware(firmware)
@@ -417,17 +426,13 @@ def load_run(path: str | Path) -> Run:
     if not folder.result.is_file():
         hint = "cut off before its end" if folder.tlog.exists() else "not a run folder"
         raise RecordError(f"{folder.path}: no {RESULT} ({hint})")
-    try:
-        result = json.loads(folder.result.read_text())
-        trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
-    except (OSError, ValueError) as error:
-        raise RecordError(f"{folder.path}: damaged ({error})") from None
-    if not isinstance(result, dict):
-        raise RecordError(f"{folder.result}: not the record of a run")
+    result = read_json(folder.result, _LARGEST_RESULT)
+    trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
     if result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
         raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
     # Records from before the introduction of stacks flew the stack FIRST.
-    result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
+    with reading(folder.result):
+        result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
     return Run(folder, result, trace)

@@ -59,6 +59,12 @@ def test_one_that_writes_outside_its_folder_is_attacked_with_a_warning(attack, t
     assert (tmp_path / "mine").read_text() == "x"
 
 
+def test_one_that_ends_with_an_exit_code_is_attacked_with_a_warning(native_program):
+    line = ["--program", str(native_program("writing")), "--args", "nowhere/file", "--runs", "1"]
+    done = CliRunner().invoke(kernels, [*line, "--ignore-lines", "^Time"])
+    assert "warning: writing ends with exit code 3 without a fault; a run that" in done.stderr
+
+
 def test_one_that_writes_a_file_that_is_not_compared_is_attacked_with_a_warning(attack):
     done = attack("writes here")
     assert done.exit_code == 0, done.output

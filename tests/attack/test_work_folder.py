@@ -75,6 +75,9 @@ def test_relative_arguments_that_name_files_are_copied(home, argument, name, sou
         ("data/in.txt", "in.txt"),
         ("{home}/data/in.txt", "in.txt"),
         ("{home}/data/out.txt", "out.txt"),
+        ("of={home}/data/in.txt", "of=in.txt"),
+        ("--out=data/out.txt", "--out=data/out.txt"),
+        ("-DA={home}/in.txt", "-DA={home}/in.txt"),
         ("data/deep/", "deep"),
         ("deep/one", "deep/one"),
         ("out.txt", "out.txt"),
@@ -85,6 +88,13 @@ def test_relative_arguments_that_name_files_are_copied(home, argument, name, sou
 def test_arguments_that_name_something_in_the_folder_name_its_copy(home, argument, name):
     arguments, sources = copied_arguments([argument.format(home=home)], home, home / "data")
     assert (arguments, sources) == ([name.format(home=home)], {})
+
+
+def test_the_value_of_an_option_is_copied_unless_the_whole_argument_names_a_file(home):
+    (home / "if=in.txt").write_text("mine")
+    arguments, sources = copied_arguments(["of=in.txt", "x=5", "=", "if=in.txt"], home, None)
+    assert arguments == ["of=in.txt", "x=5", "=", "if=in.txt"]
+    assert sources == {name: home / name for name in ("in.txt", "if=in.txt")}
 
 
 def test_a_file_beside_the_folder_is_copied_beside_the_copy(home, made):
@@ -115,6 +125,8 @@ def attack(native_program, home):
         ("in.txt", ("--folder", ".")),
         ("data/in.txt", ("--folder", "data")),
         ("{home}/data/in.txt", ("--folder", "data")),
+        ("to=in.txt --to=./data/in.txt", ()),
+        ("--to={home}/data/in.txt to=in.txt", ("--folder", "data")),
         ("link", ("--folder", "data")),
         ("ring/in.txt", ("--folder", "data", "--compare", "file:ring/in.txt")),
     ],

@@ -102,7 +102,7 @@ def test_a_record_that_is_none_says_so(command_line, short_flight, tmp_path):
     (tmp_path / "result.json").write_text("[1, 2]")
     code, _, err = command_line("show", tmp_path)
     assert code == 1
-    assert err.endswith("result.json: not the record of a run\n")
+    assert err.endswith("result.json: not a JSON object\n")
 
 
 def test_show_events_and_json(command_line, troubled_flight):
@@ -134,12 +134,22 @@ def copied(short_flight, tmp_path):
     return folder
 
 
+def _change(folder, section, value):
+    path = folder / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {section: value}))
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
         (lambda f: (f / "result.json").write_text('{"schema": 1, '), "damaged"),
         (lambda f: (f / "result.json").write_bytes(b"\xff\xfe"), "damaged"),
-        (lambda f: (f / "result.json").write_text("[]"), "not the record of a run"),
+        (lambda f: (f / "result.json").write_text("[]"), "not a JSON object"),
+        (lambda f: (f / "result.json").write_text("[" * 100_000), "damaged (RecursionError"),
+        (lambda f: _change(f, "config", 5), "damaged (TypeError"),
+        (lambda f: _change(f, "detection", 5), "damaged (TypeError"),
+        (lambda f: _change(f, "events", 5), "damaged (TypeError"),
+        (lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}), "damaged (it has no"),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
         (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "damaged"),
@@ -155,6 +165,14 @@ def test_show_says_in_one_line_what_is_wrong_with_a_run(command_line, copied, da
     (line,) = err.splitlines()
     assert line.startswith("error: ")
     assert said in line
+
+
+def test_no_text_of_a_record_commands_the_terminal(command_line, copied):
+    _change(copied, "reason", "\x1b[2J\x1b]0;title\x07")
+    code, out, _ = command_line("show", copied)
+    assert code == 0
+    assert "\ufffd[2J\ufffd]0;title\ufffd" in out
+    assert "\x1b" not in out
 
 
 def test_show_does_without_a_trace(command_line, copied):

@@ -161,6 +161,26 @@ def test_a_record_that_inflates_beyond_bounds_is_refused(hostile, command_line, 
     assert "has more than 1 MB" in err
 
 
+@pytest.mark.parametrize(
+    ("change", "commands"),
+    [
+        ("UPDATE cells SET labels = '[1]'", ["status", "export", "report"]),
+        ("DELETE FROM cells", ["status", "report"]),
+        ("UPDATE missions SET changes = '5'", ["export"]),
+        ("UPDATE results SET state = 'theirs'", ["export"]),
+    ],
+)
+def test_a_damaged_ledger_is_an_error_of_one_line(change, commands, hostile, command_line):
+    with sqlite3.connect(hostile / LEDGER) as database:
+        database.execute(change)
+    for command in commands:
+        output = ["-"] if command == "export" else []
+        code, _, err = command_line("campaign", command, hostile, *output)
+        assert code == 1
+        (line,) = err.splitlines()
+        assert f"{LEDGER}: damaged (" in line
+
+
 def test_the_lock_of_a_campaign_is_no_link(hostile, precious, command_line, monkeypatch):
     monkeypatch.setenv("ARDUCOPTER_SITL", str(hostile.parent / "firmware"))
     code, _, err = command_line("campaign", "run", hostile, "--quiet")

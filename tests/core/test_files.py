@@ -18,6 +18,7 @@ from mavfi_cli.core.files import (
     open_own,
     own_folder,
     read_bounded,
+    read_json,
     read_parquet,
     write_parquet,
     write_text,
@@ -148,3 +149,13 @@ def test_a_table_that_inflates_beyond_bounds_is_not_read(tmp_path):
     with mock.patch("mavfi_cli.core.files._LARGEST", 4000), pytest.raises(RecordError, match="MB"):
         read_parquet(tmp_path / "table.parquet", "table")
     assert read_parquet(tmp_path / "table.parquet", "table").num_rows == 1000
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "[1]", "5", '{"a": '])
+def test_what_is_no_json_object_is_refused(tmp_path, text):
+    path = tmp_path / "plan.json"
+    path.write_text(text)
+    with pytest.raises(RecordError, match=r"plan\.json: (damaged|not a JSON object)"):
+        read_json(path, 1 << 20)
+    path.write_text('{"a": 5}')
+    assert read_json(path, 1 << 20) == {"a": 5}
