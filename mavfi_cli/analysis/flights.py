@@ -18,7 +18,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger, stored_export, stored_provenance
+from mavfi_cli.campaigns.ledger import (
+    METADATA,
+    ExportedLedger,
+    Ledger,
+    stored_export,
+    stored_provenance,
+)
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
@@ -60,7 +66,6 @@ _TYPES = {  # of the columns that are not text; one without a value has its type
         (*QUALITY, *COSTS, "strike_s", "first_read_s", "simulated_s", "wall_s"), pa.float64()),
 }  # fmt: skip
 _HOST = ("machine", "cores", "started")
-_METADATA = "mavfi"  # key of an export's provenance
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
@@ -182,7 +187,7 @@ def exported(ledger: Ledger) -> pa.Table:
         return whole
     labels = [name for name in whole.column_names if name.startswith("label_")]
     mine = _typed(whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]]))
-    return mine.replace_schema_metadata({_METADATA: canonical(provenance(ledger))})
+    return mine.replace_schema_metadata({METADATA: canonical(provenance(ledger))})
 
 
 def read_export(path: Path) -> pa.Table:

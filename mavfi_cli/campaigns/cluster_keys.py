@@ -93,11 +93,11 @@ def security(folder: Path) -> Security:
 
 def _private(path: Path) -> Path:
     try:
-        told = path.stat()
+        status = path.stat()
     except OSError as error:
         problem = f"{error.strerror}; `mavfi campaign keys DIR` makes the files"
         raise ConfigError(problem, path=path) from None
-    if not stat.S_ISREG(told.st_mode) or told.st_uid != os.getuid() or told.st_mode & 0o077:
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise ConfigError(
             "must be a file of yours that nobody else can read (chmod 600)", path=path
         )

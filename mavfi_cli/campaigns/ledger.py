@@ -435,7 +435,7 @@ class Ledger:
 # Exports ------------------------------------------------------------------------------------------
 
 EXPORT = ".parquet"
-_METADATA = b"mavfi"  # key of an export's provenance
+METADATA = b"mavfi"  # key of an export's provenance
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _LABEL = "label_"
 
@@ -470,7 +470,7 @@ def _no_export(path: Path, why: object) -> RecordError:
 
 def stored_provenance(table: pa.Table) -> dict[str, Any]:
     """Return the provenance in the metadata of an export; {} if it has none."""
-    return dict(json.loads((table.schema.metadata or {}).get(_METADATA, b"{}")))
+    return dict(json.loads((table.schema.metadata or {}).get(METADATA, b"{}")))
 
 
 class ExportedLedger(Ledger):

@@ -96,7 +96,9 @@ class Options:
         if not 0.0 < self.limit_s < math.inf:
             raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
         if (self.cluster or "").startswith("tls://") != (self.cluster_key is not None):
-            problem = "an address with tls:// needs --cluster-key, and no other has keys"
+            problem = (
+                "an address with tls:// needs --cluster-key, and only such an address takes it"
+            )
             raise ConfigError(problem, key="cluster")
 
 

@@ -216,9 +216,9 @@ def export(what: str, path: Path, as_json: bool) -> None:
         click.echo(content, nl=False)
     else:
         write_atomically(path, lambda file: file.write(content))
-        told = {"file": str(path), "missions": table.num_rows, "columns": table.column_names}
+        summary = {"file": str(path), "missions": table.num_rows, "columns": table.column_names}
         text = f"{table.num_rows} missions in {path}"
-        click.echo(json.dumps(told, indent=2) if as_json else text)
+        click.echo(json.dumps(summary, indent=2) if as_json else text)
 
 
 @campaign.command()

@@ -99,17 +99,17 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
     evidence = Evidence.gather(places)
     for problem in evidence.problems:
         click.echo(f"note: {problem}", err=True)
-    told = document(evidence, upsets)
-    page = render(told)
+    content = document(evidence, upsets)
+    page = render(content)
     write_text(output, page)
     missions, size = len(evidence.flights()), len(page.encode())
     if as_json:
         verdicts = {
             where: {verdict.value: count for verdict, count in counts.items()}
-            for where, counts in told["verdicts"].items()
+            for where, counts in content["verdicts"].items()
         }
-        told = {"file": str(output), "bytes": size, "missions": missions, "verdicts": verdicts,
-                "problems": [*evidence.problems]}  # fmt: skip
-        click.echo(json.dumps(told, indent=2))
+        summary = {"file": str(output), "bytes": size, "missions": missions, "verdicts": verdicts,
+                   "problems": [*evidence.problems]}  # fmt: skip
+        click.echo(json.dumps(summary, indent=2))
     else:
         click.echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")
