@@ -134,6 +134,7 @@ class Ledger:
     def _become_writer(self) -> None:
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
+        with writing(self.folder / LOCK):
             self._lock = open_own(self.folder / LOCK, os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -7,6 +7,7 @@ anybody: nothing is written through a link in it, and what is read has bounds.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -45,7 +46,8 @@ def writing(place: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise RecordError(f"{place}: {error.strerror or error}") from None
+        problem = "is a link" if error.errno == errno.ELOOP else error.strerror or error
+        raise RecordError(f"{place}: {problem}") from None
 
 
 @contextlib.contextmanager
