@@ -1,14 +1,19 @@
 """Hostile frames at a flying companion: from other systems, and with the autopilot's own ids.
 
-    python benchmarks/hostile_flight.py --frames 1000000
+    python benchmarks/hostile_flight.py --frames 1000000 --rate 8000
+    python benchmarks/hostile_flight.py --frames 0 --own 4
 
 Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all on.
 Once the vehicle is in OFFBOARD, the router adds hostile frames. So they come from the autopilot's
 own address, and nothing is signed. They have right checksums and are of every message that the
-companion handles, with NaN, infinities, extremes and zeros. They are of other systems and
-components, and the flight has to succeed. In the first flights (`--own`) they have the ids of the
-autopilot and its camera, and the flight may succeed or end as `failsafe`. Frames count if the
-companion has decoded them, which its tlog tells. The command ends with 1 after any other outcome.
+companion handles, with NaN, infinities, extremes and zeros. `--frames` is the least number of
+frames of other systems and components, and these flights have to succeed. `--own` is the number of
+flights of each kind with the ids of the autopilot and its camera: every message, then all but those
+that end or replace a flight by design, such as a HEARTBEAT of a disarmed vehicle. Half of their
+frames are the vehicle's newest messages with a few fields changed, so that stamps and places are
+plausible. These flights may have any outcome but `crash`. Frames count if the companion has decoded
+them, which its tlog shows. The command ends with 1 after any other outcome, a traceback, a flight
+of more than 10 minutes, or another exit code of the companion.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +39,24 @@ from mavfi_cli.link import session, telemetry
 from mavfi_cli.link.codec import Codec, dialect, frame_length
 from mavfi_cli.link.images import IMAGE_MESSAGES
 
-_HANDLED = sorted({*telemetry._HANDLERS, *session._HEARD, *IMAGE_MESSAGES})
+_Sender = tuple[int, int]
+_HANDLED = {*telemetry._HANDLERS, *session._HEARD, *IMAGE_MESSAGES}
 _OWN = [(1, 1), (1, 1), (1, 100)]
 _OTHERS = [(1, 101), (1, 190), (1, 0), (7, 1), (7, 100), (255, 190), (0, 1)]
+_HEARTBEAT = dialect.MAVLINK_MSG_ID_HEARTBEAT
+_POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+_WITHOUT = {
+    "others": set[int](),
+    "own ids": set[int](),
+    "own ids without HEARTBEAT": {_HEARTBEAT},
+    "own ids without HEARTBEAT and images": {_HEARTBEAT, *IMAGE_MESSAGES},
+    "own ids without HEARTBEAT, images and position": {_HEARTBEAT, *IMAGE_MESSAGES, _POSITION},
+}  # kinds of flight, and the messages that their hostile frames are none of
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 5.0, math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-45, 9e3)
 _POOL = 4000
-_ALLOWED = {"others": {"success"}, "own ids": {"success", "failsafe"}}
+_CHANGED = 0.3  # share of fields that differ from the vehicle's message
+_LIMIT_S = 600.0  # of a flight, on the wall clock
+_FAIR = {"success", "failsafe", "timeout", "link_lost", "collision", "no_path"}
 _WORLD = ("--world", "farm", "--seed", "5", "--start=2,2,0")
 _GOAL = "58,58,5"
 
@@ -52,13 +70,15 @@ def _scalar(rng: random.Random, kind: str) -> float | int:
     return rng.choice((low, high, 0, 1, rng.randint(low, high)))
 
 
-def hostile_frame(rng: random.Random, sender: tuple[int, int]) -> bytes:
-    """Return a frame of any message that the companion handles, with any contents."""
-    cls = dialect.mavlink_map[rng.choice(_HANDLED)]
+def hostile_frame(rng: random.Random, cls: Any, sender: _Sender, true: Any = None) -> bytes:
+    """Return a frame with any contents, or with those of a true message but for some fields."""
     lengths = dict(zip(cls.ordered_fieldnames, cls.array_lengths, strict=True))
     values: list[Any] = []
     for name, kind in zip(cls.fieldnames, cls.fieldtypes, strict=True):
-        if kind == "char":
+        if true is not None and rng.random() > _CHANGED:
+            value = getattr(true, name)
+            values.append(value.encode() if isinstance(value, str) else value)
+        elif kind == "char":
             values.append(rng.choice((b"depth8:crc32=00000000", b"", rng.randbytes(lengths[name]))))
         elif lengths[name]:
             values.append([_scalar(rng, kind)] * lengths[name])
@@ -71,10 +91,13 @@ class Router:
     """Passes datagrams between vehicle and companion, and adds frames once the vehicle follows.
 
     Args:
+        frame: Makes a hostile frame from the vehicle's newest messages, by component and id.
         rate_hz: Hostile frames a second.
     """
 
-    def __init__(self, companion_port: int, frames: list[bytes], rate_hz: float) -> None:
+    def __init__(
+        self, companion_port: int, frame: Callable[[dict[_Sender, Any]], bytes], rate_hz: float
+    ) -> None:
         self.vehicle, self.companion = (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)
         )
@@ -82,11 +105,13 @@ class Router:
         self.companion.connect(("127.0.0.1", companion_port))
         for each in (self.vehicle, self.companion):
             each.settimeout(0.0)
-        self._frames, self._rate_hz = frames, rate_hz
-        self._codec, self._begun_s, self._sent = Codec(255, 255), 0.0, 0
+        self._frame, self._rate_hz = frame, rate_hz
+        self._codec, self._begun_s, self._count = Codec(255, 255), 0.0, 0
+        self._newest: dict[_Sender, Any] = {}
         self._peer: Any = None
+        self.sent: set[bytes] = set()
 
-    def turn(self, rng: random.Random) -> None:
+    def turn(self) -> None:
         """Pass on what waits, and send the hostile frames that are due."""
         for ready in select.select([self.vehicle, self.companion], [], [], 0.002)[0]:
             try:
@@ -100,17 +125,22 @@ class Router:
             except OSError:  # the companion does not listen yet, or has ended
                 continue
         due = (time.monotonic() - self._begun_s) * self._rate_hz if self._begun_s else 0.0
-        while self._sent < due:
-            self._sent += 1
+        while self._count < due:
+            self._count += 1
+            frame = self._frame(self._newest)
             try:
-                self.companion.send(rng.choice(self._frames))
+                self.companion.send(frame)
             except OSError:
                 break
+            self.sent.add(frame)
 
     def _look(self, data: bytes) -> None:
-        for message in self._codec.decode(data, datagram=True) if not self._begun_s else ():
-            if isinstance(message, dialect.MAVLink_heartbeat_message) and (
-                message.custom_mode == 6 << 16 and message.base_mode & 128
+        for message in self._codec.decode(data, datagram=True):
+            self._newest[message.get_srcComponent(), type(message).id] = message
+            if (
+                not self._begun_s
+                and isinstance(message, dialect.MAVLink_heartbeat_message)
+                and (message.custom_mode == 6 << 16 and message.base_mode & 128)
             ):
                 self._begun_s = time.monotonic()
 
@@ -129,13 +159,25 @@ def heard(tlog: Path, hostile: set[bytes]) -> int:
     return count
 
 
+def frame_maker(kind: str, rng: random.Random) -> Callable[[dict[_Sender, Any]], bytes]:
+    """Return a function that makes the hostile frames of a kind of flight."""
+    classes = [dialect.mavlink_map[number] for number in sorted(_HANDLED - _WITHOUT[kind])]
+    if kind == "others":
+        pool = [hostile_frame(rng, rng.choice(classes), rng.choice(_OTHERS)) for _ in range(_POOL)]
+        return lambda _: rng.choice(pool)
+
+    def frame(newest: dict[_Sender, Any]) -> bytes:
+        cls, sender = rng.choice(classes), rng.choice(_OWN)
+        true = newest.get((sender[1], cls.id)) if rng.random() < 0.5 else None
+        return hostile_frame(rng, cls, sender, true)
+
+    return frame
+
+
 def fly(kind: str, seed: int, rate_hz: float) -> tuple[str, str, int]:
     """Fly once among hostile frames. Return outcome, reason and the number of frames heard."""
-    rng = random.Random(seed)
-    senders = _OTHERS if kind == "others" else _OWN
-    frames = [hostile_frame(rng, rng.choice(senders)) for _ in range(_POOL)]
     port = free_port(socket.SOCK_DGRAM)
-    router = Router(port, frames, rate_hz)
+    router = Router(port, frame_maker(kind, random.Random(seed)), rate_hz)
     link = f"onboard=udpout:127.0.0.1:{router.vehicle.getsockname()[1]}"
     with tempfile.TemporaryDirectory() as folder:
         vehicle = subprocess.Popen(
@@ -143,25 +185,29 @@ def fly(kind: str, seed: int, rate_hz: float) -> tuple[str, str, int]:
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         select.select([router.vehicle], [], [])  # the vehicle has started
-        line = ["fly", "--link", f"udpin:127.0.0.1:{port}", "--goal", _GOAL, "--out", folder]
-        companion = subprocess.Popen(
-            [sys.executable, "-m", "mavfi_cli", *line, "--quiet", "--json"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        link = f"udpin:127.0.0.1:{port}"
+        line = ["fly", "--link", link, "--goal", _GOAL, "--out", folder, "--time-limit", "60"]
+        errors = Path(folder, "errors")
+        with errors.open("w") as file:
+            companion = subprocess.Popen(
+                [sys.executable, "-m", "mavfi_cli", *line, "--quiet"], stdout=file, stderr=file
+            )
+        until_s = time.monotonic() + _LIMIT_S
         try:
-            while companion.poll() is None:
-                router.turn(rng)
+            while companion.poll() is None and time.monotonic() < until_s:
+                router.turn()
+            hung = companion.poll() is None
         finally:
             for process in (companion, vehicle):
                 process.terminate()
-            errors = companion.communicate()[1]
-            vehicle.wait()
+                process.wait()
             router.close()
-        if companion.returncode != 0:
-            raise RuntimeError(errors)
-        (run,) = Path(folder).iterdir()
-        result = json.loads((run / "result.json").read_text())
-        return result["outcome"], result["reason"], heard(run / "flight.tlog", set(frames))
+        text = errors.read_text()
+        if hung or companion.returncode != 0 or "Traceback" in text:
+            raise RuntimeError(f"{kind}: {'the companion hung ' * hung}{text}")
+        (record,) = Path(folder).glob("*/result.json")
+        result, run = json.loads(record.read_text()), record.parent
+        return result["outcome"], result["reason"], heard(run / "flight.tlog", router.sent)
 
 
 def main() -> None:
@@ -171,17 +217,18 @@ def main() -> None:
     parser.add_argument("--own", type=int, default=0, help="flights with the autopilot's own ids")
     parser.add_argument("--rate", type=float, default=4000.0, help="frames a second")
     given = parser.parse_args()
-    counts, ends, flown, wrong = Counter[str](), Counter[tuple[str, str]](), 0, 0
-    while counts["others"] < given.frames or flown < given.own:
-        kind = "own ids" if flown < given.own else "others"
-        outcome, reason, count = fly(kind, flown, given.rate)
-        flown, wrong = flown + 1, wrong + (outcome not in _ALLOWED[kind])
+    counts, ends, wrong = Counter[str](), Counter[tuple[str, str]](), 0
+    kinds = [kind for kind in _WITHOUT if kind != "others" for _ in range(given.own)]
+    while kinds or counts["others"] < given.frames:
+        kind = kinds.pop(0) if kinds else "others"
+        outcome, reason, count = fly(kind, ends.total(), given.rate)
+        wrong += outcome not in ({"success"} if kind == "others" else _FAIR)
         counts[kind] += count
         ends[kind, outcome] += 1
         print(f"{kind}: {count} frames, {outcome} {reason}", flush=True)
     for (kind, outcome), flights in sorted(ends.items()):
         print(f"{flights} flights with frames of {kind}: {outcome}")
-    print(f"{sum(counts.values())} frames heard, {dict(counts)}")
+    print(f"{counts.total()} frames heard, {dict(counts)}")
     sys.exit(1 if wrong else 0)
 
 

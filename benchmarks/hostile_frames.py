@@ -48,7 +48,7 @@ def hostile_frame(rng: random.Random) -> bytes:
     kind = rng.randrange(3)
     if kind == 0:
         return rng.choice((b"", b"\xfd", b"\xfe")) + rng.randbytes(rng.randrange(1, 60))
-    frame = _valid_frame(rng)
+    frame = valid_frame(rng)
     if kind == 1:
         mutated = bytearray(frame)
         for _ in range(rng.randrange(1, 5)):
@@ -57,7 +57,8 @@ def hostile_frame(rng: random.Random) -> bytes:
     return frame
 
 
-def _valid_frame(rng: random.Random) -> bytes:
+def valid_frame(rng: random.Random) -> bytes:
+    """Return a frame of any message, with any contents and a right checksum."""
     names = [cls.msgname for cls in dialect.mavlink_map.values()]
     name = rng.choice(_LIKELY) if rng.random() < 0.5 else rng.choice(names)
     cls = next(cls for cls in dialect.mavlink_map.values() if cls.msgname == name)
@@ -159,8 +160,8 @@ class Observer:
         """Return what a command could change: the parameters' hash, the home and the mode."""
         asked = dialect.MAVLink_param_request_read_message(1, 1, b"_HASH_CHECK", -1)
         value = self.ask("PARAM_VALUE", asked)
-        home = self.ask("HOME_POSITION", _request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
-        beat = self.ask("HEARTBEAT", _request(dialect.MAVLINK_MSG_ID_HEARTBEAT))
+        home = self.ask("HOME_POSITION", message_request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
+        beat = self.ask("HEARTBEAT", message_request(dialect.MAVLINK_MSG_ID_HEARTBEAT))
         bits = struct.pack("<f", value.param_value)
         return bits, home.latitude, home.longitude, home.altitude, beat.custom_mode
 
@@ -169,9 +170,10 @@ class Observer:
         self._socket.close()
 
 
-def _request(number: int) -> Any:
-    request = dialect.MAV_CMD_REQUEST_MESSAGE
-    return dialect.MAVLink_command_long_message(1, 1, request, 0, number, 0, 0, 0, 0, 0, 0)
+def message_request(number: int) -> Any:
+    """Return a COMMAND_LONG that requests a message by its id."""
+    command = dialect.MAV_CMD_REQUEST_MESSAGE
+    return dialect.MAVLink_command_long_message(1, 1, command, 0, number, 0, 0, 0, 0, 0, 0)
 
 
 def free_port(kind: socket.SocketKind) -> int:
@@ -303,7 +305,7 @@ def flood(frames: int, *, signed: bool, seed: int = 1) -> Report:
     rng = random.Random(seed)
     with running_server(signed=signed) as server:
         observer = Observer(server.tcp, signed=signed)
-        observer.ask("HOME_POSITION", _request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
+        observer.ask("HOME_POSITION", message_request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
         before = observer.state()
         attack = _Flood(server)
         start_s, simulated_s = time.monotonic(), observer.simulated_s

@@ -1,9 +1,9 @@
-"""The peers at several endpoints: who is heard and told, in which order, and for how long.
+"""The peers at several endpoints: receives from and sends to them in turn, in bounded time.
 
 A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
-their number and what waits for them. A sender's address may be false, and everything that is sent
-then hits whoever has it. So a UDP peer is told everything only for a short while after each of its
-valid frames, then less and less, and is forgotten after 30 s.
+the number of peers and of their waiting bytes. The source address of a datagram may be false, and
+replies then reach somebody who did not ask. So a UDP peer gets all messages only for a short time
+after each of its valid frames, then fewer and fewer, and is forgotten after 30 s.
 """
 
 from __future__ import annotations
@@ -21,20 +21,23 @@ from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
 from mavfi_cli.link.transport import Listener, Transport, open_listener
 
 _SILENCE_S = 30.0
-# Time after a valid frame for which a UDP peer is told everything: after its first one, and later.
-_NEWCOMER_S, _LISTENER_S = 0.2, 3.0
+# Time for which a UDP peer gets all messages, after its first valid frame and after later ones.
+_AFTER_FIRST_S, _AFTER_LATER_S = 0.2, 3.0
 
 
 class Peer(ABC):
     """Somebody at the other end of a transport.
 
-    `Peers` keeps its scheme, when it was last heard and told, and for how long after it was heard
-    it is told everything.
+    Attributes:
+        scheme: Scheme of its endpoint's URL.
+        last_received_s: Time of its newest valid frame. `Peers` sets this and the following ones.
+        last_sent_s: Time at which it was last sent something.
+        full_rate_s: Time after a valid frame for which it gets all messages.
     """
 
     scheme = ""
-    heard_s = told_s = 0.0
-    listens_s = _NEWCOMER_S
+    last_received_s = last_sent_s = 0.0
+    full_rate_s = _AFTER_FIRST_S
 
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
@@ -63,7 +66,7 @@ class Peers(Generic[P]):
     """All peers of all open endpoints.
 
     Args:
-        signing: Vouches for unknown senders; None: everybody with a valid frame is welcome.
+        signing: Verifies the first frame of a sender; None accepts any valid frame.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class Peers(Generic[P]):
         self._signing, self._allow_unsigned, self._clock = signing, allow_unsigned, clock
         self._endpoints: list[tuple[str, Listener, Callable[[Transport], P]]] = []
         self._peers: list[P] = []
-        self._turns = self._told = 0
+        self._receive_turn = self._send_turn = 0  # index of the peer that was last
         self.over = False  # True once an inherited connection has closed
         self.lost: LinkLost | None = None  # of the only peer of an endpoint that calls
 
@@ -101,7 +104,7 @@ class Peers(Generic[P]):
         self._endpoints.append((parse_endpoint(url).scheme, listener, make))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until somebody says something, or until the time is over."""
+        """Wait until bytes or a connection arrive, or until the time is over."""
         poller = select.poll()
         descriptors = {listener.fileno() for _, listener, _ in self._endpoints}
         for descriptor in descriptors | {peer.transport.fileno() for peer in self._peers}:
@@ -110,38 +113,36 @@ class Peers(Generic[P]):
         poller.poll(timeout_s * 1e3)
 
     def serve(self, until_s: float) -> None:
-        """Welcome new peers, and handle the bytes of all by turns until the time is over."""
-        self._welcome()
-        quiet = 0
-        while quiet < len(self._peers) and self._clock() < until_s:
-            self._turns = (self._turns + 1) % len(self._peers)
-            quiet = 0 if self._hear(self._peers[self._turns]) else quiet + 1
+        """Accept new peers, and handle the bytes of all in turn until the time is over."""
+        self._accept()
+        idle = 0
+        while idle < len(self._peers) and self._clock() < until_s:
+            self._receive_turn = (self._receive_turn + 1) % len(self._peers)
+            idle = 0 if self._receive(self._peers[self._receive_turn]) else idle + 1
         since_s = self._clock() - _SILENCE_S
         for peer in self:
-            if peer.scheme == "udpin" and peer.heard_s < since_s:
+            if peer.scheme == "udpin" and peer.last_received_s < since_s:
                 self._remove(peer)
 
-    def each(self, action: Callable[[P], object]) -> None:
+    def for_all(self, action: Callable[[P], object]) -> None:
         """Call a function with every peer, and remove those whose connection is lost."""
         for peer in self:
-            self._try(peer, action)
+            self._call(action, peer)
 
-    def tell(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
-        """Call a function that sends with every peer by turns, except for a silent UDP peer.
+    def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
+        """Call a function that sends with every peer in turn, except for a silent UDP peer.
 
-        The intervals at which a silent one is told double. Once the time is over, the others have
-        to wait for the next call, in which they are the first. The function returns False if there
-        was nothing to send.
+        A silent peer is sent to at intervals that double. Once the time is over, the remaining
+        peers wait for the next call, which begins with them. The function returns False if it had
+        nothing to send.
         """
         for _ in range(len(self._peers)):
             if not self._peers:
                 break
-            self._told = (self._told + 1) % len(self._peers)
-            peer, now_s = self._peers[self._told], self._clock()
-            silent_s, untold_s = now_s - peer.heard_s, now_s - peer.told_s
-            is_due = peer.scheme != "udpin" or silent_s <= max(peer.listens_s, 2.0 * untold_s)
-            if is_due and self._try(peer, action) is not False:
-                peer.told_s = now_s
+            self._send_turn = (self._send_turn + 1) % len(self._peers)
+            peer, now_s = self._peers[self._send_turn], self._clock()
+            if _is_due(peer, now_s) and self._call(action, peer) is not False:
+                peer.last_sent_s = now_s
             if self._clock() >= until_s:
                 break
 
@@ -152,34 +153,42 @@ class Peers(Generic[P]):
         for _, listener, _ in self._endpoints:
             listener.close()
 
-    def _welcome(self) -> None:
+    def _accept(self) -> None:
         for scheme, listener, make in self._endpoints:
             for transport in listener.accept_ready():
                 peer = make(transport)
-                peer.scheme, peer.heard_s = scheme, self._clock()
-                peer.told_s = peer.heard_s
+                peer.scheme = scheme
+                peer.last_received_s = peer.last_sent_s = self._clock()
                 self._peers.append(peer)
-                self._hear(peer)  # else a copy of its signed frame would be as new
-                peer.listens_s = _NEWCOMER_S
+                self._receive(peer)  # at once, else a replay of its signed frame would be as new
+                peer.full_rate_s = _AFTER_FIRST_S
 
-    def _hear(self, peer: P) -> bool:
+    def _receive(self, peer: P) -> bool:
         """Handle a few waiting bytes of a peer. Return True if there were any."""
-        data = self._try(peer, lambda peer: peer.transport.receive(0.0))
-        if data and self._try(peer, lambda peer: peer.take(data)):
-            peer.heard_s, peer.listens_s = self._clock(), _LISTENER_S
+        data = self._call(lambda peer: peer.transport.receive(0.0), peer)
+        if data and self._call(lambda peer: peer.take(data), peer):
+            peer.last_received_s, peer.full_rate_s = self._clock(), _AFTER_LATER_S
         return bool(data)
 
-    def _try(self, peer: P, action: Callable[[P], T]) -> T | None:
-        """Call a function with a peer. Remove a disconnected one, and return None."""
+    def _call(self, action: Callable[[P], T], peer: P) -> T | None:
+        """Return the function's result for a peer. Remove a disconnected peer and return None."""
         try:
             return action(peer)
         except LinkLost as error:
             self._remove(peer)
-            self.over = self.over or peer.scheme == "fd"
-            self.lost = self.lost if peer.scheme in (*LISTENING, "fd") else error
+            if peer.scheme == "fd":
+                self.over = True
+            elif peer.scheme not in LISTENING:
+                self.lost = error
             return None
 
     def _remove(self, peer: P) -> None:
         peer.close()
         if peer in self._peers:
             self._peers.remove(peer)
+
+
+def _is_due(peer: Peer, now_s: float) -> bool:
+    """Return True if a peer is no UDP peer, is not silent, or has waited for half its silence."""
+    silent_s, unsent_s = now_s - peer.last_received_s, now_s - peer.last_sent_s
+    return peer.scheme != "udpin" or silent_s <= max(peer.full_rate_s, 2.0 * unsent_s)

@@ -311,7 +311,7 @@ class _Realtime:
                 click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
             if self._simulation.autopilot.restart_asked:
                 self._simulation.restart()
-                self._clients.each(Client.rejoin)
+                self._clients.for_all(Client.rejoin)
                 self._told_collision = False
                 click.echo("restarted")
 
@@ -335,12 +335,12 @@ class _Realtime:
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
         now_s = time.monotonic()
         time_s = max(self._pace.remaining_s(), share_s)
-        self._clients.tell(send, now_s + 0.5 * time_s)
+        self._clients.send_in_turn(send, now_s + 0.5 * time_s)
         while True:
             self._clients.wait(max(self._pace.remaining_s(), 0.0))
             self._clients.serve(now_s + time_s)
             self._forward(now_s + time_s)
-            self._clients.tell(Client.send_answers, now_s + time_s)
+            self._clients.send_in_turn(Client.send_answers, now_s + time_s)
             if self._pace.remaining_s() <= 0.0 or stopped() or self._clients.over:
                 break
 
@@ -348,7 +348,9 @@ class _Realtime:
         for speaker in self._clients:
             while speaker.overheard and time.monotonic() < until_s:
                 frame = speaker.overheard.popleft()
-                self._clients.tell(partial(Client.forward, frame=frame, of=speaker), until_s)
+                self._clients.send_in_turn(
+                    partial(Client.forward, frame=frame, of=speaker), until_s
+                )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

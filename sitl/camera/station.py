@@ -295,7 +295,7 @@ class Station:
         """Handle a message of a peer, and pass it on."""
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
-            self.peers.tell(partial(_Linked.forward, frame=frame, of=source))
+            self.peers.send_in_turn(partial(_Linked.forward, frame=frame, of=source))
 
     def _is_of_holder(self, message: Any, source: _Linked) -> bool:
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
@@ -434,7 +434,7 @@ class Station:
     def _send(self, messages: Sequence[Any]) -> None:
         self.frames_sent += sum(m.get_type() == "CAMERA_IMAGE_CAPTURED" for m in messages)
         if data := b"".join(self._codec.encode(message) for message in messages):
-            self.peers.tell(lambda peer: peer.transport.send(data))
+            self.peers.send_in_turn(lambda peer: peer.transport.send(data))
 
     def close(self) -> None:
         """Close every link."""

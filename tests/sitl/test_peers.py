@@ -85,52 +85,52 @@ def test_peers_are_heard_by_turns_and_no_longer_than_the_budget(scene):
     assert 9 <= len(order) <= 11
 
 
-def tell_for(peers, now, duration_s, told):
-    """Tell everybody at 50 Hz from now on; the times at which each was told."""
+def send_for(peers, now, duration_s, times):
+    """Send to all at 50 Hz from now on; adds the times at which each peer was sent to."""
     begun_s = now[0]
     for tick in range(round(duration_s * 50)):
         now[0] = begun_s + tick / 50
         peers.serve(now[0])
-        peers.tell(lambda peer: told.setdefault(peer, []).append(now[0]))
+        peers.send_in_turn(lambda peer: times.setdefault(peer, []).append(now[0]))
 
 
-def test_a_sender_whose_address_may_be_false_is_told_little(scene):
+def test_a_sender_whose_address_may_be_false_is_sent_little(scene):
     peers, call, now = scene
     say(call())
     peers.serve(1.0)
-    told = {}
-    tell_for(peers, now, 40.0, told)
-    ((newcomer, times),) = told.items()
+    sent = {}
+    send_for(peers, now, 40.0, sent)
+    ((newcomer, times),) = sent.items()
     later = [time_s for time_s in times if time_s > 0.21]
     assert len(times) - len(later) == 11
     assert later == pytest.approx([0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6], abs=0.5)
     assert newcomer not in list(peers)
 
 
-def test_a_peer_that_goes_on_speaking_is_told_everything(scene):
+def test_a_peer_that_goes_on_speaking_is_sent_everything(scene):
     peers, call, now = scene
-    talker, told = call(), {}
+    talker, sent = call(), {}
     for _ in range(6):
         say(talker)
         peers.serve(now[0] + 1.0)
-        tell_for(peers, now, 3.0, told)
-    (times,) = told.values()
+        send_for(peers, now, 3.0, sent)
+    (times,) = sent.values()
     assert len(times) > 5 * 150
 
 
-def test_peers_are_told_by_turns_and_no_longer_than_the_budget(scene):
+def test_peers_are_sent_to_in_turn_and_no_longer_than_the_budget(scene):
     peers, call, now = scene
     for _ in range(5):
         say(call())
     peers.serve(1.0)
     order = []
 
-    def telling(peer):
+    def sending(peer):
         order.append(peer)
         now[0] += 0.01
 
     for _ in range(5):
-        peers.tell(telling, now[0] + 0.015)
+        peers.send_in_turn(sending, now[0] + 0.015)
     assert len(order) == 10
     assert {order.count(peer) for peer in peers} == {2}
 
@@ -140,10 +140,10 @@ def test_a_turn_in_which_there_was_nothing_to_send_is_none(scene):
     say(call())
     peers.serve(1.0)
     now[0] = 10.0
-    asked = []
+    calls = []
     for _ in range(3):
-        peers.tell(lambda peer: asked.append(peer) or False)
-    assert len(asked) == 3
+        peers.send_in_turn(lambda peer: calls.append(peer) or False)
+    assert len(calls) == 3
 
 
 def test_an_endpoint_bounds_its_peers(scene):
@@ -155,7 +155,7 @@ def test_an_endpoint_bounds_its_peers(scene):
 
 
 @pytest.mark.parametrize("scheme", ["tcpin", "tcp"])
-def test_a_lost_peer_leaves_and_only_that_of_a_calling_endpoint_is_told(scheme):
+def test_a_lost_peer_leaves_and_only_that_of_a_calling_endpoint_is_reported(scheme):
     with contextlib.ExitStack() as stack:
         peers = stack.enter_context(contextlib.closing(Peers()))
         if scheme == "tcp":
