@@ -6,14 +6,16 @@
 Each flight is `mavfi fly --link` with a `mavfi sitl` behind a router, which passes all on.
 Once the vehicle is in OFFBOARD, the router adds hostile frames. So they come from the autopilot's
 own address, and nothing is signed. They have right checksums and are of every message that the
-companion handles, with NaN, infinities, extremes and zeros. `--frames` is the least number of
-frames of other systems and components, and these flights have to succeed. `--own` is the number of
-flights of each kind with the ids of the autopilot and its camera: every message, then all but those
-that end or replace a flight by design, such as a HEARTBEAT of a disarmed vehicle. Half of their
-frames are the vehicle's newest messages with a few fields changed, so that stamps and places are
-plausible. These flights may have any outcome but `crash`. Frames count if the companion has decoded
-them, which its tlog shows. The command ends with 1 after any other outcome, a traceback, a flight
-of more than 10 minutes, or another exit code of the companion.
+companion handles, with NaN, infinities, extremes and zeros.
+
+`--frames` is the least number of frames of other systems and components. These flights have to
+succeed. `--own` is the number of flights of each kind with the ids of the autopilot and its camera:
+first with every message, then without those by which an autopilot ends or steers a flight. Half of
+these frames are the vehicle's newest messages with some fields changed, a little or at will, so
+that stamps and places are plausible. These flights may have any outcome but `crash` and `hang`.
+
+Frames count if the companion has decoded them, which its tlog shows. The command ends with 1 after
+any other outcome, a traceback, a flight of more than 10 minutes, or another exit code.
 """
 
 from __future__ import annotations
@@ -70,6 +72,14 @@ def _scalar(rng: random.Random, kind: str) -> float | int:
     return rng.choice((low, high, 0, 1, rng.randint(low, high)))
 
 
+def _near(rng: random.Random, value: float, kind: str) -> float | int:
+    """Return a value near a true one, such as the stamp of the next message."""
+    if kind in ("float", "double"):
+        return value + rng.gauss(0.0, 2.0)
+    bits = int("".join(filter(str.isdigit, kind))) - (not kind.startswith("u"))
+    return max(0, min(int(value) + rng.randint(-5, 40), (1 << bits) - 1))
+
+
 def hostile_frame(rng: random.Random, cls: Any, sender: _Sender, true: Any = None) -> bytes:
     """Return a frame with any contents, or with those of a true message but for some fields."""
     lengths = dict(zip(cls.ordered_fieldnames, cls.array_lengths, strict=True))
@@ -82,6 +92,8 @@ def hostile_frame(rng: random.Random, cls: Any, sender: _Sender, true: Any = Non
             values.append(rng.choice((b"depth8:crc32=00000000", b"", rng.randbytes(lengths[name]))))
         elif lengths[name]:
             values.append([_scalar(rng, kind)] * lengths[name])
+        elif true is not None and rng.random() < 0.5:
+            values.append(_near(rng, getattr(true, name), kind))
         else:
             values.append(_scalar(rng, kind))
     return Codec(*sender).encode(cls(*values))

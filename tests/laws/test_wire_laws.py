@@ -174,10 +174,10 @@ class FlightInMemory:
             self.flight._judge()
         assert until in (None, self.flight._session.phase)
 
-    def check(self) -> None:
-        """What the companion believes has bounds; at the worst the flight ends as a failsafe."""
+    def check(self, *ends: Outcome) -> None:
+        """What the companion believes has bounds; the flight ends as a failsafe or as given."""
         heard, hfov_rad = self.flight._session.telemetry, self.flight.images.hfov_rad
-        assert self.flight.outcome in (None, Outcome.FAILSAFE), self.flight.reason
+        assert self.flight.outcome in (None, Outcome.FAILSAFE, *ends), self.flight.reason
         assert heard.state is not None
         assert np.abs(heard.state.position_enu_m).max() <= 1e4
         assert np.abs(heard.state.velocity_enu_mps).max() <= 1e3
@@ -217,6 +217,25 @@ def test_no_spoofed_frame_ends_a_flying_companion_otherwise_than_by_failsafe(
     hostile: list[bytes],
 ) -> None:
     fly_on(hostile, turns=150)
+
+
+PLACES = st.sampled_from(FLOATS) | st.floats(-300.0, 300.0, width=32)
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 30), *[PLACES] * 6), min_size=1, max_size=30))
+def test_a_companion_flies_on_with_states_that_are_newer_than_the_true_ones(
+    states: list[Any],
+) -> None:
+    """The companion believes them, and looks for the goal from wherever they are."""
+    scene, codec = FlightInMemory(flies=True), Codec(*AUTOPILOT)
+    for turn in range(150):
+        ahead_ms, *state = states[turn // 3 % len(states)]
+        stamp_ms = round(scene.autopilot.stamp_s * 1e3) + ahead_ms
+        place = dialect.MAVLink_local_position_ned_message(stamp_ms, *state)
+        scene.hostile = [codec.encode(place)] if turn % 3 == 0 else []
+        scene.run(1)
+        scene.check(Outcome.SUCCESS, Outcome.NO_PATH)
 
 
 @cache
