@@ -10,9 +10,10 @@ companion handles, with NaN, infinities, extremes and zeros.
 
 `--frames` is the least number of frames of other systems and components. These flights have to
 succeed. `--own` is the number of flights of each kind with the ids of the autopilot and its camera:
-first with every message, then without those by which an autopilot ends or steers a flight. Half of
-these frames are the vehicle's newest messages with some fields changed, a little or at will, so
-that stamps and places are plausible. These flights may have any outcome but `crash` and `hang`.
+first with every message, then without those by which an autopilot ends or steers a flight. Up to
+half of these frames are the vehicle's newest messages with some fields changed, a little or at
+will, so that stamps and places are plausible. These flights may have any outcome but `crash` and
+`hang`.
 
 Frames count if the companion has decoded them, which its tlog shows. The command ends with 1 after
 any other outcome, a traceback, a flight of more than 10 minutes, or another exit code.
