@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from mavfi_cli.core.errors import ConfigError, MavfiError
+from mavfi_cli.core.errors import ConfigError, MavfiError, PlaceError
 
 
 class GroupedOption(click.Option):
@@ -66,6 +66,8 @@ def _blamed(error: MavfiError) -> tuple[str, str]:
     """The option or argument whose value an error is about, and the problem; both may be empty."""
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
+    if isinstance(error, PlaceError):  # names the world, whose name is right
+        return "", ""
     for name, value in given_options().items() if error.exit_code == 2 else ():
         texts = value if isinstance(value, tuple) else (value,)
         names = (

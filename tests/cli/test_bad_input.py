@@ -69,7 +69,9 @@ def test_a_name_like_no_other_gets_the_list(refused):
     ],
 )
 def test_a_place_where_nobody_can_be(refused, arguments, said):
-    assert said in refused(*arguments, code=2)
+    line = refused(*arguments, code=2)
+    assert said in line
+    assert line.startswith(("world ", "start "))  # the name of the world is not blamed
 
 
 @pytest.mark.parametrize(
