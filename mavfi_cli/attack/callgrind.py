@@ -138,8 +138,8 @@ class _Count:
 
     def _add(self, path: Path) -> None:
         self.read += 1
-        for name, found in _read_counts(path).items():
-            self.executions.setdefault(name, Counter()).update(found)
+        for name, counts in _read_counts(path).items():
+            self.executions.setdefault(name, Counter()).update(counts)
         path.unlink()
 
 
@@ -171,7 +171,7 @@ def _read_counts(path: Path) -> dict[str, Counter[int]]:
         path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
             the cost of the called function.
     """
-    found: dict[str, Counter[int]] = {}
+    counts: dict[str, Counter[int]] = {}
     current: Counter[int] = Counter()
     of_callee = False
     with path.open(encoding="utf-8", errors="replace") as lines:
@@ -184,7 +184,7 @@ def _read_counts(path: Path) -> dict[str, Counter[int]]:
             elif line.startswith("ob="):
                 name = line[3:].rstrip("\n")
                 name = name if name == UNNAMED else os.path.realpath(name)
-                current = found.setdefault(name, Counter())
+                current = counts.setdefault(name, Counter())
             elif line.startswith("calls="):
                 of_callee = True
-    return found
+    return counts

@@ -111,26 +111,26 @@ class ProgramTarget:
 
     def context(self) -> dict[str, Any]:
         """Entries of every record about the program."""
-        told: dict[str, Any] = {
+        entries: dict[str, Any] = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
             "function": self.function,
         }
         if self.command.stdin != Path(os.devnull):
-            told["stdin"] = str(self.command.stdin)
-        return told
+            entries["stdin"] = str(self.command.stdin)
+        return entries
 
     def known(self) -> dict[str, Any]:
         """Everything that its results depend on."""
-        told = self.context() | {
+        entries = self.context() | {
             "comparison": self.comparison.to_json(),
             "environment": dict(self.command.environment),
             "memory_bytes": self.command.memory_bytes,
             "folder": None if self.folder is None else str(self.folder),
         }
         if self.files:
-            told["files"] = {place: str(source) for place, source in self.files.items()}
-        return told
+            entries["files"] = {place: str(source) for place, source in self.files.items()}
+        return entries
 
     def open(self) -> _Workplace:
         """Make a scratch folder for its runs."""
