@@ -152,7 +152,7 @@ def _change(folder, section, value):
         (lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}), "damaged (it has no"),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
-        (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "damaged"),
+        (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "the trace cannot be read"),
         (lambda f: (f / "result.json").unlink(), "cut off before its end"),
         (lambda f: [path.unlink() for path in f.iterdir()], "not a run folder"),
         (shutil.rmtree, "no such run folder"),

@@ -129,12 +129,12 @@ def test_without_a_display_a_file_is_offered_before_anything_flies(
 
 
 def test_bad_input_is_one_line(short_flight, mavfi, tmp_path):
-    for line, told in (
-        ([short_flight.path, "--save", "x.png"], "ends in .rrd (rerun) or .mcap (Foxglove)"),
-        ([tmp_path / "nothing", "--save", "x.mcap"], "no such run folder"),
-        ([short_flight.path, "--save", tmp_path / "no" / "x.mcap"], "its folder does not exist"),
+    for line, code, told in (
+        ([short_flight.path, "--save", "x.png"], 2, "name a file that ends in .rrd or .mcap"),
+        ([tmp_path / "nothing", "--save", "x.mcap"], 1, "no such run folder"),
+        ([short_flight.path, "--save", tmp_path / "no" / "x.mcap"], 2, "its folder does not exist"),
     ):
         done = mavfi("view", *line)
-        assert done.returncode == 1
+        assert done.returncode == code
         assert told in done.stderr
         assert done.stderr.startswith("error: ")  # before anything is flown

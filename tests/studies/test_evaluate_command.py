@@ -13,7 +13,7 @@ def refused(mavfi, tmp_path, *arguments):
     """The line that an evaluation ends with before anything is flown."""
     done = mavfi("detect", "evaluate", *arguments, "--out", tmp_path / "out", "--quiet")
     (line,) = done.stderr.splitlines()
-    code = 2 if re.match("error: unknown ", line) else 1
+    code = 2 if re.match("error: --[a-z]+: unknown ", line) else 1
     assert (done.returncode, done.stdout) == (code, "")
     assert not (tmp_path / "out").exists()
     return line

@@ -254,7 +254,9 @@ def test_inputs_of_something_else_are_refused(tmp_path):
 def test_the_command_line_refuses_what_makes_no_sense(mavfi):
     asked = mavfi("kernels", "--kernel", "contrl", "--runs", "1")
     assert asked.returncode == 2
-    assert asked.stderr.startswith("error: unknown kernel 'contrl'; did you mean 'control'?")
+    assert asked.stderr.startswith(
+        "error: --kernel: unknown kernel 'contrl'; did you mean 'control'?"
+    )
     assert mavfi("kernels", "--args", "5").returncode == 2
     assert mavfi("kernels", "--program", "/bin/true", "--kernel", "rrt").returncode == 2
     for option in (["--json"], ["--seed", "1"], ["--jobs", "2"]):
