@@ -144,7 +144,7 @@ def test_the_firmware_of_a_record_flies_only_if_the_user_names_it(hostile, comma
     (hostile / LEDGER).unlink()  # else it is a campaign, whose missions `replay` asks for
     code, _, err = command_line("replay", hostile)
     script = hostile.parent / "firmware"
-    assert code == 1
+    assert code == 2
     assert f"names the program {script}, which would be executed" in err
     code, _, err = command_line("replay", hostile, "--firmware", script)
     assert (hostile.parent / "struck").exists()
