@@ -19,7 +19,7 @@ import itertools
 
 from exported import Key, Row, against, arguments, flown, key, lost, share
 
-from mavfi_cli.paper.flights import LONGER
+from mavfi_cli.analysis.pairs import LONGER
 
 MISSION = ("world", "world_seed", "seed", "platform")
 FAULT = ("fault_target", "fault_field", "fault_seed")

@@ -16,7 +16,7 @@ from collections.abc import Iterable
 
 from exported import Row, arguments, flown, key, lost, share
 
-from mavfi_cli.paper.flights import LONGER
+from mavfi_cli.analysis.pairs import LONGER
 
 PAIRED = ("world", "world_seed", "seed", "stack", "platform")
 

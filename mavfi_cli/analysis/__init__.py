@@ -1,6 +1,7 @@
 """Turn the ledger of a campaign into one table, and evaluate it.
 
-flights      the table, one row per flight; its export to a file; pairs of its rows; one mission
+flights      the table, one row per flight; its export to a file; one mission
+pairs        flights beside their golden flights and their flights without detector; harm
 summary      flights by setting; results of a campaign
 failures     faults that fail missions, across the layers; the summary of attacked kernels
 overhead     cost of detection and recovery

@@ -2,7 +2,6 @@
 
 items     the tables and figures, their missions, the form of their tables, the paper's numbers
 flying    flies the missions and runs the isolated kernels
-flights   flown missions as one table, each beside the flights that it is compared with
 layouts   the rows of each item's table, from flights
 figures   the figure of each item
 status    what a campaign shows of the paper, and its state

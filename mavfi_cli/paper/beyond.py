@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
 

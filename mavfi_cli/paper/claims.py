@@ -19,10 +19,10 @@ import numpy as np
 
 from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.pairs import EVERY_STAGE, STAGES, Flights
 from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.paper.flights import EVERY_STAGE, STAGES, Flights
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import (
     ClaimVerdict,

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavfi_cli.analysis.pairs import LONGER, Flights
 from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.paper.beyond import (
@@ -21,7 +22,6 @@ from mavfi_cli.paper.beyond import (
 )
 from mavfi_cli.paper.claims import CLAIMS, ISOLATED
 from mavfi_cli.paper.figures import OVER_GOLDEN, draw, panel
-from mavfi_cli.paper.flights import LONGER, Flights
 from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
 from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mavfi_cli.analysis.pairs import PERCENT, STAGES, Flights
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.paper.flights import PERCENT, STAGES, Flights
 from mavfi_cli.paper.items import printed
 from mavfi_cli.paper.layouts import KERNELS_FLOWN, PROTECTED, values_and_deltas
 from mavfi_cli.report.paper import (

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mavfi_cli.analysis.pairs import EVERY_STAGE, PERCENT, STAGES, Flights
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
-from mavfi_cli.paper.flights import EVERY_STAGE, PERCENT, STAGES, Flights
 from mavfi_cli.paper.items import BY_NAME, printed
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable, Printed
 from mavfi_cli.stats.paired import OWN, worst_case

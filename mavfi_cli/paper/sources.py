@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary
 from mavfi_cli.analysis.flights import flights, provenance, read_export
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import ResultState
@@ -20,7 +21,6 @@ from mavfi_cli.campaigns.specification_file import PRESETS, load_spec
 from mavfi_cli.core.errors import MavfiError, RecordError, lack_of
 from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions, version_differences
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import FlightsPlan
 from mavfi_cli.paper.status import of_kernels
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from mavfi_cli.analysis.failures import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import PRESETS
 from mavfi_cli.core.errors import RecordError, UnknownName
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import (
     BY_NAME,
     ITEMS,

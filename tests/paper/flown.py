@@ -4,8 +4,8 @@ from dataclasses import asdict
 
 import pyarrow as pa
 
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig

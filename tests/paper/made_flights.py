@@ -4,7 +4,7 @@ import json
 
 import pyarrow as pa
 
-from mavfi_cli.paper.flights import Flights
+from mavfi_cli.analysis.pairs import Flights
 
 _KINDS = {
     "number": pa.int64(), "pair": pa.string(), "world": pa.string(), "planner": pa.string(),

@@ -8,9 +8,9 @@ import pytest
 from flown import flights, row
 
 from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.pairs import WORLDS
 from mavfi_cli.paper import claims, items
 from mavfi_cli.paper.claims import CLAIMS
-from mavfi_cli.paper.flights import WORLDS
 from mavfi_cli.paper.items import BY_NAME, printed
 from mavfi_cli.stats.paired import ClaimVerdict
 from mavfi_cli.stats.shares import wilson

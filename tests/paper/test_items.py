@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from flown import table
 
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import canonical, changes_of
 from mavfi_cli.paper import document
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.items import BY_NAME, FlightsPlan
 from mavfi_cli.paper.sources import CampaignSource, Evidence
 

@@ -6,8 +6,8 @@ import pytest
 from flown import row, table
 
 from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.paper.document import document
-from mavfi_cli.paper.flights import Flights
 from mavfi_cli.paper.sources import CampaignSource, Evidence
 from mavfi_cli.stats.paired import ClaimVerdict
 

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 from made_flights import flight, struck, table
 
-from mavfi_cli.paper.flights import Flights
+from mavfi_cli.analysis.pairs import Flights
 
 
 def columns(found, *names):
