@@ -47,7 +47,7 @@ _MODULES = {  # name -> module that defines it
     "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.fault",
-    "load_run": "mavfi_cli.mission.run_folder",
+    "load_run": "mavfi_cli.library",  # which shows runs in notebooks
     "paired_golden": "mavfi_cli.mission.run",
     "run_campaign": "mavfi_cli.campaigns.run",
 }

@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_folder
+from mavfi_cli.mission.run_folder import Run, load_run
+from mavfi_cli.report.summary import run_html
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
     from mavfi_cli.mission.progress import Recorder, Watcher
-    from mavfi_cli.mission.run_folder import Run
     from mavfi_cli.spec.mission import MissionConfig
+
+Run.to_html = run_html
 
 
 def fly(
@@ -51,7 +54,6 @@ def fly(
         ServedProcess.start_early(PROGRAM)
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
-    from mavfi_cli.mission.run_folder import load_run
 
     folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder)
     return load_run(folder.path)

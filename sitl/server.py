@@ -102,7 +102,7 @@ class Client(Peer):
                     self._offer_camera(message)
                 elif message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
                     self.overheard.append(bytes(message.get_msgbuf()))
-                self._simulation.autopilot.handle(message, self.link)
+                self._simulation.handle(message, self.link)
         return messages
 
     def send_tick(self) -> bool:

@@ -12,8 +12,9 @@ from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector, dot, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.core.wall import WallClock
+from sitl.autopilot import services
 from sitl.autopilot.autopilot import Autopilot
-from sitl.autopilot.telemetry import STEP_US, STEPS_A_TICK, TICK_US
+from sitl.autopilot.telemetry import STEP_US, STEPS_A_TICK, TICK_US, Link
 from sitl.camera.component import Camera
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.referee import Referee
@@ -91,6 +92,11 @@ class Simulation:
         assert isinstance(before, Autopilot)
         assert isinstance(self.autopilot, Autopilot)
         self.autopilot.parameters.restore(before.parameters)
+
+    def handle(self, message: Any, link: Link) -> None:
+        """Give the autopilot a message of a client."""
+        assert isinstance(self.autopilot, Autopilot)
+        services.handle(self.autopilot, message, link)
 
     def advance(self, between: Callable[[int], None] | None = None) -> None:
         """Fly one control tick with the autopilot's command, then judge the result.

@@ -19,7 +19,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from mavfi_cli.attack.target import Golden, JudgedPlace, RunOutcome, RunVerdict
+from mavfi_cli.attack.place import Golden
+from mavfi_cli.attack.target import JudgedPlace, RunOutcome, RunVerdict
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.counted import CountedStop

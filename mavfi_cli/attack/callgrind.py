@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mavfi_cli.attack.target import Golden
+from mavfi_cli.attack.place import Golden
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.fi.tracer.spawn import Program

@@ -30,8 +30,9 @@ import numpy as np
 from mavfi_cli.attack.attacker import Attacker, RunResult, Task, golden_run
 from mavfi_cli.attack.journal import Journal, read_plan, read_runs
 from mavfi_cli.attack.null_runs import NullRuns, Profiles, Run, make_null_runs, require_golden_again
+from mavfi_cli.attack.place import Golden, Watch
 from mavfi_cli.attack.profile import TargetProfile, started
-from mavfi_cli.attack.target import AttackTarget, Golden, JudgedPlace, Watch, places_of
+from mavfi_cli.attack.target import AttackTarget, JudgedPlace, places_of
 from mavfi_cli.core.errors import (
     BuildMismatch,
     ConfigError,

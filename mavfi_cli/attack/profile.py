@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.attack.callgrind import UNNAMED, Executions
-from mavfi_cli.attack.target import AttackPlace, Watch
+from mavfi_cli.attack.place import AttackPlace, Watch
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Counting, Detour

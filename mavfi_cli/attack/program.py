@@ -21,6 +21,7 @@ import numpy as np
 from mavfi_cli.attack.attacker import run_out
 from mavfi_cli.attack.callgrind import Executions, count_executions, find_valgrind
 from mavfi_cli.attack.comparison import LARGEST_BYTES, STDOUT, OutputComparison
+from mavfi_cli.attack.place import Golden, Watch, digest
 from mavfi_cli.attack.profile import (
     TargetProfile,
     function_of,
@@ -29,15 +30,7 @@ from mavfi_cli.attack.profile import (
     profile_counted,
     profile_run,
 )
-from mavfi_cli.attack.target import (
-    Golden,
-    RunLimits,
-    RunVerdict,
-    Watch,
-    digest,
-    judged,
-    signal_name,
-)
+from mavfi_cli.attack.target import RunLimits, RunVerdict, judged, signal_name
 from mavfi_cli.attack.work_folder import WorkFolder
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.files import ScratchFolder

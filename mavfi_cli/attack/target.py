@@ -6,24 +6,18 @@ where it runs repeatedly from the same memory. Any class with these methods can 
 
 from __future__ import annotations
 
-import hashlib
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from mavfi_cli.attack.comparison import Difference
-from mavfi_cli.fi.tracer.image import Image, Scope
-from mavfi_cli.fi.tracer.tracee import Ended, Tracee
-
-if TYPE_CHECKING:
-    from mavfi_cli.attack.profile import TargetProfile
-
-# Called with the instructions stepped since the last call, or with what goes on, in words.
-Watch = Callable[[int | str], None]
+from mavfi_cli.attack.place import AttackPlace, Golden, Watch
+from mavfi_cli.attack.profile import TargetProfile
+from mavfi_cli.fi.tracer.tracee import Ended
 
 
 class RunOutcome(Enum):
@@ -54,22 +48,6 @@ class RunLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Golden:
-    """The golden run."""
-
-    output: bytes
-    cpu_s: float
-    wall_s: float
-    exit_code: int = 0
-    notices: tuple[str, ...] = ()  # what the user should know about it
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the output."""
-        return digest(self.output)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RunVerdict:
     """The judgement of a run from its end and its output.
 
@@ -82,30 +60,6 @@ class RunVerdict:
     outcome: RunOutcome
     output_sha256: str
     details: Mapping[str, Any] = field(default_factory=dict)
-
-
-class AttackPlace(Protocol):
-    """A place where a target runs repeatedly from the same start."""
-
-    @property
-    def name(self) -> str:
-        """Name of the target."""
-
-    @property
-    def kind(self) -> str:
-        """Kind of the target for messages: kernel, node or program."""
-
-    def start(self) -> Tracee:
-        """Start a run, stopped before anything that can be hit."""
-
-    def image(self, tracee: Tracee) -> Image:
-        """The memory image of a run."""
-
-    def scope(self, image: Image) -> Scope:
-        """The code that may be hit."""
-
-    def close(self) -> None:
-        """End all processes and remove all temporary files."""
 
 
 class JudgedPlace(AttackPlace, Protocol):
@@ -185,11 +139,6 @@ def judged(
     difference = compare(golden.output, output)
     near = difference is not None and tolerance is not None and difference.relative <= tolerance
     return RunOutcome.BENIGN if near and same_end else RunOutcome.SDC, difference
-
-
-def digest(output: bytes) -> str:
-    """SHA-256 of an output."""
-    return hashlib.sha256(output).hexdigest()
 
 
 def signal_name(number: int) -> str:

@@ -211,7 +211,7 @@ def fly(
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
-    from mavfi_cli.report.view import ViewedFlight
+    from mavfi_cli.report.view.entries import ViewedFlight
 
     mission = _mission_of(config)
     recorder = Recorder() if record else None

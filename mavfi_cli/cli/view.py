@@ -34,7 +34,7 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
     """
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report import view as viewers
-    from mavfi_cli.report.view import ViewedFlight
+    from mavfi_cli.report.view.entries import ViewedFlight
 
     if as_json and save is None:
         raise click.UsageError("--json needs --save FILE")

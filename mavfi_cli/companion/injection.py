@@ -43,6 +43,9 @@ class NoInjection:
     def __init__(self) -> None:
         self.injector = NoInjector()
 
+    def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
+        """Draw what depends on the way to the goal and on the detector."""
+
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
 
@@ -79,18 +82,11 @@ class SourceInjection(NoInjection):
     """Injection of one source-level fault, and its record on disk.
 
     The record is written before the flight, at the first strike and at the end.
-
-    Args:
-        shortest_flight_s: Interval from which a random trigger is drawn, s.
-        protection: Protection whose detector the fault may corrupt.
-
-    Raises:
-        FaultSpecError: A fault in the detector needs one.
     """
 
-    def __init__(
-        self, config: FaultConfig, shortest_flight_s: float, protection: NoProtection
-    ) -> None:
+    injector: Injector
+
+    def __init__(self, config: FaultConfig) -> None:
         super().__init__()
         self._config = config
         self._path: Path | None = None
@@ -99,7 +95,18 @@ class SourceInjection(NoInjection):
         self._executor: Executor | None = None
         self.in_queue = config.strikes_queue
         self._reader = ""  # who reads at once what is corrupted; empty: the follower finds out
-        self.injector: Injector
+
+    def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
+        """Draw the fault.
+
+        Args:
+            shortest_flight_s: Interval from which a random trigger is drawn, s.
+            protection: Protection whose detector the fault may corrupt.
+
+        Raises:
+            FaultSpecError: A fault in the detector needs one.
+        """
+        config = self._config
         common: Any = {
             "seed": config.seed,
             "shortest_flight_s": shortest_flight_s,

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
-from mavfi_cli.companion.injection import NoInjection, SourceInjection
+from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import (
@@ -194,18 +194,19 @@ class Flight:
         self._briefing = briefing
         if config.detector is not None:
             protection = Protection(config.detector, config.stack, self.wall)
-        if config.fault is not None:
-            takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, config.takeoff_height_m))
-            way_m = norm(briefing.goal_enu_m - takeoff)
-            way_m = max(0.0, way_m - self.stack.goal_tolerance_m)
-            turn_s = TURN_S if self.stack.turns_before_departure else 0.0
-            shortest_s = way_m / config.v_max_mps + turn_s  # no flight takes less
-            self.injection = SourceInjection(config.fault, shortest_s, protection)
+        self.injection.aim(self._shortest_flight_s(briefing), protection)
         self.companion = Companion(config, briefing, self.wall, self.injection, protection)
         if recorder is not None:
             recorder.briefing = briefing
             self.companion.executor.on_start = recorder.on_start
         return self.companion
+
+    def _shortest_flight_s(self, briefing: Briefing) -> float:
+        """Return a time that no flight from the take-over to the goal undercuts, s."""
+        takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
+        way_m = norm(briefing.goal_enu_m - takeoff) - self.stack.goal_tolerance_m
+        turn_s = TURN_S if self.stack.turns_before_departure else 0.0
+        return max(0.0, way_m) / self._config.v_max_mps + turn_s
 
     @contextlib.contextmanager
     def isolated_nodes(self) -> Iterator[None]:

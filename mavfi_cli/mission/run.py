@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.autonomy import planners, warm
-from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.pipeline import Companion
 from mavfi_cli.companion.protection import Protection
 from mavfi_cli.core.compiled import processor_level
@@ -77,11 +77,7 @@ def fly_mission(
     load_platform(config.platform), planners.find(config.planner)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
-    injection = NoInjection()
-    if config.instruction is not None:
-        from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the tracer
-
-        injection = InstructionInjection(config, profiles or out / CACHE, repeat, for_debugger)
+    injection = _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
     with (
         contextlib.closing(injection),
         interruptible() as interrupt,
@@ -105,6 +101,24 @@ def fly_mission(
         }
         _write(config, flight, companion, folder, host, vehicle, crash)
     return folder
+
+
+def _plan_injection(
+    config: MissionConfig,
+    profiles: Path,
+    repeat: Mapping[str, Any] | None,
+    for_debugger: Callable[[int], None] | None,
+) -> NoInjection:
+    """Plan the fault of a mission. Arguments as for `fly_mission`."""
+    if config.fault is not None:
+        return SourceInjection(config.fault)
+    if config.instruction is None:
+        return NoInjection()
+    from mavfi_cli.mission.instruction.injection import InstructionInjection  # loads the tracer
+
+    if repeat is not None:
+        return InstructionInjection.of_record(repeat, for_debugger)
+    return InstructionInjection.plan(config, profiles, fly_golden, for_debugger)
 
 
 def _warm_up(config: MissionConfig, watcher: Watcher) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -292,8 +292,13 @@ class _Parting:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run read from its folder."""
+    """A run read from its folder.
 
+    Attributes:
+        to_html: Returns summary and picture of a run; `mavfi_cli.library` sets it.
+    """
+
+    to_html: ClassVar[Callable[[Run], str] | None] = None
     folder: RunFolder
     result: dict[str, Any]
     trace: pa.Table | None
@@ -301,11 +306,9 @@ class Run:
     def __repr__(self) -> str:
         return f"Run({str(self.folder.path)!r}, outcome={self.record.outcome!r})"
 
-    def _repr_html_(self) -> str:
-        """Return the summary and the picture, which a notebook shows."""
-        from mavfi_cli.report.summary import run_html
-
-        return run_html(self)
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows; None as long as the library is not loaded."""
+        return None if Run.to_html is None else Run.to_html(self)
 
     @property
     def record(self) -> FlightRecord:

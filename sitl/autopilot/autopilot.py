@@ -1,4 +1,4 @@
-"""The autopilot: dispatches messages, runs the active mode, collects telemetry; who commands it."""
+"""The autopilot: runs the active mode and collects telemetry; who commands it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect, text_messages
-from sitl.autopilot import services
 from sitl.autopilot.commander import GPS_FIX_US, Commander, FlightMode, Result, Severity
 from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
@@ -28,8 +27,9 @@ class Autopilot(Links):
     """A PX4-like autopilot without sockets or clock.
 
     At each stamp, call `observe` with the vehicle's state, `collect` for the messages of each link,
-    `handle` for each received message, then `fly`. `setpoint` (11,) and `motors_on` hold until the
-    next stamp. `restart_asked` is True once a client has asked for a reboot; the owner restarts.
+    `services.handle` for each received message, then `fly`. `setpoint` (11,) and `motors_on` hold
+    until the next stamp. `restart_asked` is True once a client has asked for a reboot; the owner
+    restarts.
 
     Args:
         truth: Vehicle state before the first `observe`.
@@ -75,18 +75,6 @@ class Autopilot(Links):
         return messages
 
     # Requests of clients.
-
-    def handle(self, message: Any, link: Link) -> None:
-        """Handle a message of a client. Messages for other systems are ignored."""
-        number = message.get_msgId()
-        if not self.authority.may_command(message, link):
-            if self._is_for_me(message):
-                services.refuse(self, message, link)
-        elif number in services.ANY_TARGET:
-            services.ANY_TARGET[number](self, message, link)
-        elif number in services.ADDRESSED and self._is_for_me(message):
-            services.ADDRESSED[number](self, message, link)
-        self._flush_texts()
 
     def enter_mode(self, mode: FlightMode | None) -> Result:
         """Change the mode on a user's request. Entering the present mode restarts it."""
@@ -142,7 +130,7 @@ class Autopilot(Links):
         now.consumed_mah += max(truth.battery_current_a, 0.0) * now.elapsed_s / 3.6
         wants_up = self.motors_on and climbs(self.setpoint, truth)
         self.commander.update(stamp_us, truth, wants_up=wants_up)
-        self._flush_texts()
+        self.flush_texts()
 
     @property
     def may_touch_ground(self) -> bool:
@@ -167,7 +155,7 @@ class Autopilot(Links):
         lifts_off = self.snapshot.spooled_up and climbs(out, truth)
         flies = not commander.landed or lifts_off
         self._command(out, motors_on=flies and not commander.terminated)
-        self._flush_texts()
+        self.flush_texts()
 
     def _command(self, setpoint: Setpoint, *, motors_on: bool) -> None:
         self.setpoint = self.snapshot.setpoint = setpoint
@@ -191,7 +179,8 @@ class Autopilot(Links):
         text = f"RTL: start return at {amsl:.0f} m ({height_m:.0f} m above destination)"
         self.commander.say(Severity.INFO, text)
 
-    def _flush_texts(self) -> None:
+    def flush_texts(self) -> None:
+        """Broadcast the commander's new texts."""
         texts = self.commander.texts
         if not texts:
             return
@@ -203,12 +192,6 @@ class Autopilot(Links):
             data = text.encode("ascii", "replace") + b"\t"
             for message in text_messages(severity, data, self._text_id):
                 self.broadcast(message)
-
-    def _is_for_me(self, message: Any) -> bool:
-        systems = (self.system_id, 0)
-        if not hasattr(message, "target_component"):  # SET_MODE, MANUAL_CONTROL
-            return getattr(message, "target_system", None) == self.system_id
-        return message.target_system in systems and message.target_component in (COMPONENT, 0)
 
 
 # Who commands -------------------------------------------------------------------------------------

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mavfi_cli.link.codec import dialect
+from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.commander import GPS_FIX_US, FlightMode, Result, Severity
 from sitl.autopilot.parameters import HASH_NAME
 from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, Link, Setpoint, int32, no_setpoint
 from sitl.geodesy import Origin
-
-if TYPE_CHECKING:
-    from sitl.autopilot.autopilot import Autopilot
 
 _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
@@ -43,7 +41,7 @@ def _sender(message: Any) -> tuple[int, int]:
 
 # Commands: a handler takes a COMMAND_LONG or COMMAND_INT, and returns the result to acknowledge.
 
-_CommandHandler = Callable[["Autopilot", Any, Link], Result | None]
+_CommandHandler = Callable[[Autopilot, Any, Link], Result | None]
 
 
 def _execute(autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -59,7 +57,7 @@ def _acknowledge(message: Any, number: int, result: Result) -> Any:
     return dialect.MAVLink_command_ack_message(number, int(result), 0, 0, *_sender(message))
 
 
-def refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
+def _refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer a sender that may not command: commands are denied, a parameter keeps its value."""
     name = message.get_type()
     if name == "SET_MODE":
@@ -424,7 +422,7 @@ def _ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
         link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, *_sender(message)))
 
 
-_Service = Callable[["Autopilot", Any, Link], None]
+_Service = Callable[[Autopilot, Any, Link], None]
 
 ADDRESSED: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: _param_request_list,
@@ -458,3 +456,24 @@ ANY_TARGET: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
 }
 """Services by message id, for messages whatever their target is."""
+
+
+def handle(autopilot: Autopilot, message: Any, link: Link) -> None:
+    """Handle a message of a client. Messages for other systems are ignored."""
+    number = message.get_msgId()
+    is_addressed = _is_addressed(message, autopilot.system_id)
+    if not autopilot.authority.may_command(message, link):
+        if is_addressed:
+            _refuse(autopilot, message, link)
+    elif number in ANY_TARGET:
+        ANY_TARGET[number](autopilot, message, link)
+    elif number in ADDRESSED and is_addressed:
+        ADDRESSED[number](autopilot, message, link)
+    autopilot.flush_texts()
+
+
+def _is_addressed(message: Any, system: int) -> bool:
+    """Return True if a message names the autopilot of a system as its target, or all of them."""
+    if not hasattr(message, "target_component"):  # SET_MODE, MANUAL_CONTROL
+        return getattr(message, "target_system", None) == system
+    return message.target_system in (system, 0) and message.target_component in (COMPONENT, 0)

@@ -15,7 +15,7 @@ import numpy as np
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.link.transport import open_transport
-from sitl.autopilot.telemetry import TICK_US
+from sitl.autopilot.telemetry import TICK_US, Link
 from sitl.firmware.ardupilot import ArduPilotLink
 from sitl.firmware.autopilot import FirmwareAutopilot, FirmwareProcess
 from sitl.firmware.px4 import Px4Link
@@ -109,6 +109,10 @@ class FirmwareSimulation(Simulation):
                 raise VehicleProcessError("the firmware gave no position within 120 s")
             self.advance()
         autopilot.forget()
+
+    def handle(self, message: Any, link: Link) -> None:
+        """Keep a client's message for the firmware."""
+        self._firmware.handle(message, link)
 
     def advance(self, between: Callable[[int], None] | None = None) -> None:
         """See `Simulation`. An error about a firmware that we started shows its last lines."""

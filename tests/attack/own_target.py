@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mavfi_cli.attack.attacker import run_out
+from mavfi_cli.attack.place import Golden, digest
 from mavfi_cli.attack.profile import profile_run
-from mavfi_cli.attack.target import Golden, RunLimits, RunVerdict, digest, judged
+from mavfi_cli.attack.target import RunLimits, RunVerdict, judged
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 

@@ -12,8 +12,8 @@ from mavfi_cli.attack import profile as profiles
 from mavfi_cli.attack import program as programs
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
+from mavfi_cli.attack.place import Golden
 from mavfi_cli.attack.program import ProgramTarget
-from mavfi_cli.attack.target import Golden
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program

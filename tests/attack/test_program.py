@@ -16,8 +16,9 @@ from mavfi_cli.attack.attacker import Attacker, golden_run
 from mavfi_cli.attack.campaign import Plan, replay_runs, run_campaign
 from mavfi_cli.attack.comparison import OutputComparison
 from mavfi_cli.attack.journal import read_runs
+from mavfi_cli.attack.place import digest
 from mavfi_cli.attack.program import ProgramTarget
-from mavfi_cli.attack.target import RunLimits, RunOutcome, digest
+from mavfi_cli.attack.target import RunLimits, RunOutcome
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, FaultError, RecordError, TargetError
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record

@@ -21,7 +21,7 @@ from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.mission import flight
 from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.report.view import ViewedFlight
+from mavfi_cli.report.view.entries import ViewedFlight
 from mavfi_cli.report.view.mcap_file import write_mcap
 
 MAVLOGDUMP = Path(pymavlink.__file__).parent / "tools" / "mavlogdump.py"

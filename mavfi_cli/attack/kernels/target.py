@@ -23,9 +23,10 @@ from mavfi_cli.attack.kernels.catalogue import unpack
 from mavfi_cli.attack.kernels.inputs import read_inputs
 from mavfi_cli.attack.kernels.scope import KernelScope
 from mavfi_cli.attack.kernels.template import ASK_SCOPE, GO, PID_BYTES, RAISED, RUN, TIMES
+from mavfi_cli.attack.place import Golden, Watch, digest
 from mavfi_cli.attack.profile import TargetProfile, profile_run
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.target import Golden, RunLimits, RunOutcome, RunVerdict, Watch, digest, judged
+from mavfi_cli.attack.target import RunLimits, RunOutcome, RunVerdict, judged
 from mavfi_cli.core.errors import FaultError, TargetError
 from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive

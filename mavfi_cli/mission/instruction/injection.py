@@ -49,12 +49,11 @@ from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM, kept_in
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
-from mavfi_cli.mission.run import fly_golden
-from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
 _Order = tuple[T, float]  # input, start stamp
+FlyGolden = Callable[[MissionConfig, Path, Recorder], object]  # mission, folder of runs, recorder
 _CONTEXT = (
     "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
     "windows", "profiled_instructions", "seed", "request",
@@ -91,9 +90,11 @@ class _Entries:
 
 
 def _plan_fault(
-    config: MissionConfig, asked: InstructionConfig, profiles: Path
+    config: MissionConfig, profiles: Path, fly_golden: FlyGolden
 ) -> tuple[InstructionFault, dict[str, Any]]:
     """Draw the fault of a mission, and the entries of _CONTEXT."""
+    asked = config.instruction
+    assert asked is not None
     strategy, node = asked.strategy(), asked.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
@@ -345,47 +346,66 @@ class Rehearsal:
 
 
 class InstructionInjection(NoInjection):
-    """One instruction-level fault in one mission; messages pass unchanged.
-
-    Args:
-        profiles: the folder in which golden runs and profiles are kept.
-        repeat: the record of a fault to repeat; None draws one.
-        for_debugger: called when the node waits for a debugger at the injected instruction.
-
-    Raises:
-        FaultError: the flight is not repeatable, or nothing can be hit in it.
-        RecordError: the record to repeat is damaged.
-    """
+    """One instruction-level fault in one mission; messages pass unchanged."""
 
     def __init__(
         self,
-        config: MissionConfig,
-        profiles: Path,
-        repeat: Mapping[str, Any] | None,
-        for_debugger: Callable[[int], None] | None,
+        fault: InstructionFault,
+        context: Mapping[str, Any],
+        *,
+        recorded: Mapping[str, Any] | None = None,
+        for_debugger: Callable[[int], None] | None = None,
     ) -> None:
         super().__init__()
-        assert config.instruction is not None
-        if config.link is not None:
-            raise FaultError(
-                "an instruction-level fault needs flights that repeat, and those of a foreign "
-                "autopilot do not: leave out --link"
-            )
-        self._repeat, self._for_debugger = repeat, for_debugger
-        if repeat is None:
-            self._fault, self._context = _plan_fault(config, config.instruction, profiles)
-        else:
-            self._fault = record.fault_of(repeat)
-            if missing := [name for name in _CONTEXT if name not in repeat]:
-                raise RecordError(f"the fault record is damaged: it has no {missing[0]!r}")
-            self._context = {name: repeat[name] for name in _CONTEXT}
-        self.node = str(self._context["node"])
+        self._fault, self._context = fault, context
+        self._recorded, self._for_debugger = recorded, for_debugger
+        self.node = str(context["node"])
         self._spawned = ServedProcess.of(PROGRAM)
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
         self._reached = threading.Event()  # the trigger, or the end of the attack without it
         self._struck = False  # in an invocation whose answer is there
         self._told = False
+
+    @classmethod
+    def plan(
+        cls,
+        config: MissionConfig,
+        profiles: Path,
+        fly_golden: FlyGolden,
+        for_debugger: Callable[[int], None] | None = None,
+    ) -> InstructionInjection:
+        """Draw the fault of a mission from its golden flight.
+
+        Args:
+            profiles: Folder in which golden flights and profiles are kept.
+            fly_golden: Flies the golden mission, if its orders are not kept yet.
+
+        Raises:
+            FaultError: The flight is not repeatable, or nothing in it can be hit.
+        """
+        if config.link is not None:
+            raise FaultError(
+                "an instruction-level fault needs flights that repeat, and those of a foreign "
+                "autopilot do not: leave out --link"
+            )
+        fault, context = _plan_fault(config, profiles, fly_golden)
+        return cls(fault, context, for_debugger=for_debugger)
+
+    @classmethod
+    def of_record(
+        cls, recorded: Mapping[str, Any], for_debugger: Callable[[int], None] | None = None
+    ) -> InstructionInjection:
+        """Repeat the fault of a record.
+
+        Raises:
+            RecordError: The record is damaged.
+        """
+        fault = record.fault_of(recorded)
+        if missing := [name for name in _CONTEXT if name not in recorded]:
+            raise RecordError(f"the fault record is damaged: it has no {missing[0]!r}")
+        context = {name: recorded[name] for name in _CONTEXT}
+        return cls(fault, context, recorded=recorded, for_debugger=for_debugger)
 
     def begin(self, path: Path) -> None:
         """Note where the tracer writes the record."""
@@ -400,8 +420,8 @@ class InstructionInjection(NoInjection):
         """
         scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")
         pid = self._spawned.pid
-        if self._repeat is not None:
-            record.require_same_build(self._repeat, Image(pid, scope.regions))
+        if self._recorded is not None:
+            record.require_same_build(self._recorded, Image(pid, scope.regions))
         self._tracer = TracerThread(lambda armed: self._attack(pid, scope, armed))
         self._tracer.await_armed()
         process = NodeProcess(

@@ -40,7 +40,7 @@ from mcap_protobuf.schema import register_schema
 from mavfi_cli.core.files import plain, write_atomically, write_json
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, unix_time_of_stamp_0
-from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
+from mavfi_cli.report.view.entries import Entry, ViewedFlight, entries_of
 
 _STATES = "mavfi.States"  # schema of the states of a tick
 _WORLD = "world"  # the frame of all positions

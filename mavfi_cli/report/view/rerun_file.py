@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 
 from mavfi_cli.core.files import write_atomically
 from mavfi_cli.core.types import Stage
-from mavfi_cli.report.view import Entry, ViewedFlight, entries_of
+from mavfi_cli.report.view.entries import Entry, ViewedFlight, entries_of
 
 _TIME = "simulated_time"
 _BODY_M = (0.25, 0.25, 0.08)  # half sizes of the box that stands for the vehicle

@@ -11,8 +11,8 @@ from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels import target as kernel_target
 from mavfi_cli.attack.kernels.catalogue import pack
 from mavfi_cli.attack.kernels.inputs import load_inputs
+from mavfi_cli.attack.place import digest
 from mavfi_cli.attack.profile import profile_run
-from mavfi_cli.attack.target import digest
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table

@@ -8,7 +8,7 @@ import pytest
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.report.view import ViewedFlight
+from mavfi_cli.report.view.entries import ViewedFlight
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 

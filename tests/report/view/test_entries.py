@@ -9,7 +9,7 @@ from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run import fly_mission, watch_again
 from mavfi_cli.mission.run_folder import load_run
-from mavfi_cli.report.view import ViewedFlight, entries_of
+from mavfi_cli.report.view.entries import ViewedFlight, entries_of
 from mavfi_cli.spec.fault import FaultConfig
 
 

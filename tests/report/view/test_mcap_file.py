@@ -11,7 +11,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.frames import rotation_matrix
 from mavfi_cli.link.tlog import EPOCH_UNIX_S
-from mavfi_cli.report.view import entries_of
+from mavfi_cli.report.view.entries import entries_of
 from mavfi_cli.report.view.mcap_file import write_layout, write_mcap
 
 SCHEMAS = {

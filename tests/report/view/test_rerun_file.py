@@ -8,7 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.report.view import entries_of
+from mavfi_cli.report.view.entries import entries_of
 from mavfi_cli.report.view.rerun_file import write_rrd
 
 

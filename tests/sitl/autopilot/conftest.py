@@ -5,6 +5,7 @@ import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
 from sitl.autopilot.autopilot import Autopilot
+from sitl.autopilot.services import handle
 from sitl.autopilot.telemetry import TICK_US, Preset
 from sitl.vehicle.vehicle import Truth
 
@@ -75,7 +76,7 @@ class Bench:
 
     def send(self, message, link=None):
         for received in self._server_in.decode(self._out.encode(message)):
-            self.autopilot.handle(received, link or self.link)
+            handle(self.autopilot, received, link or self.link)
 
     def command(self, number, *parameters, system=1, component=1):
         given = [*parameters, *([NAN] * (7 - len(parameters)))]

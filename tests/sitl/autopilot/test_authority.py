@@ -5,6 +5,7 @@ import pytest
 from mavfi_cli.link.codec import Codec, dialect
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.commander import FlightMode
+from sitl.autopilot.services import handle
 
 
 def as_sender(message, system, component=191):
@@ -24,12 +25,12 @@ def test_the_first_of_two_companions_commands_until_it_is_silent(flying, velocit
     flying.command(176, 1, 6)
     for _ in range(50):
         flying.send(velocity_target(north=1.0))
-        autopilot.handle(as_sender(velocity_target(north=-5.0), 7), link)
+        handle(autopilot, as_sender(velocity_target(north=-5.0), 7), link)
         flying.tick()
         assert autopilot.setpoint[3] == 1.0
     assert flying.texts().count((4, "Setpoints of 7/191 ignored: 245/190 commands")) == 1
     for _ in range(150):  # a second of silence, and a second until the failsafe ends
-        autopilot.handle(as_sender(velocity_target(north=2.0), 7), link)
+        handle(autopilot, as_sender(velocity_target(north=2.0), 7), link)
         flying.tick()
     assert autopilot.setpoint[3] == 2.0
     assert flying.mode is FlightMode.OFFBOARD
@@ -57,7 +58,7 @@ def test_only_a_trusted_system_commands(make_bench, velocity_target):
     assert bench.mode is FlightMode.LOITER
     assert not bench.commander.is_available(FlightMode.OFFBOARD)
     assert bench.texts() == [(4, "Commands of system 245 refused, trusted: 7")]
-    bench.autopilot.handle(as_sender(command(400, 1.0), 7), bench.link)
+    handle(bench.autopilot, as_sender(command(400, 1.0), 7), bench.link)
     assert bench.commander.armed
 
 

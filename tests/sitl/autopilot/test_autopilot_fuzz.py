@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.link.codec import Codec, dialect
+from sitl.autopilot.services import handle
 from sitl.autopilot.telemetry import Preset
 
 _INTEGERS = {
@@ -89,7 +90,7 @@ def test_raw_bytes(make_bench, chunks):
     codec = Codec(1, 1)
     for chunk in chunks:
         for message in codec.decode(chunk):
-            bench.autopilot.handle(message, bench.link)
+            handle(bench.autopilot, message, bench.link)
     bench.run(0.1)
     check_sane(bench)
 
@@ -102,7 +103,7 @@ def test_damaged_frames(make_bench, message, flips):
     for flip in flips:
         frame[flip // 8 % len(frame)] ^= 1 << flip % 8
     for received in Codec(1, 1).decode(bytes(frame)):
-        bench.autopilot.handle(received, bench.link)
+        handle(bench.autopilot, received, bench.link)
     bench.run(0.1)
 
 

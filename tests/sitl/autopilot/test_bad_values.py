@@ -5,6 +5,7 @@ import math
 import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
+from sitl.autopilot.services import handle
 
 
 def framed(cls, payload):
@@ -19,7 +20,7 @@ def test_a_longer_frame_is_read_as_far_as_it_is_known(bench):
     payload = Codec(245, 190).encode(order)[10:-2].ljust(33, b"\0")
     for extra in (b"", b"\xff" * 7, b"\xff" * 222):
         for message in Codec(1, 1).decode(framed(type(order), payload + extra)):
-            bench.autopilot.handle(message, bench.link)
+            handle(bench.autopilot, message, bench.link)
         assert bench.acks() == [(520, 0)]
 
 
@@ -28,7 +29,7 @@ def test_a_shorter_frame_ends_in_zeros_and_is_for_nobody(bench, length):
     order = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     payload = Codec(245, 190).encode(order)[10:-2][:length]
     (message,) = Codec(1, 1).decode(framed(type(order), payload))
-    bench.autopilot.handle(message, bench.link)
+    handle(bench.autopilot, message, bench.link)
     bench.run(5.0)
     assert bench.acks() == []
     assert not bench.commander.armed

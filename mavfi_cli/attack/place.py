@@ -1,0 +1,59 @@
+"""The place where a target runs repeatedly from the same memory, and its golden run there."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from mavfi_cli.fi.tracer.image import Image, Scope
+from mavfi_cli.fi.tracer.tracee import Tracee
+
+# Called with the instructions stepped since the last call, or with what goes on, in words.
+Watch = Callable[[int | str], None]
+
+
+class AttackPlace(Protocol):
+    """A place where a target runs repeatedly from the same start."""
+
+    @property
+    def name(self) -> str:
+        """Name of the target."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the target for messages: kernel, node or program."""
+
+    def start(self) -> Tracee:
+        """Start a run, stopped before anything that can be hit."""
+
+    def image(self, tracee: Tracee) -> Image:
+        """The memory image of a run."""
+
+    def scope(self, image: Image) -> Scope:
+        """The code that may be hit."""
+
+    def close(self) -> None:
+        """End all processes and remove all temporary files."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Golden:
+    """The golden run."""
+
+    output: bytes
+    cpu_s: float
+    wall_s: float
+    exit_code: int = 0
+    notices: tuple[str, ...] = ()  # what the user should know about it
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the output."""
+        return digest(self.output)
+
+
+def digest(output: bytes) -> str:
+    """SHA-256 of an output."""
+    return hashlib.sha256(output).hexdigest()
