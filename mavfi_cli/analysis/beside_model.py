@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import changed, chosen, errors, flags, flown, known, numbers, paired
+from mavfi_cli.analysis.flights import changed, chosen, errors, flags, flown, known, numbers
 from mavfi_cli.analysis.overhead import TIMES, ComputeOverhead
+from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.campaigns.detector_plans import TRAINING_WORLDS, TrainingPlan
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.specification import require_named
@@ -361,7 +362,7 @@ def _over(
         if isinstance(base, str) or isinstance(own, str):
             continue
         sides = [flown(_arm(flights, key)) for key in keys]
-        pairs = paired(sides[0], sides[1], PLACE)
+        pairs = paired(sides[1], sides[0], PLACE)[::-1]
         both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))
         first, second = (pair.filter(both).sort_by([*_BY_PLACE]) for pair in pairs)
         for name in names:

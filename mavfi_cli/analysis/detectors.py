@@ -18,7 +18,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers, paired
+from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
+from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.campaigns.detector_plans import ERROR_FREE, FAULT, NONE
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
@@ -404,7 +405,7 @@ def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
 
 def _recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
     """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
-    there, here = paired(second, chosen(first, active=True), KEY)
+    here, there = paired(chosen(first, active=True), second, KEY)
     harm = here["harm"]
 
     def test(among: pa.Array, column: str) -> McNemar:

@@ -252,20 +252,6 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
     }
 
 
-def paired(first: pa.Table, second: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
-    """Join the rows of two tables by equal keys, in the order of the second.
-
-    Args:
-        on: names of the key columns; no two rows of `first` have the same keys.
-    """
-    if not (first.num_rows and second.num_rows):  # an empty column has no type to join by
-        return first.slice(0, 0), second.slice(0, 0)
-    there = first.select(on).append_column("first", pa.array(np.arange(first.num_rows)))
-    here = second.select(on).append_column("second", pa.array(np.arange(second.num_rows)))
-    places = here.join(there, list(on), join_type="inner", use_threads=False).sort_by("second")
-    return first.take(places["first"]), second.take(places["second"])
-
-
 def changed(
     missions: Iterable[Hashable],
     first: Iterable[float],

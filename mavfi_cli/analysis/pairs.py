@@ -6,7 +6,7 @@ Items and claims choose rows of this table and count its columns.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis import flights as tables
-from mavfi_cli.analysis.flights import BITS, COSTS, BoolArray
+from mavfi_cli.analysis.flights import BITS, COSTS, BoolArray, IntArray
 from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
@@ -241,11 +241,10 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
 
 def _beside_golden(table: pa.Table) -> pa.Table:
     """The table with what each flight is compared with."""
-    unprotected = pc.is_null(table["detector"]).to_pylist()
-    faults = Flights(table).faults
-    place_of = {fault: place for place, fault in enumerate(faults) if unprotected[place]}
-    own = pa.array([place_of.get((pair, _NO_FAULT)) for pair, _ in faults], pa.int64())
-    bare = pa.array([place_of.get(fault) for fault in faults], pa.int64())
+    unprotected = pc.is_null(table["detector"])
+    golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
+    own = _places(partners(table, table, ("pair",), only=golden))
+    bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))
     own_lost, own_time = (table[name].take(own) for name in ("lost", "flight_time_s"))
     succeeds = pc.equal(own_lost, _NO)
     ratio = pc.divide(table["flight_time_s"], own_time)
@@ -260,3 +259,69 @@ def _beside_golden(table: pa.Table) -> pa.Table:
 
 
 _NOTHING_FLOWN = _flown(pa.table({name: pa.nulls(0, kind) for name, kind in _COLUMNS.items()}))
+
+
+# Pairing ------------------------------------------------------------------------------------------
+
+
+def partners(
+    rows: pa.Table,
+    others: pa.Table,
+    on: Sequence[str],
+    *,
+    only: pa.ChunkedArray | BoolArray | None = None,
+    repeats: bool = False,
+) -> IntArray:
+    """Find the partner of each row: the first of the other rows with equal values in some columns.
+
+    Two empty cells are equal.
+
+    Args:
+        rows, others: (n,) and (m,) rows; may be the same table.
+        on: columns of both tables, of equal types.
+        only: whether each of the other rows may be a partner, (m,); None allows all.
+        repeats: match the second of several equal rows with the second equal partner, and so on.
+            Otherwise all of them have the same partner.
+
+    Returns:
+        Index of the partner among all the other rows, (n,); -1 for a row without partner.
+    """
+    allowed = np.arange(others.num_rows)
+    if only is not None:
+        allowed = np.flatnonzero(np.asarray(only, dtype=bool))
+    both = pa.concat_tables(
+        [rows.select(on), others.select(on).take(allowed)], promote_options="permissive"
+    )
+    key = np.zeros(both.num_rows, dtype=np.int64)
+    for name in on:
+        column = both[name].combine_chunks().dictionary_encode(null_encoding="encode")
+        value = column.indices.to_numpy().astype(np.int64)
+        key = np.unique(key * both.num_rows + value, return_inverse=True)[1]
+    here, there = key[: rows.num_rows], key[rows.num_rows :]
+    if repeats:
+        here, there = (own * both.num_rows + _repeat(own) for own in (here, there))
+    known, first = np.unique(there, return_index=True)
+    if not len(known):
+        return np.full(rows.num_rows, -1)
+    place = np.searchsorted(known, here).clip(max=len(known) - 1)
+    return np.where(known[place] == here, allowed[first[place]], -1)
+
+
+def paired(rows: pa.Table, others: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
+    """Return the rows that have a partner, and beside each its partner; see `partners`."""
+    places = partners(rows, others, on)
+    return rows.filter(places >= 0), others.take(places[places >= 0])
+
+
+def _repeat(keys: IntArray) -> IntArray:
+    """Number of earlier equal keys, (n,)."""
+    order = np.argsort(keys, kind="stable")
+    _, begins, counts = np.unique(keys[order], return_index=True, return_counts=True)
+    earlier = np.empty(len(keys), dtype=np.int64)
+    earlier[order] = np.arange(len(keys)) - np.repeat(begins, counts)
+    return earlier
+
+
+def _places(partner: IntArray) -> pa.Array:
+    """Indices for `take`, which gives an empty cell for a missing partner."""
+    return pa.array(partner, mask=partner < 0)

@@ -28,8 +28,8 @@ from mavfi_cli.analysis.flights import (
     flown,
     known,
     numbers,
-    paired,
 )
+from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
@@ -167,7 +167,7 @@ def _measured(quantity: _Quantity, counted: pa.Table) -> dict[str, Any]:
 
 
 def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
-    pairs = paired(first, second, MISSION)
+    pairs = paired(second, first, MISSION)[::-1]
     test = McNemar.of(*(flags(each, "succeeded") for each in pairs))
     return {
         "pairs": test.pairs,
@@ -211,7 +211,7 @@ class FaultCosts:
     @classmethod
     def of(cls, golden: pa.Table, counted: pa.Table) -> FaultCosts:
         """Compare flights with the golden flights of the same missions."""
-        own, known = paired(golden, counted, ["seed"])
+        known, own = paired(counted, golden, ["seed"])
         won = known["succeeded"]
         own_s = numbers(own.filter(won), "flight_time_s")
         pairs = known.filter(won)
@@ -273,7 +273,7 @@ class FaultCosts:
             each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
             longest in seconds.
         """
-        there, here = paired(first.costs, self.costs, MISSION)
+        here, there = paired(self.costs, first.costs, MISSION)
         extra = _by_mission(here, "cost_s") - _by_mission(there, "cost_s")
         extra[np.abs(extra) < _SAME_S] = 0.0
         before, after = _by_mission(there, "over_own"), _by_mission(here, "over_own")

@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, paired
+from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers
+from mavfi_cli.analysis.pairs import partners
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
@@ -111,27 +112,15 @@ class Group:
         If a pair was flown several times, the first flights match, then the second ones, and so on.
         One golden flight matches all.
         """
-        alike = ("pair",) if self.golden else ("pair", "strike")
-        here, there = self._timed(alike), other._timed(alike)
-        if self.golden:
-            here, there = paired(here.filter(pc.equal(here["time"], 0)), there, alike)
-        else:
-            here, there = paired(here, there, (*alike, "time"))
-        return here["place"].to_numpy(), there["place"].to_numpy()
-
-    def _timed(self, alike: Sequence[str]) -> pa.Table:
-        """Row index and `alike` of each counted mission, and the number of earlier equal ones."""
-        places = np.flatnonzero(self.counted)
-        columns = {name: self.codes(name)[places] for name in alike}
-        order = np.lexsort([*columns.values()])  # stable
-        new = np.ones(len(places), dtype=bool)
-        if len(places):
-            new[1:] = np.any([np.diff(column[order]) != 0 for column in columns.values()], axis=0)
-        begins = np.flatnonzero(new)
-        earlier = np.repeat(begins, np.diff(begins, append=len(places)))
-        times = np.empty(len(places), dtype=np.int64)
-        times[order] = np.arange(len(places)) - earlier
-        return pa.table({**columns, "time": times, "place": places})
+        there = np.flatnonzero(other.counted)
+        here = partners(
+            other.flights.take(there),
+            self.flights,
+            ("pair",) if self.golden else ("pair", "strike"),
+            only=self.counted,
+            repeats=not self.golden,
+        )
+        return here[here >= 0], there[here >= 0]
 
 
 def untreated(labels: Mapping[str, Any]) -> str:

@@ -5,15 +5,11 @@ import math
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mavfi_cli.analysis.flights import (
-    changed,
-    chosen,
-    flags,
-    known,
-    numbers,
-    paired,
-)
+from mavfi_cli.analysis.flights import changed, chosen, flags, known, numbers
+from mavfi_cli.analysis.pairs import paired, partners
 from mavfi_cli.stats.paired import McNemar
 
 
@@ -28,16 +24,37 @@ def flown(*ends, seeds=None):
     )
 
 
-def test_rows_meet_by_their_keys_in_the_order_of_the_second():
+KEYS = st.lists(st.tuples(st.sampled_from([1, 2, None]), st.sampled_from(["a", "b"])), max_size=9)
+
+
+def keyed(keys):
+    return pa.table({name: [key[at] for key in keys] for at, name in enumerate(("seed", "world"))})
+
+
+@given(rows=KEYS, others=KEYS, repeats=st.booleans(), data=st.data())
+def test_a_partner_is_the_first_row_of_equal_keys_or_the_equally_numbered_one(
+    rows, others, repeats, data
+):
+    only = data.draw(st.lists(st.booleans(), min_size=len(others), max_size=len(others)))
+    found = partners(
+        keyed(rows), keyed(others), ("world", "seed"), only=np.array(only, bool), repeats=repeats
+    )
+    for place, (key, partner) in enumerate(zip(rows, found, strict=True)):
+        equal = [at for at, each in enumerate(others) if each == key and only[at]]
+        number = rows[:place].count(key) if repeats else 0
+        assert partner == (equal[number] if number < len(equal) else -1)
+
+
+def test_paired_rows_keep_the_order_of_the_first_table():
     first, second = (
-        flown(*["success"] * 4, seeds=[3, 1, 2, 9]),
         flown(*["crash"] * 3, seeds=[2, 5, 3]),
+        flown(*["success"] * 4, seeds=[3, 1, 2, 9]),
     )
     here, there = paired(first, second, ["seed"])
     assert here["seed"].to_pylist() == there["seed"].to_pylist() == [2, 3]
-    assert flags(here, "succeeded").all()
-    assert not flags(there, "succeeded").any()
-    none, nothing = paired(first, second.slice(0, 0), ["seed"])
+    assert not flags(here, "succeeded").any()
+    assert flags(there, "succeeded").all()
+    none, nothing = paired(first.slice(0, 0), second, ["seed"])
     assert (none.num_rows, nothing.num_rows) == (0, 0)
 
 
