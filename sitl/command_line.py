@@ -94,7 +94,7 @@ places = _options(
 )  # fmt: skip
 world_and_vehicle = _options(
     click.option(
-        "--world", "name_or_path", default="dense", metavar="NAME|FILE",
+        "--world", default="dense", metavar="NAME|FILE",
         help="World: a name of `mavfi world list`, gen:density,size or a TOML file.",
     ),
     places,

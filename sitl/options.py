@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import click
 
 from sitl.autopilot.telemetry import Preset
-from sitl.command_line import CONTEXT, Positive, camera_options, signing, world_and_vehicle
+from sitl.command_line import CONTEXT, Positive, Triple, camera_options, signing, world_and_vehicle
 
 _FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
 # As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
@@ -40,28 +40,45 @@ class _Link(click.ParamType[tuple[Preset, str]]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleSetup:
+    """What is simulated: world, vehicle, camera and autopilot.
+
+    Attributes:
+        camera_size: Columns and rows.
+        firmware_kind: Real firmware that flies; None for our own autopilot.
+        firmware: Its SITL binary; None if somebody else starts it and sends to `firmware_link`.
+        trusted: MAVLink systems that may command; empty for all.
+    """
+
+    world: str = "dense"
+    seed: int = 3
+    start_enu_m: Triple | None = None
+    goal_enu_m: Triple | None = None
+    vehicle: str = "solo"
+    camera_size: tuple[int, int] = (64, 48)
+    camera_rate_hz: float = 10.0
+    camera_heartbeat_hz: float = 1.0
+    system_id: int = 1
+    firmware_kind: str | None = None
+    firmware: Path | None = None
+    firmware_link: str = _FIRMWARE_LINK
+    firmware_seed: int = 1
+    trusted: Sequence[int] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServerOptions:
     """The parsed options of the user."""
 
-    of_world: dict[str, Any]  # arguments of `load_world`
-    vehicle: str
+    setup: VehicleSetup
     links: Sequence[tuple[Preset, str]]
     fd: int | None
     lockstep: bool
     speed: float | None  # None: no limit, in lockstep only
     answer_limit_s: float
     truth: Path | None
-    camera_size: tuple[int, int]  # columns, rows
-    camera_rate_hz: float
-    camera_heartbeat_hz: float
-    system_id: int
     key_file: Path | None
     allow_unsigned: bool
-    firmware_kind: str | None  # None: our own autopilot flies
-    firmware: Path | None
-    firmware_link: str
-    firmware_seed: int
-    trusted: Sequence[int]
 
 
 @click.command(context_settings=CONTEXT)
@@ -122,13 +139,12 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))
     kind, lockstep, fd = hil or backend, given["lockstep"], given["fd"]
     links, speed = given.pop("links"), given.pop("speed")
-    of_world = {
-        key: given.pop(key) for key in ("name_or_path", "seed", "start_enu_m", "goal_enu_m")
-    }
+    names = [each.name for each in fields(VehicleSetup) if each.name in given]
+    setup = VehicleSetup(firmware_kind=kind, **{name: given.pop(name) for name in names})
     for is_wrong, problem in (
         (hil and backend, "--hil and --json exclude each other"),
-        (given["firmware"] and not kind, "--firmware needs --hil or --json"),
-        (kind and given["trusted"], "--trust is for our own autopilot"),
+        (setup.firmware and not kind, "--firmware needs --hil or --json"),
+        (kind and setup.trusted, "--trust is for our own autopilot"),
         (kind and lockstep, "--lockstep is for our own autopilot"),
         (realtime and speed is not None, "--realtime and --speed exclude each other"),
         (lockstep and fd is None, "--lockstep needs --fd"),
@@ -143,4 +159,4 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     elif not lockstep and not links:
         urls = _FIRMWARE_LINKS if kind else _DEFAULT_LINKS
         links = [_Link().convert(url, None, None) for url in urls]
-    return ServerOptions(**given, of_world=of_world, links=links, speed=speed, firmware_kind=kind)
+    return ServerOptions(**given, setup=setup, links=links, speed=speed)

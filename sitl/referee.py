@@ -204,6 +204,11 @@ class Referee:
             **({} if self._pose is None else {"pose": self._pose}),
         }
 
+    def log(self) -> dict[str, Vector]:
+        """Return the columns of the log."""
+        columns = zip(*self._rows, strict=True)
+        return {name: np.array(column) for name, column in zip(_COLUMNS, columns, strict=True)}
+
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
         """Write `truth.npz` and then `truth.json` into `folder`, each atomically.
 
@@ -213,9 +218,6 @@ class Referee:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordError(f"{folder}: cannot write the truth log: {error.strerror}") from None
-        columns = zip(*self._rows, strict=True)
-        arrays: dict[str, Any] = {
-            name: np.array(column) for name, column in zip(_COLUMNS, columns, strict=True)
-        }
+        arrays: dict[str, Any] = self.log()
         write_atomically(folder / "truth.npz", lambda file: np.savez(file, **arrays))
         write_json(folder / "truth.json", self.report(energies_j))

@@ -13,13 +13,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import click
 
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.core.types import FlightTruth
 from mavfi_cli.link.codec import Codec, Signing, dialect, key_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import Transport, memory_pair, open_transport
@@ -29,7 +29,7 @@ from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.camera.component import Camera
 from sitl.command_line import exit_code, stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
-from sitl.options import ServerOptions, parse
+from sitl.options import ServerOptions, VehicleSetup, parse
 from sitl.peers import Peer, Peers
 from sitl.simulation import Simulation
 from sitl.vehicle.cascade import control_step
@@ -225,19 +225,28 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
     )
 
 
-class _EmbeddedVehicle:
+class EmbeddedVehicle:
     """The vehicle in the process of its companion, which waits while the vehicle flies.
 
     When the companion has answered a tick and waits for more, the vehicle flies the next one.
+
+    Attributes:
+        link: The companion's end of the link.
+        briefing: What the companion knows before the first message.
+        error: The error that ended the vehicle before its companion, if any.
+
+    Raises:
+        MavfiError: The world, the vehicle, the start or the goal cannot be used.
     """
 
-    def __init__(self, simulation: Simulation, truth_folder: Path) -> None:
-        self._simulation = simulation
+    def __init__(self, setup: VehicleSetup) -> None:
+        world, profile = _loaded(setup)
+        self.briefing = world.briefing(profile.camera_mount_flu_m)
+        self._simulation = simulation = _simulation(setup, world, profile, logs=True)
         self.link, end = memory_pair("the simulated vehicle")
         self._client = Client(simulation, end, preset=Preset.LOCKSTEP)
         self._begun = self._ended = False
-        self.truth_folder = truth_folder
-        self.error: Exception | None = None  # that ended the vehicle before its companion
+        self.error: Exception | None = None
         self.link.on_wait = self._fly_on
 
     def _fly_on(self) -> None:
@@ -263,7 +272,7 @@ class _EmbeddedVehicle:
         return answered
 
     def end(self) -> None:
-        """Fly the companion's last answer and save the truth. May be called repeatedly."""
+        """Fly the companion's last answer. May be called repeatedly."""
         if self._ended:
             return
         self._ended = True
@@ -274,7 +283,10 @@ class _EmbeddedVehicle:
             self.error = error
         self._client.close()
         self._simulation.close()
-        self._simulation.save_truth(self.truth_folder)
+
+    def truth(self) -> FlightTruth:
+        """Return the truth up to now."""
+        return self._simulation.truth()
 
 
 class _Realtime:
@@ -296,7 +308,7 @@ class _Realtime:
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
         self._simulation.begin(stopped)
-        if (kind := self._options.firmware_kind) is not None and not stopped():
+        if (kind := self._options.setup.firmware_kind) is not None and not stopped():
             click.echo(f"{kind} is ready: clients may connect", err=True)
         self._clients.serve(until_s=0.0)
         while not stopped() and not self._clients.over:
@@ -362,13 +374,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _serve(options: ServerOptions) -> None:
     """Run until the peer closes or SIGINT or SIGTERM arrives; save the truth in any case."""
     stopped = stop_on_signals()
-    world, profile = load_world(**options.of_world), load_profile(options.vehicle)
+    world, profile = _loaded(options.setup)
     if not options.lockstep and not in_cache(control_step):
         click.echo("the first start compiles the vehicle, about half a minute", err=True)
         warm_up()
     if options.truth is not None:
         world.write_briefing(profile.camera_mount_flu_m, options.truth)
-    simulation = _simulation(options, world, profile, logs=options.truth is not None)
+    simulation = _simulation(options.setup, world, profile, logs=options.truth is not None)
     try:
         if options.lockstep:
             _lockstep(options, simulation, stopped)
@@ -382,18 +394,6 @@ def _serve(options: ServerOptions) -> None:
             simulation.save_truth(options.truth)
 
 
-def embedded(arguments: Sequence[str], truth_folder: Path) -> _EmbeddedVehicle:
-    """Return the vehicle of `python -m sitl --lockstep` in this process, ready to fly.
-
-    Briefing and, at the end, the truth are left in the folder. Raises MavfiError if the world, the
-    vehicle, the start or the goal cannot be used.
-    """
-    options = parse(arguments)
-    world, profile = load_world(**options.of_world), load_profile(options.vehicle)
-    world.write_briefing(profile.camera_mount_flu_m, truth_folder)
-    return _EmbeddedVehicle(_simulation(options, world, profile, logs=True), truth_folder)
-
-
 def warm_up() -> None:
     """Load and compile the code of a flight, which is the same for every world."""
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
@@ -401,21 +401,28 @@ def warm_up() -> None:
         simulation.advance()
 
 
+def _loaded(setup: VehicleSetup) -> tuple[World, VehicleProfile]:
+    places = {"start_enu_m": setup.start_enu_m, "goal_enu_m": setup.goal_enu_m}
+    return load_world(setup.world, seed=setup.seed, **places), load_profile(setup.vehicle)
+
+
 def _simulation(
-    options: ServerOptions, world: World, profile: VehicleProfile, *, logs: bool
+    setup: VehicleSetup, world: World, profile: VehicleProfile, *, logs: bool
 ) -> Simulation:
-    columns, rows = options.camera_size
+    columns, rows = setup.camera_size
     camera = Camera(
-        world.boxes_enu_m, columns=columns, rows=rows, rate_hz=options.camera_rate_hz,
-        heartbeat_hz=options.camera_heartbeat_hz, system=options.system_id,
+        world.boxes_enu_m, columns=columns, rows=rows, rate_hz=setup.camera_rate_hz,
+        heartbeat_hz=setup.camera_heartbeat_hz, system=setup.system_id,
         mount_offset_flu_m=profile.camera_mount_flu_m,
     )  # fmt: skip
-    settings: dict[str, Any] = {"camera": camera, "system_id": options.system_id, "logs": logs}
-    if options.firmware_kind is None:
-        return Simulation(world, profile, trusted=options.trusted, **settings)
+    if setup.firmware_kind is None:
+        return Simulation(
+            world, profile, camera=camera, system_id=setup.system_id, logs=logs,
+            trusted=setup.trusted,
+        )  # fmt: skip
     return FirmwareSimulation(
-        world, profile, options.firmware_kind, options.firmware,
-        seed=options.firmware_seed, url=options.firmware_link, **settings,
+        world, profile, setup.firmware_kind, setup.firmware, seed=setup.firmware_seed,
+        url=setup.firmware_link, camera=camera, system_id=setup.system_id, logs=logs,
     )  # fmt: skip
 
 
@@ -426,11 +433,11 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
         first, *rest = _ways_to(url) or [""]
         links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{each}" for each in rest)]
     whose = "anyone" + ("" if options.key_file is None else " who signs")
-    if options.trusted:
-        whose = f"system {', '.join(map(str, sorted(options.trusted)))} only"
+    if options.setup.trusted:
+        whose = f"system {', '.join(map(str, sorted(options.setup.trusted)))} only"
     lines = [
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
-        f"system {options.system_id}, {options.speed:g} x real time",
+        f"system {options.setup.system_id}, {options.speed:g} x real time",
         f"takes commands from {whose}",
         *(line.rstrip() for line in links),
         *_needs_of_firmware(options),
@@ -440,12 +447,12 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
 
 
 def _needs_of_firmware(options: ServerOptions) -> list[str]:
-    kind = options.firmware_kind
-    if kind is None or options.firmware is not None:
+    kind = options.setup.firmware_kind
+    if kind is None or options.setup.firmware is not None:
         return []
-    parameters = LINKS[kind].parameters(load_profile(options.vehicle))
+    parameters = LINKS[kind].parameters(load_profile(options.setup.vehicle))
     return [
-        f"waits for {kind}, which sends its MAVLink to {options.firmware_link} "
+        f"waits for {kind}, which sends its MAVLink to {options.setup.firmware_link} "
         "and needs these parameters:",
         *(f"  {name} {value:.6g}" for name, value in parameters.items()),
     ]

@@ -11,6 +11,7 @@ from typing import Any
 from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector, dot, enu_from_ned, flu_enu_from_frd_ned
+from mavfi_cli.core.types import FlightTruth
 from mavfi_cli.core.wall import WallClock
 from sitl.autopilot import services
 from sitl.autopilot.autopilot import Autopilot
@@ -38,7 +39,7 @@ class Simulation:
         camera: Its depth camera; None for one with default settings.
         autopilot: Real firmware in the place of the autopilot; None for our own.
         trusted: MAVLink systems that may command; empty for all.
-        logs: Keep the truth of every tick for `save_truth`.
+        logs: Keep the truth of every tick for `truth` and `save_truth`.
     """
 
     awaits_setpoints = True  # in lockstep, every tick waits for the companion's setpoint
@@ -126,14 +127,23 @@ class Simulation:
     def close(self) -> None:
         """Release everything outside this process. May be called repeatedly."""
 
+    def truth(self) -> FlightTruth:
+        """Return the referee's log and verdict, and where this machine's time went."""
+        report = self.referee.report(self._energies_j())
+        return FlightTruth(log=self.referee.log(), report=report, **self._host())
+
     def save_truth(self, folder: Path) -> None:
-        """Write the referee's log and verdict. Raises RecordError if a file cannot be written."""
-        truth = self.vehicle.truth
-        energies = {"regression": truth.energy_regression_j, "propeller": truth.energy_propeller_j}
-        self.referee.save(folder, energies)
+        """Write `truth` into a folder. Raises RecordError if a file cannot be written."""
+        self.referee.save(folder, self._energies_j())
+        write_json(folder / HOST_FILE, self._host())
+
+    def _host(self) -> dict[str, Any]:
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        host = {"stage_wall_s": self.wall.totals, "memory_mb": memory_mb}
-        write_json(folder / HOST_FILE, host)
+        return {"stage_wall_s": self.wall.totals, "memory_mb": memory_mb}
+
+    def _energies_j(self) -> dict[str, float]:
+        truth = self.vehicle.truth
+        return {"regression": truth.energy_regression_j, "propeller": truth.energy_propeller_j}
 
     def _look(self) -> None:
         autopilot = self.autopilot

@@ -36,7 +36,7 @@ from mavfi_cli.core.errors import (
     UnknownName,
     VehicleProcessError,
 )
-from mavfi_cli.core.files import ScratchFolder, write_text
+from mavfi_cli.core.files import write_text
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.mission import MissionConfig
@@ -327,11 +327,10 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector needs a detector")
     if start:
-        with ScratchFolder("vehicle") as folder:
-            try:
-                VehicleInProcess(config, folder).end()
-            except MavfiError as error:
-                raise VehicleProcessError(str(error), error.exit_code) from None
+        try:
+            VehicleInProcess(config).end()
+        except MavfiError as error:
+            raise VehicleProcessError(str(error), error.exit_code) from None
 
 
 # Fixed worlds: candidates get golden runs in turn until one fits the rule. They are a campaign of

@@ -10,6 +10,7 @@ Source of the list: the paper, sections IV-C and V-A, and the messages of its re
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -56,6 +57,23 @@ class Briefing:
     bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax of the allowed volume
     camera_offset_flu_m: FloatArray  # (3,) from the vehicle's centre to the optical centre
     hfov_rad: float = math.pi / 2.0  # used until the camera reports its own
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightTruth:
+    """What the vehicle's side leaves of a flight at its end.
+
+    Attributes:
+        log: Columns of the referee, (n,) or (n, 3 or 4), one row per control tick.
+        report: The referee's report, as in the section `referee` of a record, and its `world`.
+        stage_wall_s: Time of this machine by part, s.
+        memory_mb: Largest memory of the process.
+    """
+
+    log: Mapping[str, FloatArray]
+    report: Mapping[str, Any]
+    stage_wall_s: Mapping[str, float] = field(default_factory=dict)
+    memory_mb: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

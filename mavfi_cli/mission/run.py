@@ -33,7 +33,7 @@ from mavfi_cli.core.files import (
 )
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
-from mavfi_cli.core.types import Outcome, Reaction
+from mavfi_cli.core.types import FlightTruth, Outcome, Reaction
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
@@ -93,13 +93,14 @@ def fly_mission(
         flight_wall_s = time.perf_counter() - flight_begun_s
         if vehicle is not None and (failure := vehicle.end()):
             flight.explain(str(failure))
+        truth = None if vehicle is None else vehicle.truth
         host = {
             "started": started.isoformat(timespec="seconds"),
             "startup_s": round(flight_begun_s - begun_s, 3),
             "flight_wall_s": round(flight_wall_s, 3),
-            **_host(config, flight, vehicle),
+            **_host(config, flight, truth),
         }
-        _write(config, flight, companion, folder, host, vehicle, crash)
+        _write(config, flight, companion, folder, host, truth, crash)
     return folder
 
 
@@ -143,10 +144,10 @@ def _begin(
         flight.connect()
         if vehicle is None:
             return flight.brief(config.briefing(flight.place_enu_m), recorder)
-        told = vehicle.briefing()
+        briefing = vehicle.briefing()
         if config.link is not None:
-            told = replace(told, start_enu_m=flight.place_enu_m)
-        return flight.brief(told, recorder)
+            briefing = replace(briefing, start_enu_m=flight.place_enu_m)
+        return flight.brief(briefing, recorder)
     except MavfiError:
         if vehicle is not None and (failure := vehicle.end()):
             raise failure from None
@@ -168,11 +169,11 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 # Record -------------------------------------------------------------------------------------------
 
 
-def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dict[str, Any]:
+def _host(config: MissionConfig, flight: Flight, truth: FlightTruth | None) -> dict[str, Any]:
     """Return what this machine did for the flight, which no repetition repeats."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    told = (vehicle and vehicle.report("host")) or {}
-    walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": told.get("stage_wall_s")}
+    of_vehicle = {} if truth is None else truth.stage_wall_s
+    walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": of_vehicle}
     return {
         "machine": host_platform.machine(),
         "level": processor_level(),
@@ -180,10 +181,10 @@ def _host(config: MissionConfig, flight: Flight, vehicle: Vehicle | None) -> dic
         "isolated": list(config.isolate),
         "memory_mb": {
             "companion": round(own_mb, 1),
-            "vehicle": round(told.get("memory_mb", 0.0), 1),
+            "vehicle": 0.0 if truth is None else round(truth.memory_mb, 1),
         },
         **{
-            name: {stage: round(value, 4) for stage, value in (stages or {}).items()}
+            name: {stage: round(value, 4) for stage, value in stages.items()}
             for name, stages in walls.items()
         },
     }
@@ -195,14 +196,13 @@ def _write(
     companion: Companion,
     folder: RunFolder,
     host: dict[str, Any],
-    vehicle: Vehicle | None,
+    truth: FlightTruth | None,
     crash: str | None,
 ) -> None:
-    truth = None if vehicle is None else vehicle.truth()
-    referee = (truth and vehicle and vehicle.report("truth")) or {}
+    log, report = (None, {}) if truth is None else (truth.log, truth.report)
     assert flight.outcome is not None
     asked, goal = config.fault or config.instruction, companion.pilot.goal_enu_m
-    flown = flight.trace.motion() if truth is None else truth
+    flown = flight.trace.motion() if log is None else log
     failures = dict(companion.plan_failures)
     files = {name: file_digest(name) for name in config.files}
     result = {
@@ -226,14 +226,14 @@ def _write(
         "fault": flight.injection.finish(),
         "detection": companion.protection.summary(),
         "goal_enu_m": goal.tolist(),
-        "world": referee.pop("world", None),
-        "referee": referee or None,
+        "world": report.get("world"),
+        "referee": {key: part for key, part in report.items() if key != "world"} or None,
         "versions": installed_versions(),
         "host": host,
         **({"plan_failures": failures} if failures else {}),
         **({"files": files} if files else {}),
     }
-    write_parquet(folder.trace, flight.trace.table(truth))
+    write_parquet(folder.trace, flight.trace.table(log))
     folder.write_plans(companion.plans)
     executor = companion.executor
     folder.write_timetable(executor.timetable, companion.reactions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -220,7 +220,7 @@ class Trace:
             "velocity_enu_mps": vehicle[:, 3:6],
         }
 
-    def table(self, truth: dict[str, np.ndarray] | None) -> pa.Table:
+    def table(self, truth: Mapping[str, FloatArray] | None) -> pa.Table:
         """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
 
         The stamps of report and trajectory and the index of the waypoint identify the messages of
@@ -249,7 +249,7 @@ class Trace:
             columns.update(self._truth_columns(truth))
         return pa.table(columns)
 
-    def _truth_columns(self, truth: dict[str, np.ndarray]) -> dict[str, pa.Array]:
+    def _truth_columns(self, truth: Mapping[str, FloatArray]) -> dict[str, pa.Array]:
         import pyarrow as pa
 
         stamps_ms = np.round(np.array(self._stamps) * 1e3)

@@ -1,8 +1,8 @@
 """The simulated vehicle of a mission: in the mission's own process, or beside it in another.
 
-Either way companion and vehicle share the bytes of a MAVLink link, and the folder in which the
-vehicle leaves its briefing before its first message and, at the end, the referee's truth. This is
-the only module of the companion's side that imports the vehicle's, and only to start it.
+Either way companion and vehicle share the bytes of a MAVLink link. The vehicle gives its briefing
+before its first message, and the referee's truth at the end: as objects in this process, or in the
+files of another. This is the only module of the companion's side that imports the vehicle's.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import socket
 import subprocess
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from mavfi_cli.core.errors import MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import Briefing, FloatArray
+from mavfi_cli.core.types import Briefing, FlightTruth
 from mavfi_cli.link.codec import Signing, key_from_file
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
@@ -34,70 +36,64 @@ _START_LIMIT_S = 120.0  # of a camera; its first start compiles
 _END_LIMIT_S = 20.0
 
 
-class Vehicle:
-    """A simulated vehicle: the link to it, and the folder in which it leaves its files."""
+class Vehicle(ABC):
+    """A simulated vehicle.
+
+    Attributes:
+        link: The companion's end of the link.
+        truth: What the referee saw; None before the end, or if the vehicle died before it.
+    """
 
     link: Transport
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    truth: FlightTruth | None = None
 
     @staticmethod
-    def start(config: MissionConfig, folder: Path) -> Vehicle:
+    def start(config: MissionConfig) -> Vehicle:
         """Start the vehicle in this process, or beside it where both run by the wall clock."""
-        return (VehicleProcess if config.realtime else VehicleInProcess)(config, folder)
+        return (VehicleProcess if config.realtime else VehicleInProcess)(config)
 
-    def end(self) -> VehicleProcessError | None:
-        """Close the link and save the truth; return why the vehicle ended before that, if it did.
-
-        Raises:
-            RecordError: the truth cannot be saved.
-        """
-        raise NotImplementedError
-
+    @abstractmethod
     def briefing(self) -> Briefing:
-        """Read start, goal, bounds and camera, which only the vehicle knows, as it has the world.
+        """Return start, goal, bounds and camera, which the world determines.
 
         Raises:
             VehicleProcessError: There is no briefing.
         """
-        try:
-            data = json.loads((self._folder / "briefing.json").read_text())
-            data["bounds_enu_m"][2::3] = LOWEST_M, HIGHEST_M
-            told: Any = {name: np.array(values, np.float64) for name, values in data.items()}
-            return Briefing(**told)
-        except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-            raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
 
-    def report(self, name: str) -> dict[str, Any] | None:
-        """Read a JSON file that the vehicle has left; None if it has not."""
-        path = self._folder / f"{name}.json"
-        told: dict[str, Any] | None = json.loads(path.read_text()) if path.is_file() else None
-        return told
+    @abstractmethod
+    def end(self) -> VehicleProcessError | None:
+        """Close the link and set the truth. Return why the vehicle ended before that, if it did.
 
-    def truth(self) -> dict[str, FloatArray] | None:
-        """Read the referee's log by column; None if the vehicle died before it was saved."""
-        if self.report("truth") is None:
-            return None
-        with np.load(self._folder / "truth.npz") as data:
-            return {name: data[name] for name in data.files}
+        May be called repeatedly.
+        """
 
 
 class VehicleInProcess(Vehicle):
     """The vehicle in this process; it flies while the companion waits for it.
 
-    Args:
-        folder: where the vehicle leaves its files.
-
     Raises:
-        MavfiError: the world, the vehicle, the start or the goal cannot be used.
+        MavfiError: The world, the vehicle, the start or the goal cannot be used.
     """
 
-    def __init__(self, config: MissionConfig, folder: Path) -> None:
-        from sitl.server import embedded
+    def __init__(self, config: MissionConfig) -> None:
+        from sitl.options import VehicleSetup  # loads JSBSim
+        from sitl.server import EmbeddedVehicle
 
-        super().__init__(folder)
-        self._vehicle = embedded(_arguments(config), folder)
+        seed = Stream.SENSOR.seed(config.seed, "firmware")
+        firmware = config.with_firmware().firmware
+        setup = VehicleSetup(
+            world=config.world,
+            seed=config.seed_of_world,
+            start_enu_m=config.start,
+            goal_enu_m=config.goal,
+            vehicle=config.vehicle,
+            camera_size=(config.camera_columns, config.camera_rows),
+            camera_rate_hz=config.camera_rate_hz,
+            firmware_kind=None if config.autopilot == OWN_AUTOPILOT else config.autopilot,
+            firmware=None if firmware is None else Path(firmware),
+            firmware_seed=seed,
+        )
+        self._vehicle = EmbeddedVehicle(setup)
         self.link = self._vehicle.link
 
     @staticmethod
@@ -107,9 +103,14 @@ class VehicleInProcess(Vehicle):
 
         warm_up()
 
+    def briefing(self) -> Briefing:
+        """See `Vehicle`."""
+        return _at_flight_levels(self._vehicle.briefing)
+
     def end(self) -> VehicleProcessError | None:
         """See `Vehicle`."""
         self._vehicle.end()
+        self.truth = self._vehicle.truth()
         error = self._vehicle.error
         if error is None:
             return None
@@ -118,24 +119,56 @@ class VehicleInProcess(Vehicle):
         return VehicleProcessError(why)
 
 
+def _at_flight_levels(briefing: Briefing) -> Briefing:
+    """Return a briefing whose bounds are those of the flight, not of the world."""
+    bounds = briefing.bounds_enu_m.copy()
+    bounds[2::3] = LOWEST_M, HIGHEST_M
+    return replace(briefing, bounds_enu_m=bounds)
+
+
+def read_briefing(folder: Path) -> Briefing:
+    """Read the briefing that a vehicle in another process has left.
+
+    Raises:
+        VehicleProcessError: There is none.
+    """
+    try:
+        data = json.loads((folder / "briefing.json").read_text())
+        arrays: Any = {name: np.array(values, np.float64) for name, values in data.items()}
+        return _at_flight_levels(Briefing(**arrays))
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
+
+
+def _read_truth(folder: Path) -> FlightTruth | None:
+    """Read the truth that a vehicle in another process has left; None if it has not."""
+    report, host = folder / "truth.json", folder / "host.json"
+    if not report.is_file():
+        return None
+    with np.load(folder / "truth.npz") as data:
+        log = {name: data[name] for name in data.files}
+    times: Any = json.loads(host.read_text()) if host.is_file() else {}
+    return FlightTruth(log=log, report=json.loads(report.read_text()), **times)
+
+
 class VehicleProcess(Vehicle):
     """`python -m sitl` in lockstep, as `VehicleInProcess`. Closing the socket ends it.
 
     Raises:
-        VehicleProcessError: it cannot be started.
+        VehicleProcessError: It cannot be started.
     """
 
     _name = "vehicle"
 
-    def __init__(self, config: MissionConfig, folder: Path) -> None:
-        super().__init__(folder)
+    def __init__(self, config: MissionConfig) -> None:
+        self._scratch = ScratchFolder("flight")
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         line = [*PYTHON, "-m", *self._line(config, theirs.fileno())]
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [*line, "--truth", str(folder)],
+                    [*line, "--truth", str(self._scratch.path)],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=self._errors,
@@ -145,6 +178,7 @@ class VehicleProcess(Vehicle):
             except OSError as error:
                 ours.close()
                 self._errors.close()
+                self._scratch.close()
                 raise VehicleProcessError(f"cannot start the {self._name}: {error}") from None
         self.link = open_transport(f"fd:{ours.detach()}")
 
@@ -156,6 +190,10 @@ class VehicleProcess(Vehicle):
             line.append("--lockstep")
         return [*line, "--speed", "1"] if config.realtime else line
 
+    def briefing(self) -> Briefing:
+        """See `Vehicle`."""
+        return read_briefing(self._scratch.path)
+
     def end(self) -> VehicleProcessError | None:
         """See `Vehicle`; a vehicle that does not end is killed."""
         self.link.close()
@@ -166,6 +204,8 @@ class VehicleProcess(Vehicle):
             self._process.wait()
         if self._errors.closed:
             return None
+        self.truth = _read_truth(self._scratch.path)
+        self._scratch.close()
         with self._errors:
             return self._failure(self._process.returncode)
 
@@ -174,9 +214,9 @@ class VehicleProcess(Vehicle):
             return None
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        told = [line for line in lines if line.startswith("error: ")]
-        if told:
-            return VehicleProcessError(told[-1].removeprefix("error: "), code)
+        errors = [line for line in lines if line.startswith("error: ")]
+        if errors:
+            return VehicleProcessError(errors[-1].removeprefix("error: "), code)
         how = f"ended with code {code}"
         if code < 0:
             how = f"was killed by {signal.Signals(-code).name}"
@@ -189,9 +229,9 @@ class _EyesProcess(VehicleProcess):
 
     _name = "camera"
 
-    def __init__(self, config: MissionConfig, folder: Path) -> None:
-        super().__init__(config, folder)
-        select.select([self.link.fileno()], [], [], _START_LIMIT_S)  # its first word, or its end
+    def __init__(self, config: MissionConfig) -> None:
+        super().__init__(config)
+        select.select([self.link.fileno()], [], [], _START_LIMIT_S)  # its first bytes, or its end
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -215,17 +255,17 @@ def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
     """Return the options of world, vehicle and camera; those of the camera have other names."""
     return [
         "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
-        size, f"{config.camera_columns}x{config.camera_rows}", rate, f"{config.camera_rate_hz:g}",
+        size, f"{config.camera_columns}x{config.camera_rows}", rate, repr(config.camera_rate_hz),
         *_place("start", config), *_place("goal", config),
     ]  # fmt: skip
 
 
 def _place(name: str, config: MissionConfig) -> list[str]:
     place = getattr(config, name)
-    return [] if place is None else [f"--{name}={','.join(f'{value:.9g}' for value in place)}"]
+    return [] if place is None else [f"--{name}={','.join(map(repr, place))}"]
 
 
-StartVehicle = Callable[[MissionConfig, Path], Vehicle]
+StartVehicle = Callable[[MissionConfig], Vehicle]
 
 
 def signing_of(config: MissionConfig) -> Signing | None:
@@ -246,7 +286,7 @@ def other_end(
     """Connect to a mission's foreign autopilot, or else to a simulated vehicle that starts.
 
     Raises:
-        MavfiError: the link cannot be opened, or the vehicle cannot start.
+        MavfiError: The link cannot be opened, or the vehicle cannot start.
     """
     if config.link is not None and not config.eyes:
         signing = signing_of(config)
@@ -254,8 +294,8 @@ def other_end(
         with contextlib.closing(open_transport(config.link, **signed)) as link:
             yield link, None
         return
-    with contextlib.ExitStack() as leaving:
-        folder = leaving.enter_context(ScratchFolder("flight"))
-        vehicle = (_EyesProcess if config.eyes else launch)(config, folder)
-        leaving.callback(vehicle.end)
+    vehicle = (_EyesProcess if config.eyes else launch)(config)
+    try:
         yield vehicle.link, vehicle
+    finally:
+        vehicle.end()

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
@@ -69,7 +68,10 @@ def _camera(
     truth: Path | None,
     key_file: Path | None,
     allow_unsigned: bool,
-    **of_world: Any,
+    world: str,
+    seed: int,
+    start_enu_m: Triple | None,
+    goal_enu_m: Triple | None,
 ) -> None:
     """Run depth camera and referee for an autopilot without a world, such as PX4 or ArduPilot SITL.
 
@@ -78,25 +80,25 @@ def _camera(
     MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE. The
     referee judges the same pose, and tells a collision in a STATUSTEXT.
     """
-    world = load_world(**of_world)
+    scene = load_world(world, seed=seed, start_enu_m=start_enu_m, goal_enu_m=goal_enu_m)
     profile = load_profile(vehicle)
     forward, left, up = profile.camera_mount_flu_m if mount is None else mount
     camera = Camera(
-        world.boxes_enu_m, columns=camera_size[0], rows=camera_size[1], rate_hz=camera_rate_hz,
+        scene.boxes_enu_m, columns=camera_size[0], rows=camera_size[1], rate_hz=camera_rate_hz,
         hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
         heartbeat_hz=camera_heartbeat_hz,
     )  # fmt: skip
     signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
-    witness = Witness(world, profile, logs=truth is not None)
+    witness = Witness(scene, profile, logs=truth is not None)
     if truth is not None:
-        world.write_briefing((forward, left, up), truth)
+        scene.write_briefing((forward, left, up), truth)
     stopped = stop_on_signals()
-    tracker = PoseTracker(world.start_enu_m if origin is None else np.array(origin))
+    tracker = PoseTracker(scene.start_enu_m if origin is None else np.array(origin))
     station = Station(
         camera, tracker, links, witness=witness, origin_given=origin is not None, signing=signing,
         allow_unsigned=allow_unsigned,
     )  # fmt: skip
-    place = f"depth camera in {world.name}, seed {world.seed}, on {', '.join(links)}"
+    place = f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}"
     with contextlib.closing(station):
         click.echo(place, err=True)
         try:

@@ -36,6 +36,7 @@ from mavfi_cli.core.errors import PlaceError, RecordError, UnknownName, WorldErr
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream
+from mavfi_cli.core.types import Briefing
 
 CLEAR_RADIUS_M = 3.0  # minimum horizontal distance of an obstacle from start and goal
 _START_CLEAR_M = 0.5  # distance of a start from a box, as the vehicle must be able to stand there
@@ -118,18 +119,22 @@ class World:
         boxes = [{"min_enu_m": box[:3], "max_enu_m": box[3:]} for box in self.boxes_enu_m.tolist()]
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
+    def briefing(self, camera_mount_flu_m: Sequence[float]) -> Briefing:
+        """Return what a companion knows before the first message."""
+        places = (self.start_enu_m, self.goal_enu_m, self.bounds_enu_m, camera_mount_flu_m)
+        start, goal, bounds, mount = (np.array(place, np.float64) for place in places)
+        return Briefing(
+            start_enu_m=start, goal_enu_m=goal, bounds_enu_m=bounds, camera_offset_flu_m=mount
+        )
+
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
-        """Write what a companion knows before the first message, or raise RecordError."""
+        """Write the briefing, or raise RecordError."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordError(f"{folder}: {error.strerror or error}") from None
-        briefing = {
-            "start_enu_m": self.start_enu_m.tolist(),
-            "goal_enu_m": self.goal_enu_m.tolist(),
-            "bounds_enu_m": self.bounds_enu_m.tolist(),
-            "camera_offset_flu_m": list(camera_mount_flu_m),
-        }
+        briefing = dataclasses.asdict(self.briefing(camera_mount_flu_m))
+        del briefing["hfov_rad"]  # the camera reports its own
         write_json(folder / "briefing.json", briefing)
 
 

@@ -33,10 +33,10 @@ def test_the_record_is_that_of_two_processes_with_a_socket_between(fly_short, ch
     assert record_digest(here.path) == record_digest(apart.path)
 
 
-def test_only_a_flight_by_the_wall_clock_has_a_vehicle_in_another_process(short_config, tmp_path):
+def test_only_a_flight_by_the_wall_clock_has_a_vehicle_in_another_process(short_config):
     paced = replace(short_config, realtime=True)
     for config, expected in ((short_config, False), (paced, True)):
-        vehicle = Vehicle.start(config, tmp_path)
+        vehicle = Vehicle.start(config)
         assert isinstance(vehicle, VehicleProcess) == expected
         assert vehicle.end() is None
 

@@ -29,7 +29,7 @@ from mavfi_cli.core.types import (
 from mavfi_cli.mission.measures import QUALITY, quality_of
 from mavfi_cli.mission.run import response_times
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
-from mavfi_cli.mission.vehicle import Vehicle
+from mavfi_cli.mission.vehicle import read_briefing
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, MARGIN_M, OF_THE_WORLD, MissionConfig
 from mavfi_cli.spec.platform import KERNELS
 
@@ -123,7 +123,7 @@ def test_a_vehicle_that_left_no_briefing(tmp_path, text):
     if text is not None:
         (tmp_path / "briefing.json").write_text(text)
     with pytest.raises(VehicleProcessError, match="no briefing"):
-        Vehicle(tmp_path).briefing()
+        read_briefing(tmp_path)
 
 
 # Files ---------------------------------------------------------------------------------------
