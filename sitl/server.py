@@ -20,7 +20,7 @@ import click
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.types import FlightTruth
-from mavfi_cli.link.codec import Codec, Signing, dialect, key_from_file
+from mavfi_cli.link.codec import Codec, Signing, dialect, signing_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
 from mavfi_cli.link.transport import Transport, memory_pair, open_transport
 from sitl.autopilot.autopilot import COMPONENT, Autopilot
@@ -296,8 +296,7 @@ class _Realtime:
         self._options = options
         self._simulation = simulation
         self._pace = _Pace(options.speed or 1.0)
-        file = options.key_file
-        signing = None if file is None else Signing(key_from_file(file), clock=time.time)
+        signing = signing_from_file(options.key_file)
         self._clients: Peers[Client] = Peers(signing=signing, allow_unsigned=options.allow_unsigned)
         for preset, url in options.links:  # one signing for all, so that no frame counts twice
             signs = None if parse_endpoint(url).scheme == "fd" else signing

@@ -20,7 +20,8 @@ from sitl.camera.component import Camera
 from sitl.firmware.autopilot import FirmwareAutopilot
 from sitl.referee import Referee
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Quadrotor, Truth
+from sitl.vehicle.truth import Truth
+from sitl.vehicle.vehicle import Quadrotor
 from sitl.world import World
 
 HOST_FILE = "host.json"  # where this machine's time went; beside the truth, and no part of it

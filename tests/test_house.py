@@ -16,7 +16,7 @@ SOURCES = {
     for path in sorted((ROOT / package).rglob("*.py"))
 }
 LONGEST_STUDY = 150  # lines of a module
-LONGEST_CHAIN = 21  # modules, each of which imports the next, wherever the import stands
+LONGEST_CHAIN = 19  # modules, each of which imports the next, wherever the import stands
 MOST_FILES = 260
 MOST_NAMES = 800  # public classes and functions at the top level of modules
 # Functions that nothing in the product calls by name, with the reason to keep them.

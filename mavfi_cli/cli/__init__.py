@@ -14,7 +14,7 @@ from typing import NoReturn
 import click
 from click.shell_completion import CompletionItem
 
-from mavfi_cli.core.caches import choose_caches
+from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
 
 # name -> (module, what it does); the help page must not import the modules. One of the vehicle's

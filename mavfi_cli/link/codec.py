@@ -15,6 +15,7 @@ import hashlib
 import hmac
 import re
 import struct
+import time
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -47,21 +48,6 @@ _KINDS: dict[int, _Kind] = {}
 def key_from_passphrase(passphrase: str) -> bytes:
     """Return the 32-byte key of a passphrase, its SHA-256, as ground stations compute it."""
     return hashlib.sha256(passphrase.encode()).digest()
-
-
-def key_from_file(path: Path) -> bytes:
-    """Return the key of the passphrase in a file, without the white space around it.
-
-    Raises ConfigError if the file cannot be read or is empty.
-    """
-    try:
-        passphrase = path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"cannot read the passphrase: {problem}", path=path) from None
-    if not passphrase:
-        raise ConfigError("holds no passphrase", path=path)
-    return key_from_passphrase(passphrase)
 
 
 class Signing:
@@ -123,6 +109,24 @@ class Signing:
 
     def _digest(self, data: bytes) -> bytes:
         return hashlib.sha256(self._key + data).digest()[:6]
+
+
+def signing_from_file(path: str | Path | None) -> Signing | None:
+    """Return the signing with the passphrase in a file, on this host's clock; None without a file.
+
+    White space around the passphrase does not count. Raises ConfigError if the file cannot be read
+    or is empty.
+    """
+    if path is None:
+        return None
+    try:
+        passphrase = Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"cannot read the passphrase: {problem}", path=Path(path)) from None
+    if not passphrase:
+        raise ConfigError("holds no passphrase", path=Path(path))
+    return Signing(key_from_passphrase(passphrase), clock=time.time)
 
 
 def _timestamp(frame: bytes) -> int:

@@ -14,7 +14,6 @@ import signal
 import socket
 import subprocess
 import tempfile
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -28,7 +27,7 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FlightTruth
-from mavfi_cli.link.codec import Signing, key_from_file
+from mavfi_cli.link.codec import signing_from_file
 from mavfi_cli.link.transport import Transport, open_transport
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
 
@@ -268,17 +267,6 @@ def _place(name: str, config: MissionConfig) -> list[str]:
 StartVehicle = Callable[[MissionConfig], Vehicle]
 
 
-def signing_of(config: MissionConfig) -> Signing | None:
-    """Return the signing of a mission's link.
-
-    Raises:
-        ConfigError: The key file cannot be read.
-    """
-    if config.key_file is None:
-        return None
-    return Signing(key_from_file(Path(config.key_file)), clock=time.time)
-
-
 @contextlib.contextmanager
 def other_end(
     config: MissionConfig, launch: StartVehicle = Vehicle.start
@@ -289,7 +277,7 @@ def other_end(
         MavfiError: The link cannot be opened, or the vehicle cannot start.
     """
     if config.link is not None and not config.eyes:
-        signing = signing_of(config)
+        signing = signing_from_file(config.key_file)
         signed: Any = {"signed": True, "admits": signing.vouches} if signing is not None else {}
         with contextlib.closing(open_transport(config.link, **signed)) as link:
             yield link, None

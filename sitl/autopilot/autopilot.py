@@ -15,7 +15,7 @@ from sitl.autopilot.flight_modes import Guidance, begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
 from sitl.autopilot.telemetry import Link, Links, Setpoint, Snapshot, no_setpoint
 from sitl.geodesy import Origin
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 COMPONENT = 1
 _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4

@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.parameters import Parameters
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused

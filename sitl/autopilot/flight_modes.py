@@ -15,7 +15,7 @@ from mavfi_cli.core.frames import Vector, dot, norm
 from sitl.autopilot.commander import FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.telemetry import Setpoint, Snapshot
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 _POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4
 _CLIMB_MPS = 0.3  # minimum climb speed of a setpoint that leaves the ground

@@ -24,7 +24,7 @@ from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVers
 from sitl.autopilot.commander import Commander, FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.geodesy import Origin
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 TICK_US = 20_000  # period of the control loop
 STEPS_A_TICK = 5

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import click
 import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.link.codec import Signing, key_from_file
+from mavfi_cli.link.codec import signing_from_file
 from sitl.camera.component import Camera
 from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.command_line import (
@@ -88,7 +87,7 @@ def _camera(
         hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
         heartbeat_hz=camera_heartbeat_hz,
     )  # fmt: skip
-    signing = None if key_file is None else Signing(key_from_file(key_file), time.time)
+    signing = signing_from_file(key_file)
     witness = Witness(scene, profile, logs=truth is not None)
     if truth is not None:
         scene.write_briefing((forward, left, up), truth)

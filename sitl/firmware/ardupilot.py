@@ -24,7 +24,7 @@ from sitl.firmware.sensors import Sensors
 from sitl.geodesy import Origin
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 PORT = 9002
 _LOOPBACK = "127.0.0.1"

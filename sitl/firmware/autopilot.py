@@ -21,7 +21,7 @@ from mavfi_cli.link.transport import Transport
 from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.geodesy import Origin
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 _STATE_US = 20_000.0
 _STREAMS_US = {

@@ -26,7 +26,7 @@ from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 PORT = 4560
 STEP_S = 0.004  # PX4's SITL takes inertial samples at 250 Hz

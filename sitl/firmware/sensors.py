@@ -9,7 +9,7 @@ import numpy as np
 from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import GRAVITY_MPS2
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 # Standard deviations of white noise, of the size that PX4's own simulated sensors have.
 GYRO_RADPS = 0.003

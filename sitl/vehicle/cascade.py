@@ -19,6 +19,7 @@ import numpy as np
 
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import Vector
+from sitl.vehicle.truth import T_ON_GROUND, T_POSITION, T_QUATERNION, T_RATES, T_VELOCITY
 
 # Setpoint (11,): NED, m, m/s, m/s^2, rad, rad/s; NaN means not controlled.
 SP_POSITION = 0
@@ -28,13 +29,7 @@ SP_YAW = 9
 SP_YAW_RATE = 10
 SETPOINT_SIZE = 11
 
-# Measurement (33,): what the controller reads of the vehicle's truth, at its places there
-M_POSITION = 1  # NED, m
-M_VELOCITY = 4  # NED, m/s
-M_QUATERNION = 10  # w x y z, body FRD -> NED
-M_RATES = 14  # body FRD, rad/s
-M_ON_GROUND = 25  # 0 or 1
-MEASUREMENT_SIZE = 33
+# A measurement (33,) is the vehicle's truth, in the order of `sitl.vehicle.truth`.
 
 # Controller state (21,)
 S_VELOCITY_INTEGRAL = 0  # NED, m/s^2
@@ -172,7 +167,7 @@ def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector
         position = clean[SP_POSITION + axis]
         velocity = clean[SP_VELOCITY + axis]
         if math.isfinite(position):
-            error = position - measurement[M_POSITION + axis]
+            error = position - measurement[T_POSITION + axis]
             target[axis] = gains[G_POSITION_P + axis] * error
             if math.isfinite(velocity):
                 target[axis] += velocity
@@ -235,7 +230,7 @@ def acceleration_target(
     model = state[S_MODEL_VELOCITY : S_MODEL_VELOCITY + 3]
     total = np.empty(3)
     for axis in range(3):
-        measured = measurement[M_VELOCITY + axis]
+        measured = measurement[T_VELOCITY + axis]
         if not math.isfinite(target[axis]):
             model[axis] = measured
         error = model[axis] - measured
@@ -256,7 +251,7 @@ def acceleration_target(
 @compiled
 def rotation(measurement: Vector) -> Vector:
     """Return the rotation matrix (3, 3), body FRD -> NED, of the measured attitude."""
-    w, x, y, z = measurement[M_QUATERNION : M_QUATERNION + 4]
+    w, x, y, z = measurement[T_QUATERNION : T_QUATERNION + 4]
     matrix = np.empty((3, 3))
     matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     matrix[0, 1] = 2.0 * (x * y - w * z)
@@ -356,7 +351,7 @@ def _torque(
     dt = gains[G_DT]
     angular = np.empty(3)
     for axis in range(3):
-        rate = measurement[M_RATES + axis]
+        rate = measurement[T_RATES + axis]
         error = rates_wanted[axis] - rate
         derivative = (rate - state[S_LAST_RATES + axis]) / dt
         state[S_LAST_RATES + axis] = rate
@@ -370,7 +365,7 @@ def _torque(
             + state[S_RATE_INTEGRAL + axis]
             - gains[G_RATE_D + axis] * derivative
         )
-    p, q, r = measurement[M_RATES : M_RATES + 3]
+    p, q, r = measurement[T_RATES : T_RATES + 3]
     ix, iy, iz = gains[G_INERTIA : G_INERTIA + 3]
     result = np.empty(3)
     result[0] = ix * angular[0] + q * r * (iz - iy)
@@ -430,8 +425,8 @@ def _resting_state(measurement: Vector, matrix: Vector) -> Vector:
     state = np.zeros(STATE_SIZE)
     state[S_HEADING] = math.atan2(matrix[1, 0], matrix[0, 0])
     for axis in range(3):
-        state[S_MODEL_VELOCITY + axis] = measurement[M_VELOCITY + axis]
-        state[S_LAST_RATES + axis] = measurement[M_RATES + axis]
+        state[S_MODEL_VELOCITY + axis] = measurement[T_VELOCITY + axis]
+        state[S_LAST_RATES + axis] = measurement[T_RATES + axis]
     return state
 
 
@@ -449,7 +444,7 @@ def control_step(
         return _resting_state(measurement, matrix), np.zeros(4)
     clean = clean_setpoint(setpoint, gains)
     target = velocity_target(clean, measurement, gains)
-    on_ground = measurement[M_ON_GROUND] > 0.5
+    on_ground = measurement[T_ON_GROUND] > 0.5
     climbing = target[2] < -LIFT_OFF_MPS
     if on_ground and not climbing:
         return _resting_state(measurement, matrix), np.full(4, throttle(IDLE_SHARE, gains))

@@ -12,20 +12,26 @@ from mavfi_cli.core.frames import Vector, ned_from_enu, ned_yaw_from_enu
 from sitl.vehicle import cascade, physics
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import VehicleProfile
-
-T_STAMP = 0
-T_POSITION = cascade.M_POSITION
-T_VELOCITY = cascade.M_VELOCITY
-T_ACCELERATION = 7
-T_QUATERNION = cascade.M_QUATERNION
-T_RATES = cascade.M_RATES
-T_COMMANDS = 17
-T_RPM = 21
-T_ON_GROUND = cascade.M_ON_GROUND
-T_VOLTAGE, T_CURRENT, T_REMAINING = 26, 27, 28
-T_POWER_REGRESSION, T_POWER_PROPELLER = 29, 30
-T_ENERGY_REGRESSION, T_ENERGY_PROPELLER = 31, 32
-TRUTH_SIZE = cascade.MEASUREMENT_SIZE
+from sitl.vehicle.truth import (
+    T_ACCELERATION,
+    T_COMMANDS,
+    T_CURRENT,
+    T_ENERGY_PROPELLER,
+    T_ENERGY_REGRESSION,
+    T_ON_GROUND,
+    T_POSITION,
+    T_POWER_PROPELLER,
+    T_POWER_REGRESSION,
+    T_QUATERNION,
+    T_RATES,
+    T_REMAINING,
+    T_RPM,
+    T_STAMP,
+    T_VELOCITY,
+    T_VOLTAGE,
+    TRUTH_SIZE,
+    Truth,
+)
 
 KMH_PER_MPS = 3.6
 
@@ -33,68 +39,6 @@ KMH_PER_MPS = 3.6
 _KNEES = np.array([0.0, 0.1, 0.5, 1.0])
 
 PHYSICS_DT_S = 0.004
-
-
-class _Scalar:
-    """An attribute of `Truth` that is one number of its array."""
-
-    def __init__(self, index: int) -> None:
-        self._index = index
-
-    def __get__(self, truth: Truth, owner: type) -> float:
-        return float(truth.flat[self._index])
-
-
-class Truth:
-    """Read-only view of the newest state. It is updated in place, so copy values to keep them.
-
-    The position is that of the centre of mass in the NED frame at the world origin on the ground.
-    """
-
-    stamp_s = _Scalar(T_STAMP)  # since the creation of the vehicle
-    battery_voltage_v = _Scalar(T_VOLTAGE)  # at the terminals
-    battery_current_a = _Scalar(T_CURRENT)
-    battery_remaining = _Scalar(T_REMAINING)  # charge, 0..1
-    power_regression_w = _Scalar(T_POWER_REGRESSION)  # published regression; 0 while disarmed
-    power_propeller_w = _Scalar(T_POWER_PROPELLER)  # at the shafts of all rotors
-    energy_regression_j = _Scalar(T_ENERGY_REGRESSION)
-    energy_propeller_j = _Scalar(T_ENERGY_PROPELLER)
-
-    def __init__(self, flat: Vector) -> None:
-        view = flat.view()
-        view.flags.writeable = False
-        self.flat = view  # (TRUTH_SIZE,) all values in the order of the T_ constants
-        self.position_ned_m = view[T_POSITION : T_POSITION + 3]  # (3,)
-        self.velocity_ned_mps = view[T_VELOCITY : T_VELOCITY + 3]  # (3,)
-        self.acceleration_ned_mps2 = view[T_ACCELERATION : T_ACCELERATION + 3]  # (3,)
-        self.quaternion_frd_ned = view[T_QUATERNION : T_QUATERNION + 4]  # (4,) w x y z
-        self.rates_frd_radps = view[T_RATES : T_RATES + 3]  # (3,)
-        self.motor_commands = view[T_COMMANDS : T_COMMANDS + 4]  # (4,) 0..1
-        self.motor_rpm = view[T_RPM : T_RPM + 4]  # (4,)
-
-    @property
-    def on_ground(self) -> bool:
-        """True if a landing leg carries weight."""
-        return bool(self.flat[T_ON_GROUND] > 0.5)
-
-    @property
-    def euler_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw from north, z-y-x."""
-        w, x, y, z = self.quaternion_frd_ned.tolist()
-        return (
-            math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-            math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
-            math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-        )
-
-    def wreck(self) -> Truth:
-        """Return the state of a vehicle that stays where it is with its motors stopped."""
-        flat = self.flat.copy()
-        flat[T_VELOCITY:T_QUATERNION] = 0.0  # and acceleration
-        flat[T_RATES:T_RPM] = 0.0  # and motor commands
-        flat[[T_CURRENT, T_POWER_REGRESSION, T_POWER_PROPELLER]] = 0.0
-        flat[T_ON_GROUND] = 1.0
-        return Truth(flat)
 
 
 @compiled

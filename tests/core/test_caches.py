@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.core import caches
+from mavfi_cli.core import compiled
 from mavfi_cli.core.files import PACKAGE
 
 VARIABLES = ("NUMBA_CACHE_DIR", "MPLCONFIGDIR")
@@ -30,7 +30,7 @@ def chosen(tmp_path, monkeypatch):
             return not any(Path(path).is_relative_to(each) for each in unwritable)
 
         monkeypatch.setattr("os.access", access)
-        caches.choose_caches.__wrapped__()
+        compiled.choose_caches.__wrapped__()
         return [os.environ.get(name) for name in VARIABLES]
 
     return choose
@@ -81,7 +81,7 @@ def test_what_others_put_at_that_place_is_not_used(chosen, tmp_path, capsys, min
 
 def test_functions_compile_where_nothing_beside_the_sources_can_be_written(tmp_path):
     code = (
-        "import os, pathlib; from mavfi_cli.core.caches import PACKAGE\n"
+        "import os, pathlib; from mavfi_cli.core.compiled import PACKAGE\n"
         "access = os.access\n"
         "os.access = lambda path, mode: PACKAGE not in [path, *pathlib.Path(path).parents] "
         "and access(path, mode)\n"

@@ -7,7 +7,7 @@ from mavfi_cli.link.codec import Codec, dialect
 from sitl.autopilot.autopilot import Autopilot
 from sitl.autopilot.services import handle
 from sitl.autopilot.telemetry import TICK_US, Preset
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 
 NAN = math.nan
 REST_M = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavfi_cli.link.transport import Transport, open_transport
-from sitl.vehicle.vehicle import T_QUATERNION, TRUTH_SIZE, Truth
+from sitl.vehicle.truth import T_QUATERNION, TRUTH_SIZE, Truth
 
 
 @pytest.fixture

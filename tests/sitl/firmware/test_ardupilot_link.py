@@ -15,7 +15,7 @@ from mavfi_cli.core.errors import VehicleProcessError
 from sitl.firmware import ardupilot
 from sitl.firmware.ardupilot import ArduPilotLink
 from sitl.firmware.sensors import Sensors
-from sitl.vehicle.vehicle import T_POSITION, T_QUATERNION, TRUTH_SIZE, Truth
+from sitl.vehicle.truth import T_POSITION, T_QUATERNION, TRUTH_SIZE, Truth
 from tests.sitl.firmware.recorded import ARDUPILOT_CLIMB, ARDUPILOT_FIRST
 
 MAGIC = 18458

@@ -11,7 +11,7 @@ from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.autopilot.telemetry import Preset
 from sitl.firmware.autopilot import FirmwareAutopilot
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 from tests.sitl.firmware.recorded import PX4_HEARTBEAT, PX4_POSITION
 
 Wire = tuple[Transport, socket.socket]

@@ -14,7 +14,7 @@ from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport
 from sitl.firmware.px4 import ANSWER_LIMIT_S, Px4Link
 from sitl.firmware.sensors import FIELD_NED_GAUSS, Sensors
-from sitl.vehicle.vehicle import Truth
+from sitl.vehicle.truth import Truth
 from tests.sitl.firmware.recorded import PX4_CONTROLS, PX4_HELLO
 
 Wire = tuple[Transport, socket.socket]

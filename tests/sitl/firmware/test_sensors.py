@@ -16,7 +16,8 @@ from sitl.firmware.sensors import (
 )
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import GRAVITY_MPS2, load_profile
-from sitl.vehicle.vehicle import T_QUATERNION, TRUTH_SIZE, Quadrotor, Truth
+from sitl.vehicle.truth import T_QUATERNION, TRUTH_SIZE, Truth
+from sitl.vehicle.vehicle import Quadrotor
 
 
 def _at_rest(quaternion: list[float]) -> Truth:

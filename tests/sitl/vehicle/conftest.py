@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sitl.vehicle.profile import load_profile
-from sitl.vehicle.vehicle import PHYSICS_DT_S, T_POSITION, T_QUATERNION, T_VELOCITY, Quadrotor
+from sitl.vehicle.truth import T_POSITION, T_QUATERNION, T_VELOCITY
+from sitl.vehicle.vehicle import PHYSICS_DT_S, Quadrotor
 
 FREE = math.nan
 

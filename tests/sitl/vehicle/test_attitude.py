@@ -12,6 +12,7 @@ from sitl.vehicle import cascade
 from sitl.vehicle.cascade import rotation, specific_force, tilt_rates
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
+from sitl.vehicle.truth import T_QUATERNION, TRUTH_SIZE
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
 angles = st.floats(-3.0, 3.0)
@@ -19,8 +20,8 @@ accelerations = st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3).map(np.
 
 
 def measured(quaternion):
-    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
-    measurement[cascade.M_QUATERNION : cascade.M_QUATERNION + 4] = quaternion
+    measurement = np.zeros(TRUTH_SIZE)
+    measurement[T_QUATERNION : T_QUATERNION + 4] = quaternion
     return measurement
 
 

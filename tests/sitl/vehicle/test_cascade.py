@@ -11,6 +11,7 @@ from sitl.vehicle import cascade
 from sitl.vehicle.cascade import control_step
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import PROFILES, load_profile
+from sitl.vehicle.truth import T_ON_GROUND, T_QUATERNION, T_RATES, TRUTH_SIZE
 
 GAINS = {name: gains_for(load_profile(name), 0.004) for name in PROFILES.names}
 names = st.sampled_from(PROFILES.names)
@@ -20,12 +21,12 @@ small = st.floats(-1.0, 1.0)
 
 @st.composite
 def measurements(draw, on_ground=0.0):
-    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
+    measurement = np.zeros(TRUTH_SIZE)
     measurement[:6] = [100.0 * draw(small) for _ in range(3)] + [5.0 * draw(small)] * 3
     quaternion = quaternion_from_euler(*(3.0 * draw(small) for _ in range(3)))
-    measurement[cascade.M_QUATERNION : cascade.M_QUATERNION + 4] = quaternion
-    measurement[cascade.M_RATES : cascade.M_RATES + 3] = [10.0 * draw(small) for _ in range(3)]
-    measurement[cascade.M_ON_GROUND] = on_ground
+    measurement[T_QUATERNION : T_QUATERNION + 4] = quaternion
+    measurement[T_RATES : T_RATES + 3] = [10.0 * draw(small) for _ in range(3)]
+    measurement[T_ON_GROUND] = on_ground
     return measurement
 
 

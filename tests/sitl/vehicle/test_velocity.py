@@ -11,6 +11,7 @@ from sitl.vehicle import cascade
 from sitl.vehicle.cascade import acceleration_target, velocity_target
 from sitl.vehicle.gains import gains_for
 from sitl.vehicle.profile import load_profile
+from sitl.vehicle.truth import T_QUATERNION, TRUTH_SIZE
 
 GAINS = gains_for(load_profile("solo"), 0.004)
 FREE = math.nan
@@ -25,8 +26,8 @@ def setpoint(**fields):
 
 
 def at_rest():
-    measurement = np.zeros(cascade.MEASUREMENT_SIZE)
-    measurement[cascade.M_QUATERNION] = 1.0
+    measurement = np.zeros(TRUTH_SIZE)
+    measurement[T_QUATERNION] = 1.0
     return measurement
 
 
