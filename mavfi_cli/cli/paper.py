@@ -91,7 +91,7 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
     """
     from mavfi_cli.report.page import render, require_page
 
-    require_page(output)  # before what takes long, and before what needs scipy
+    require_page(output)  # before what takes long
     from mavfi_cli.core.files import write_text
     from mavfi_cli.paper.document import document
     from mavfi_cli.paper.sources import Evidence

@@ -49,7 +49,7 @@ _WHEELS = {
     "pyoctomap": "pyoctomap", "ompl": "ompl", "python-fcl": "fcl", "pyarrow": "pyarrow",
     "matplotlib": "matplotlib", "click": "click", "rich": "rich", "cattrs": "cattrs",
     "pyserial": "serial", "capstone": "capstone", "pyelftools": "elftools",
-    "tomli-w": "tomli_w",
+    "scipy": "scipy", "tomli-w": "tomli_w",
 }  # fmt: skip
 _EXTRAS = {
     "train": "torch", "cluster": "distributed", "pandas": "pandas", "report": "jinja2",

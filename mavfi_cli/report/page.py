@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FOLDER = Path(__file__).parent
-_LIBRARIES = ("jinja2", "scipy")  # of the extra `report`
 _NONE = "\N{EN DASH}"
 
 
@@ -35,14 +34,11 @@ def require_page(path: Path) -> None:
     """Check what a page needs before its numbers are computed.
 
     Raises:
-        MavfiError: a library of the extra `report` is not installed. Says how to install it.
+        MavfiError: jinja2, which the extra `report` installs, is missing.
         RecordError: the page's folder does not exist.
     """
-    lacking = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
-    if lacking:
-        raise MavfiError(
-            f"the report needs {' and '.join(lacking)}; install with: pip install 'mavfi[report]'"
-        )
+    if importlib.util.find_spec("jinja2") is None:
+        raise MavfiError("the report needs jinja2; install with: pip install 'mavfi[report]'")
     require_output(path)
 
 

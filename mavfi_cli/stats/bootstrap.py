@@ -1,26 +1,24 @@
 """Bootstrap intervals of flight time, distance, energy, replans, and of their paired differences.
 
-BCa: bias-corrected and accelerated (B. Efron, JASA 82, 1987). It is seeded, so the same numbers
-give the same interval.
+SciPy resamples, with a fixed seed, so the same numbers give the same interval.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.stats.shares import Interval, z_of
+from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 RESAMPLES = 9999
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
 LARGE = 500  # from here on the mean is normal and the bootstrap would only be slow
-BLOCKS = 2000  # with more values whole blocks are left out in turn
-_CHUNK = 4_000_000  # numbers drawn at once
+CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
@@ -43,64 +41,52 @@ def interval(
     resamples: int = RESAMPLES,
     seed: int = 1,
 ) -> Interval:
-    """A statistic with its BCa interval, or the normal one for the mean of LARGE samples.
+    """A statistic with its bootstrap interval, or the normal one for the mean of LARGE samples.
+
+    The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is that of the
+    percentiles if BCa is not defined, as for the median of tied values, and if there are more
+    values than resamples, because BCa leaves out each value in turn.
 
     Args:
         values: (n,) one value per mission; the differences for a paired difference.
         statistic: reduces the last axis of an array.
     """
     sample = np.asarray(values, dtype=np.float64)
-    if len(sample) == 0:
-        return Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
-    value = float(statistic(sample))
-    if len(sample) == 1 or float(np.ptp(sample)) == 0.0:
-        spread = math.nan if len(sample) == 1 else value
-        return Interval(value=value, low=spread, high=spread, count=len(sample))
-    if statistic is mean and len(sample) >= LARGE:
-        half = z_of(confidence) * float(sample.std(ddof=1)) / math.sqrt(len(sample))
-        return Interval(value=value, low=value - half, high=value + half, count=len(sample))
-    drawn = _resampled(sample, statistic, resamples, seed)
-    low, high = np.quantile(drawn, _levels(sample, statistic, drawn, value, confidence))
-    return Interval(value=value, low=float(low), high=float(high), count=len(sample))
+    count = len(sample)
+    if count == 0:
+        return NO_INTERVAL
+    value = low = high = float(statistic(sample))
+    if count == 1:
+        low = high = math.nan
+    elif float(np.ptp(sample)) != 0.0:
+        if statistic is mean and count >= LARGE:
+            half = z_of(confidence) * float(sample.std(ddof=1)) / math.sqrt(count)
+            low, high = value - half, value + half
+        else:
+            low, high = _resampled(sample, statistic, confidence, resamples, seed)
+    return Interval(value=value, low=low, high=high, count=count)
 
 
-def _resampled(sample: FloatArray, statistic: Statistic, resamples: int, seed: int) -> FloatArray:
-    rng = np.random.Generator(np.random.PCG64(seed))
-    rows = max(1, _CHUNK // len(sample))
-    parts = [
-        statistic(
-            sample[rng.integers(len(sample), size=(min(rows, resamples - done), len(sample)))]
-        )
-        for done in range(0, resamples, rows)
-    ]
-    return np.concatenate(parts)
+def _resampled(
+    sample: FloatArray, statistic: Statistic, confidence: float, resamples: int, seed: int
+) -> tuple[float, float]:
+    """Ends of the bootstrap interval."""
+    from scipy.stats import DegenerateDataWarning, bootstrap
 
-
-def _levels(
-    sample: FloatArray, statistic: Statistic, drawn: FloatArray, value: float, confidence: float
-) -> list[float]:
-    """The quantiles of the resampled statistic that are the ends of the interval."""
-    normal = NormalDist()
-    counted = int(np.count_nonzero(drawn < value)) + int(np.count_nonzero(drawn <= value))
-    least = 1.0 / (len(drawn) + 1)  # the quantile of 0 or 1 is infinite
-    bias = normal.inv_cdf(min(max(counted / (2 * len(drawn)), least), 1.0 - least))
-    left_out = _left_out(sample, statistic)
-    centred = left_out.mean() - left_out
-    scale = float((centred**2).sum()) ** 1.5
-    acceleration = float((centred**3).sum()) / (6.0 * scale) if scale > 0.0 else 0.0
-    levels = []
-    for z in (-z_of(confidence), z_of(confidence)):
-        shifted = bias + z
-        levels.append(normal.cdf(bias + shifted / (1.0 - acceleration * shifted)))
-    return levels
-
-
-def _left_out(sample: FloatArray, statistic: Statistic) -> FloatArray:
-    """The statistic without each value in turn, or without each of BLOCKS blocks if many."""
-    if statistic is mean:
-        return np.asarray((sample.sum() - sample) / (len(sample) - 1))
-    blocks = np.array_split(np.arange(len(sample)), min(len(sample), BLOCKS))
-    return np.array([float(statistic(np.delete(sample, block))) for block in blocks])
+    result, ends = None, (math.nan, math.nan)
+    for method in ("BCa", "percentile")[len(sample) > resamples :]:
+        with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
+            warnings.simplefilter("ignore", DegenerateDataWarning)
+            result = bootstrap(
+                (sample,), lambda drawn, **_axis: statistic(drawn), vectorized=True,
+                method=method, confidence_level=confidence,
+                n_resamples=0 if result else resamples, bootstrap_result=result,
+                batch=max(1, CHUNK // len(sample)), rng=np.random.default_rng(seed),
+            )  # fmt: skip
+        ends = float(result.confidence_interval.low), float(result.confidence_interval.high)
+        if not any(map(math.isnan, ends)):
+            break
+    return ends
 
 
 def interval_of_rows(

@@ -20,14 +20,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.stats.bootstrap import CHUNK, RESAMPLES
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
-_EXACT = 16  # all signs are tried up to this many differences
-_FLIPS = 9999  # number of random sign patterns for more
-_CHUNK = 4_000_000  # numbers drawn at once
 OWN = (1.0,)  # golden values over their own, for `worst_case` whatever the missions' lengths
-_SLACK = 1e-9  # relative to the largest sum; equal sums differ by rounding
+_DIGITS = 9  # of a sum over the largest sum; equal sums differ by rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,14 +51,17 @@ class McNemar:
         Args:
             first, second: success of each mission under each treatment, (n,).
         """
+        from scipy.stats import binomtest
+
         ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
         neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
+        differing = only_first + only_second
         return cls(
             both=both,
             only_first=only_first,
             only_second=only_second,
             neither=neither,
-            p_value=_coins(min(only_first, only_second), only_first + only_second),
+            p_value=float(binomtest(only_first, differing).pvalue) if differing else 1.0,
         )
 
     @property
@@ -95,45 +96,33 @@ class McNemar:
         )
 
 
-def _coins(few: int, total: int) -> float:
-    """Two-sided probability of at most `few` heads or tails among fair coins."""
-    ways = tail = 1  # of no heads; whole numbers, exact up to the one division
-    for heads in range(1, few + 1):
-        ways = ways * (total - heads + 1) // heads
-        tail += ways
-    half: int = 1 << (total - 1) if total else 1
-    return min(1.0, tail / half)
-
-
 def sign_flips(differences: Sequence[float]) -> float:
     """Two-sided p-value of Fisher's randomisation test of paired differences.
 
     Without an effect both signs of a difference are equally likely. The test assumes no
     distribution, so it is valid if most differences are zero and a bootstrap interval is too
-    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried. For
-    more than _EXACT differences, _FLIPS seeded random patterns are tried.
+    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried if there
+    are at most RESAMPLES patterns, else RESAMPLES seeded random patterns.
 
     Args:
         differences: one for each independent pair; zeros have no effect.
 
     Returns:
-        1 if nothing differs.
+        1 if at most one differs.
     """
-    values = np.array([each for each in differences if each != 0.0])
-    count = len(values)
-    if count == 0:
+    from scipy.stats import permutation_test
+
+    values = np.array([difference for difference in differences if difference != 0.0])
+    if len(values) < 2:
         return 1.0
-    least = abs(float(values.sum())) - _SLACK * float(np.abs(values).sum())
-    if count <= _EXACT:
-        flipped = (np.arange(1 << count)[:, None] >> np.arange(count)) & 1
-        return float(np.mean(np.abs((1 - 2 * flipped) @ values) >= least))
-    rng = np.random.Generator(np.random.PCG64(1))
-    rows = max(1, _CHUNK // count)
-    extreme = 0
-    for done in range(0, _FLIPS, rows):
-        signs = 1 - 2 * rng.integers(2, size=(min(rows, _FLIPS - done), count))
-        extreme += int(np.count_nonzero(np.abs(signs @ values) >= least))
-    return (1 + extreme) / (1 + _FLIPS)
+    scale = float(np.abs(values).sum())
+    result = permutation_test(
+        (values,),
+        lambda flipped, axis: np.round(np.abs(flipped.sum(axis)) / scale, _DIGITS),
+        permutation_type="samples", alternative="greater", vectorized=True,
+        n_resamples=RESAMPLES, batch=max(1, CHUNK // len(values)), rng=np.random.default_rng(1),
+    )  # fmt: skip
+    return float(result.pvalue)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from mavfi_cli.stats.shares import z_of
 
-_HALVINGS = 60
+_NEAR = 1e-9  # areas of 0 and 1 have no spread, so their far ends are searched from beside them
 
 
 def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, Any]:
@@ -33,6 +33,8 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, A
         curve; it depends on the mix of flights, chance is positives / (positives + negatives).
         `operating_point`: false positive rate and recall at the detector's own threshold.
     """
+    from scipy.stats import rankdata
+
     positive, negative = (np.sort(np.asarray(s, np.float64)) for s in (harmful, error_free))
     found: dict[str, Any] = {"positives": len(positive), "negatives": len(negative)}
     if not len(positive) or not len(negative):
@@ -47,8 +49,9 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, A
     recall, precision = hits / len(positive), hits / (hits + false)
     below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
     # The probability that a harmful fault scores higher than an error-free flight, ties halved.
-    pairs = [np.searchsorted(negative, positive, side=side) for side in ("left", "right")]
-    area = float((pairs[0] + pairs[1]).sum() / (2.0 * len(positive) * len(negative)))
+    ranks = rankdata(np.concatenate([positive, negative]))[: len(positive)]
+    above = float(ranks.sum()) - len(positive) * (len(positive) + 1) / 2.0  # Mann-Whitney's U
+    area = above / (len(positive) * len(negative))
     low, high = _area_interval(area, len(positive), len(negative))
     return {
         **found,
@@ -66,6 +69,8 @@ def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, A
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
     """Ends of the 95 % interval: areas whose own spread just reaches the estimate."""
+    from scipy.optimize import brentq
+
     z = z_of(0.95)
 
     def spread(of: float) -> float:
@@ -76,14 +81,8 @@ def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, 
         ) / (positives * negatives)
         return z * math.sqrt(max(0.0, variance))
 
-    ends = []
-    for far in (0.0, 1.0):
-        near, outside = area, far
-        for _ in range(_HALVINGS):
-            middle = (near + outside) / 2.0
-            if abs(middle - area) <= spread(middle):
-                near = middle
-            else:
-                outside = middle
-        ends.append(near)
-    return ends[0], ends[1]
+    low, high = (
+        float(brentq(lambda of: abs(of - area) - spread(of), area + _NEAR * (far - area), far))
+        for far in (0.0, 1.0)
+    )
+    return low, high

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from statistics import NormalDist
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
@@ -68,8 +67,8 @@ class Share:
         """
         if not (self.total and other.total):
             return NO_INTERVAL
-        found = self.effect.minus(other.effect)
-        return replace(found, low=max(-1.0, found.low), high=min(1.0, found.high))
+        difference = self.effect.minus(other.effect)
+        return replace(difference, low=max(-1.0, difference.low), high=min(1.0, difference.high))
 
     def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
         """Failed missions per flight hour, low and high, of a share of missions that fail.
@@ -83,8 +82,7 @@ class Share:
             ConfigError: the rate is negative.
         """
         if not upsets_per_hour >= 0.0:
-            told = f"must not be negative, got {upsets_per_hour:g}"
-            raise ConfigError(told, key="upsets_per_hour")
+            raise ConfigError(f"must be at least 0, got {upsets_per_hour:g}", key="upsets_per_hour")
         return upsets_per_hour * self.share, upsets_per_hour * self.low, upsets_per_hour * self.high
 
     def longest_reaches(self, flights: int) -> Interval:
@@ -100,19 +98,19 @@ class Share:
 
 
 def wilson(
-    count: int, total: int, *, design_effect: float = 1.0, confidence_z: float = 1.959963984540054
+    count: int, total: int, *, design_effect: float = 1.0, confidence: float = 0.95
 ) -> Share:
-    """Wilson score interval (E. B. Wilson, JASA 22, 1927), 95 % by default.
+    """Wilson score interval (E. B. Wilson, JASA 22, 1927).
 
     Without observations the interval is [0, 1] and the share is NaN. A design effect divides the
-    number of observations.
+    number of observations, which SciPy's `proportion_ci` does not support.
     """
     if total == 0:
         return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
-    p, n = count / total, total / design_effect
-    z2 = confidence_z**2
+    p, n, z = count / total, total / design_effect, z_of(confidence)
+    z2 = z**2
     centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = confidence_z * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2)) / (1 + z2 / n)
+    half = z * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2)) / (1 + z2 / n)
     return Share(
         count=count,
         total=total,
@@ -127,7 +125,11 @@ def unseen_share(total: int, confidence: float = 0.95) -> float:
 
     The one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 without runs.
     """
-    return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0
+    from scipy.stats import binomtest
+
+    if not total:
+        return 1.0
+    return float(binomtest(0, total, alternative="less").proportion_ci(confidence).high)
 
 
 def z_of(confidence: float) -> float:
@@ -136,14 +138,16 @@ def z_of(confidence: float) -> float:
     Raises:
         ConfigError: the confidence is not between 0 and 1.
     """
+    from scipy.special import ndtri
+
     if not 0.0 < confidence < 1.0:
         raise ConfigError(f"must be between 0 and 1, got {confidence:g}", key="confidence")
-    return NormalDist().inv_cdf(0.5 + confidence / 2.0)
+    return float(ndtri(0.5 + confidence / 2.0))
 
 
 def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
     """A proportion with its Wilson score interval."""
-    return wilson(successes, total, confidence_z=z_of(confidence))
+    return wilson(successes, total, confidence=confidence)
 
 
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
@@ -178,8 +182,9 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
             and 1.
     """
     if not _LEAST <= margin < 0.5:
-        told = f"must be at least {_LEAST:g} and below 0.5, got {margin:g}"
-        raise ConfigError(told, key="margin")
+        raise ConfigError(
+            f"must be at least {_LEAST:g} and below 0.5, got {margin:g}", key="margin"
+        )
     if not 0.0 <= expected <= 1.0:
         raise ConfigError(f"must be within 0 and 1, got {expected:g}", key="expected")
     z2 = z_of(confidence) ** 2
@@ -200,6 +205,8 @@ def pairs_for_difference(
         ConfigError: the difference is below a millionth, or the share of differing pairs does not
             allow it.
     """
+    from scipy.special import ndtri
+
     if not _LEAST <= abs(difference) <= discordant <= 1.0:
         raise ConfigError(
             f"must be at least {_LEAST:g}, and at most the share of pairs that differ "
@@ -208,8 +215,8 @@ def pairs_for_difference(
         )
     if not 0.0 < power < 1.0:
         raise ConfigError(f"must be between 0 and 1, got {power:g}", key="power")
-    z_b = NormalDist().inv_cdf(power)
-    root = z_of(confidence) * math.sqrt(discordant) + z_b * math.sqrt(discordant - difference**2)
+    z_a, z_b = z_of(confidence), float(ndtri(power))
+    root = z_a * math.sqrt(discordant) + z_b * math.sqrt(discordant - difference**2)
     return math.ceil(root**2 / difference**2 - 1e-9)
 
 
@@ -235,7 +242,8 @@ def cross_layer(
     ends = None
     if corrupted and failure.share <= corruption.share:
         ends = tuple(
-            min(1.0, each / corruption.share) for each in (failure.share, failure.low, failure.high)
+            min(1.0, share / corruption.share)
+            for share in (failure.share, failure.low, failure.high)
         )
     return {
         "corruption": asdict(corruption),
@@ -249,7 +257,6 @@ def cross_layer(
 Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it
 # Sampled clusters of each stratum, those without a run included.
 Sampled = Mapping[Any, int]
-_NORMAL = 1.959963984540054
 
 
 def clustered_share(
@@ -263,7 +270,7 @@ def clustered_share(
     alone, spread = _spread(hits, clusters, sampled)
     freedom = [len(hits), *(number - 1 for number, _ in spread)]
     variances = [alone, *(variance for _, variance in spread)]
-    wider = (_student(variances, freedom) / _NORMAL) ** 2 if spread else 1.0
+    wider = (_student(variances, freedom) / z_of(0.95)) ** 2 if spread else 1.0
     effect = wider * design_effect(hits, clusters, sampled)
     return wilson(sum(hits), len(hits), design_effect=effect)
 
@@ -276,8 +283,8 @@ def design_effect(
     if not 0.0 < share < 1.0:
         return 1.0
     alone, spread = _spread(hits, clusters, sampled or {})
-    variance = alone + sum(each for _, each in spread)
-    return max(1.0, variance / (len(hits) * share * (1.0 - share)))
+    total = alone + sum(variance for _, variance in spread)
+    return max(1.0, total / (len(hits) * share * (1.0 - share)))
 
 
 def _spread(
@@ -303,7 +310,7 @@ def _spread(
     for stratum, sums in strata.items():
         number = max(2, len(sums), sampled.get(stratum, 0))
         mean = sum(sums.values()) / number
-        squares = sum(each**2 for each in sums.values()) - number * mean**2
+        squares = sum(residual**2 for residual in sums.values()) - number * mean**2
         spread.append((number, squares * number / (number - 1)))
     return alone, spread
 
@@ -335,15 +342,8 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
 
 
 def _student(variances: Sequence[float], freedom: Sequence[int]) -> float:
-    """The 97.5 % quantile of Student's t for a sum of variances, each with degrees of freedom.
+    """The 97.5 % quantile of Student's t for a sum of variances, each with degrees of freedom."""
+    from scipy.special import stdtrit
 
-    By the series of Abramowitz and Stegun, 26.7.5: within 0.03 from three degrees on.
-    """
     doubt = sum(own**2 / n for own, n in zip(variances, freedom, strict=True))
-    if not doubt:
-        return _NORMAL
-    v, z = sum(variances) ** 2 / doubt, _NORMAL
-    first = (z**3 + z) / (4 * v)
-    second = (5 * z**5 + 16 * z**3 + 3 * z) / (96 * v**2)
-    third = (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * v**3)
-    return z + first + second + third
+    return float(stdtrit(sum(variances) ** 2 / doubt, 0.975)) if doubt else z_of(0.95)

@@ -73,13 +73,12 @@ def test_a_page_that_cannot_be_written_is_wrong_usage(command_line, output, told
     assert told in err
 
 
-@pytest.mark.parametrize("library", ["jinja2", "scipy"])
-def test_a_missing_library_names_the_extra(command_line, tmp_path, monkeypatch, library):
-    monkeypatch.setitem(sys.modules, library, None)
+def test_a_missing_jinja2_names_the_extra(command_line, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     monkeypatch.setattr(sys, "path_importer_cache", {})
     left, _, err = command_line("report", str(tmp_path), "-o", str(tmp_path / "page.html"))
     assert left == 1
-    assert f"needs {library}" in err
+    assert "needs jinja2" in err
     assert "pip install 'mavfi[report]'" in err
 
 
