@@ -10,8 +10,6 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.errors import MavfiError
-
 CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True}
 Triple = tuple[float, ...]
 
@@ -141,23 +139,3 @@ def stop_on_signals() -> Callable[[], bool]:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, _frame: seen.append(signum))
     return lambda: bool(seen)
-
-
-def exit_code(program: Callable[[], object]) -> int:
-    """Run a program. Return 0, or the code of a known error or wrong usage, told in one line."""
-    try:
-        program()
-    except click.exceptions.Exit as left:
-        return left.exit_code
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
-        return error.exit_code
-    except click.ClickException as error:
-        click.echo(f"error: {error.format_message()}", err=True)
-        return error.exit_code
-    except click.Abort:
-        return 1
-    except MavfiError as error:
-        click.echo(f"error: {error}", err=True)
-        return error.exit_code
-    return 0

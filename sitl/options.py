@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from mavfi_cli.core.output_paths import OutFolder
 from sitl.autopilot.telemetry import Preset
 from sitl.command_line import CONTEXT, Positive, Triple, camera_options, signing, world_and_vehicle
 
@@ -99,7 +100,7 @@ class ServerOptions:
     "--answer-limit", "answer_limit_s", type=Positive(), default=120.0,
     help="Time that the companion in lockstep may take for a tick, s.",
 )  # fmt: skip
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder for the referee's truth.")
+@click.option("--truth", type=OutFolder(), help="Folder for the referee's truth.")
 @camera_options("camera-")
 @click.option(
     "--sysid", "system_id", type=click.IntRange(1, 255), default=1, help="MAVLink system id."

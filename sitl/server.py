@@ -15,10 +15,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import click
-
 from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
+from mavfi_cli.core.terminal import echo, exit_code, note
 from mavfi_cli.core.types import FlightTruth
 from mavfi_cli.link.codec import Codec, Signing, dialect, signing_from_file
 from mavfi_cli.link.endpoint import parse_endpoint
@@ -27,7 +26,7 @@ from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.camera.component import Camera
-from sitl.command_line import exit_code, stop_on_signals
+from sitl.command_line import stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.options import ServerOptions, VehicleSetup, parse
 from sitl.peers import Peer, Peers
@@ -308,7 +307,7 @@ class _Realtime:
         """Run until stopped, or until an inherited connection closes."""
         self._simulation.begin(stopped)
         if (kind := self._options.setup.firmware_kind) is not None and not stopped():
-            click.echo(f"{kind} is ready: clients may connect", err=True)
+            note(f"{kind} is ready: clients may connect")
         self._clients.serve(until_s=0.0)
         while not stopped() and not self._clients.over:
             is_fast = self._pace.remaining_s() > -_LATE_S and any(
@@ -319,12 +318,12 @@ class _Realtime:
             collision = self._simulation.referee.collision
             if collision is not None and not self._told_collision:
                 self._told_collision = True
-                click.echo(f"{collision.text}; the vehicle stays there until a client reboots it")
+                echo(f"{collision.text}; the vehicle stays there until a client reboots it")
             if self._simulation.autopilot.restart_asked:
                 self._simulation.restart()
                 self._clients.for_all(Client.rejoin)
                 self._told_collision = False
-                click.echo("restarted")
+                echo("restarted")
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
         """Send the fast streams at a stamp within a tick, and wait for the next step."""
@@ -375,7 +374,7 @@ def _serve(options: ServerOptions) -> None:
     stopped = stop_on_signals()
     world, profile = _loaded(options.setup)
     if not options.lockstep and not in_cache(control_step):
-        click.echo("the first start compiles the vehicle, about half a minute", err=True)
+        note("the first start compiles the vehicle, about half a minute")
         warm_up()
     if options.truth is not None:
         world.write_briefing(profile.camera_mount_flu_m, options.truth)
@@ -442,7 +441,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
         *_needs_of_firmware(options),
         "Ctrl-C ends it.",
     ]
-    click.echo("\n".join(lines), err=True)
+    note("\n".join(lines))
 
 
 def _needs_of_firmware(options: ServerOptions) -> list[str]:

@@ -86,6 +86,16 @@ __attribute__((noinline)) unsigned long walk(long n) {
 }
 int main(int c, char **v) { printf("%lu\\n", walk(atol(v[1]))); return 0; }""",
     # Prints the beginning of a file. arg: its path.
+    "seconds": r"""  // prints the time in seconds
+        #include <stdio.h>
+        #include <time.h>
+        int main(void) {
+            volatile long sum = 0;
+            for (int i = 0; i < 1000; ++i) sum += i;
+            printf("%ld %ld\n", sum, (long)time(NULL));
+            return 0;
+        }
+    """,
     "echoing": """
 #include <stdio.h>
 int main(int c, char **v) {

@@ -162,6 +162,7 @@ def _attack(
     progress(target.name, 0)
     with one_processor():
         place, goldens, profiles = _prepare(plan, target, stage, notice)
+    golden_s = time.monotonic()
     stream = {"kernel": target.stream[0]} if target.stream else {}
     context = stream | place.context()
     bench = _Bench(plan=plan, target=target, golden=goldens)
@@ -198,7 +199,7 @@ def _attack(
             if journal is not None:
                 journal.append(done[index])
             progress(target.name, len(done))
-        require_golden_again(target.name, null_runs, workers.null(bench))
+        require_golden_again(target.name, null_runs, workers.null(bench), golden_s)
     records = tuple(done[index] for index in sorted(done))
     return replace(prepared, records=records, wall_s=time.perf_counter() - begun)
 

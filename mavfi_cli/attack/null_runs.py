@@ -8,6 +8,7 @@ faults, by turns from every counting method, and goes on without detours that ch
 
 from __future__ import annotations
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from mavfi_cli.fi.tracer.tracee import DETOUR_COST
 NULL_RUNS = 20
 _FAULTS = 64  # of the campaign, from which null runs are chosen
 _REPEATED = 3  # runs of a null fault that differed, to tell a detour from chance
+_APART_S = 1.0  # golden runs and the last null run
 _TIMER = "timer"
 _DETOURS = (Counting.FAR_DETOUR, Counting.DETOUR)
 Profiles = tuple[TargetProfile | None, ...]  # of each input; None for time rules
@@ -90,12 +92,17 @@ def make_null_runs(
         profiles = tuple(each and each.without(unused) for each in profiles)
 
 
-def require_golden_again(name: str, null_runs: NullRuns, run: Run) -> None:
+def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
     """Repeat a null run later, because a difference may come late, such as that of a date.
+
+    Args:
+        golden_s: end of the golden runs on `time.monotonic`. The null run begins a second later at
+            the earliest, so that a program that prints the time in seconds ends differently.
 
     Raises:
         TargetError: it ends differently from the golden run now.
     """
+    time.sleep(max(0.0, golden_s + _APART_S - time.monotonic()))
     if any(each.differs for each in _make(null_runs.tasks[:1], run)):
         raise TargetError(
             name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from mavfi_cli.core.errors import (
     UnknownName,
     VehicleProcessError,
 )
-from mavfi_cli.core.files import write_text
+from mavfi_cli.core.files import reading, write_text
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.mission import MissionConfig
@@ -123,13 +123,18 @@ def folder_of(what: str) -> Path:
     return DEFAULT / load_spec(what).name
 
 
-def opened(what: str | Path) -> Ledger:
+@contextlib.contextmanager
+def opened(what: str | Path) -> Iterator[Ledger]:
     """Open a campaign for reading: a preset, a TOML file, a folder, or an exported .parquet file.
 
     Raises:
         MavfiError: as `folder_of`, `Ledger` and `ExportedLedger`.
+        RecordError: an error of the block shows that what was read is damaged.
     """
-    return ExportedLedger(Path(what)) if is_export(Path(what)) else Ledger(folder_of(str(what)))
+    path = Path(what)
+    ledger = ExportedLedger(path) if is_export(path) else Ledger(folder_of(str(what)))
+    with ledger, reading(ledger.folder):
+        yield ledger
 
 
 def _folder(what: str) -> Path | None:

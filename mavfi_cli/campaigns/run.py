@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.ledger import RUNS, Ledger
 from mavfi_cli.campaigns.missions import (
@@ -95,11 +96,23 @@ class Options:
     def __post_init__(self) -> None:
         if not 0.0 < self.limit_s < math.inf:
             raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
+        if self.cluster is not None and not _is_address(self.cluster):
+            # dask would retry for half a minute, and then raise a traceback
+            problem = f"expected an address such as tls://host:8786, got {self.cluster!r}"
+            raise ConfigError(problem, key="cluster")
         if (self.cluster or "").startswith("tls://") != (self.cluster_key is not None):
             problem = (
                 "an address with tls:// needs --cluster-key, and only such an address takes it"
             )
             raise ConfigError(problem, key="cluster")
+
+
+def _is_address(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return bool(parts.scheme and parts.hostname and parts.port)
+    except ValueError:  # such as a port that is not a number
+        return False
 
 
 def run_campaign(

@@ -42,7 +42,7 @@ def load_spec(name: str) -> Spec:
         flown = {mission.config.world for mission in spec.kinds()}
         for world in spec.fixed_world.worlds:
             if world not in flown:
-                raise UnknownName(f"{path}: fixed_world.worlds: world", world, flown)
+                raise UnknownName("world of [fixed_world]", world, flown)
     return spec
 
 

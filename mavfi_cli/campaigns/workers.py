@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
-from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import ResultState
@@ -349,15 +348,6 @@ def _connect(address: str, keys: Path | None) -> Client:
         raise CampaignStopped(
             "--cluster needs dask.distributed: pip install 'mavfi[cluster]'"
         ) from None
-    parts = urlsplit(address)
-    try:
-        usable = bool(parts.scheme and parts.hostname and parts.port)
-    except ValueError:  # the port is not a number
-        usable = False
-    if not usable:  # dask would retry for half a minute, and then raise a traceback
-        raise CampaignStopped(
-            f"{address}: expected the scheduler's address, such as tls://host:8786"
-        )
     secure = {} if keys is None else {"security": security(keys)}
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False, **secure)

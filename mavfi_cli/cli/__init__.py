@@ -15,7 +15,8 @@ import click
 from click.shell_completion import CompletionItem
 
 from mavfi_cli.core.compiled import choose_caches
-from mavfi_cli.core.errors import Interrupted, MavfiError, UnknownName, nearest
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.terminal import exit_code
 
 # name -> (module, what it does); the help page must not import the modules. One of the vehicle's
 # side takes the place of this process.
@@ -138,27 +139,8 @@ def main() -> NoReturn:
     choose_caches()
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, _interrupt)
-    try:  # not standalone: click hands back the code of an Exit instead of leaving with it
-        code = cli.main(prog_name="mavfi", standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
-        sys.exit(error.exit_code)
-    except click.NoSuchOption as error:
-        click.echo(f"error: {_no_such_option(error)}", err=True)
-        sys.exit(error.exit_code)
-    except click.ClickException as error:
-        click.echo(f"error: {error.format_message()}", err=True)
-        sys.exit(error.exit_code)
-    except (Interrupted, KeyboardInterrupt, click.Abort) as error:
-        click.echo(str(error) or "interrupted", err=True)
-        sys.exit(128 + (signal.SIGTERM if _terminated else signal.SIGINT))
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(1)
-    except MavfiError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_code)
-    sys.exit(code if isinstance(code, int) else 0)
+    code = exit_code(lambda: cli.main(prog_name="mavfi", standalone_mode=False))
+    sys.exit(128 + signal.SIGTERM if _terminated else code)
 
 
 def _interrupt(*_: object) -> NoReturn:
@@ -166,11 +148,3 @@ def _interrupt(*_: object) -> NoReturn:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _terminated.append(True)
     raise KeyboardInterrupt
-
-
-def _no_such_option(error: click.NoSuchOption) -> str:
-    params = error.ctx.command.params if error.ctx is not None else []
-    known = [name.lstrip("-") for param in params for name in param.opts]
-    match = nearest(error.option_name.lstrip("-"), known)
-    hint = f"; did you mean '--{match}'?" if match else ""
-    return f"no such option {error.option_name!r}{hint}"

@@ -29,8 +29,9 @@ from mavfi_cli.cli.parameters import (
     SHARE,
     UPSETS,
     Number,
-    OutFile,
 )
+from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
         firmware=spec.firmware(),
     )
     if cluster is not None and keys is None:
-        click.echo(_OPEN_CLUSTER.format(cluster), err=True)
+        note(_OPEN_CLUSTER.format(cluster))
     with (
         missions_view(quiet=quiet) as view,
         begin(
@@ -191,10 +192,10 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 
     with opened(what) as ledger:
         table, flights = shown(ledger, item)
-        click.echo(FORMATS[form](table), nl=False)
+        echo(FORMATS[form](table), nl=False)
         if output is not None:
             write_figure(draw(table, flights, columns), output)
-            click.echo(f"figure: {output}", err=True)
+            note(f"figure: {output}")
 
 
 @campaign.command()
@@ -213,12 +214,12 @@ def export(what: str, path: Path, as_json: bool) -> None:
     table = library.campaign(what).table
     content = flights_file(table, path)
     if path == Path("-"):
-        click.echo(content, nl=False)
+        echo(content.decode(), nl=False)
     else:
         write_atomically(path, lambda file: file.write(content))
         summary = {"file": str(path), "missions": table.num_rows, "columns": table.column_names}
         text = f"{table.num_rows} missions in {path}"
-        click.echo(json.dumps(summary, indent=2) if as_json else text)
+        echo(json.dumps(summary, indent=2) if as_json else text)
 
 
 @campaign.command()
@@ -243,14 +244,14 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
     with opened(what) as ledger:
         chosen = pair(ledger, number)
-    flown = Trajectories.of(chosen)
-    write_figure(flown.draw(), output)
+        flown = Trajectories.of(chosen)
+        write_figure(flown.draw(), output)
     if as_json:
         told = {**chosen, "picture": output}
-        click.echo(json.dumps(plain(told), indent=2, default=str))
+        echo(json.dumps(plain(told), indent=2, default=str))
     else:
         absent = [f"not in the picture: {text}" for text in chosen["absent"]]
-        click.echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
+        echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
 
 
 @campaign.command(cls=GroupedCommand)
@@ -312,11 +313,11 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
         lines += more
     if not told:
         raise click.UsageError("name a campaign, --margin or --difference")
-    click.echo(json.dumps(told, indent=2) if as_json else "\n".join(lines))
+    echo(json.dumps(told, indent=2) if as_json else "\n".join(lines))
 
 
 @campaign.command()
-@click.argument("folder", metavar="DIR", type=_FOLDER)
+@click.argument("folder", metavar="DIR", type=OUT)
 def keys(folder: Path) -> None:
     """Make the keys of a cluster in DIR, for `mavfi campaign run --cluster tls://...`.
 
@@ -326,7 +327,7 @@ def keys(folder: Path) -> None:
     from mavfi_cli.campaigns.cluster_keys import CERTIFICATE, KEY, make_keys
 
     make_keys(folder)
-    click.echo(f"{folder / CERTIFICATE} and {folder / KEY}: only you can read them")
+    echo(f"{folder / CERTIFICATE} and {folder / KEY}: only you can read them")
 
 
 def _planned(
@@ -371,7 +372,7 @@ def _show(
 
     if as_json:
         told = _summary(ledger, by, confidence, more or {})
-        click.echo(json.dumps(plain(told), indent=2))
+        echo(json.dumps(plain(told), indent=2))
         return
     lines, spec = progress_lines(ledger), stored_spec(ledger)
     if spec is not None and spec.fixed_world is not None:
@@ -382,7 +383,7 @@ def _show(
     else:
         table, _ = shown(ledger)
         lines += ["", short(table).text().rstrip()]
-    click.echo("\n".join(lines))
+    echo("\n".join(lines))
 
 
 def _summary(

@@ -23,6 +23,7 @@ from mavfi_cli.cli.parameters import (
     TARGETS,
     WORLD,
 )
+from mavfi_cli.core.terminal import echo
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")
 _settings = partial(click.option, cls=GroupedOption, group="Faults and detectors")
@@ -82,12 +83,12 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     for name, draw in PICTURES.items():
         write_figure(draw(told), out / name)
     if as_json:
-        click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
+        echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(platform_csv(told), nl=False)
+        echo(platform_csv(told), nl=False)
     else:
         files = "compare.json, compare.csv, compare.svg, timeline.svg, timeline/"
-        click.echo("\n".join([*platform_lines(told), "", f"Files  {out}: {files}"]))
+        echo("\n".join([*platform_lines(told), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:

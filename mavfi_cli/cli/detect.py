@@ -23,6 +23,7 @@ from mavfi_cli.cli.parameters import (
     STAGES,
     WORLD,
 )
+from mavfi_cli.core.terminal import echo
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -41,15 +42,13 @@ def list_(models: Path | None, as_json: bool) -> None:
 
     rows = listing(models)
     if as_json:
-        click.echo(json.dumps(rows, indent=2))
+        echo(json.dumps(rows, indent=2))
         return
     for row in rows:
         threshold = "-" if row["threshold"] is None else f"{row['threshold']:.6g}"
         stack = f"{row['stack']}: " if row["stack"] else ""
-        click.echo(
-            f"{row['name']:<9} threshold {threshold:<9} {stack}{row['model'] or 'no model file'}"
-        )
-        click.echo(f"{'':<9} {row['told']}")
+        echo(f"{row['name']:<9} threshold {threshold:<9} {stack}{row['model'] or 'no model file'}")
+        echo(f"{'':<9} {row['told']}")
 
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")
@@ -124,12 +123,12 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     for name, draw in PICTURES.items():
         write_figure(draw(evaluation), out / name)
     if as_json:
-        click.echo(json.dumps(plain(evaluation), indent=2, sort_keys=True))
+        echo(json.dumps(plain(evaluation), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(detector_csv(*pairs), nl=False)
+        echo(detector_csv(*pairs), nl=False)
     else:
         files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
-        click.echo("\n".join([*detector_lines(evaluation), "", f"Files  {out}: {files}"]))
+        echo("\n".join([*detector_lines(evaluation), "", f"Files  {out}: {files}"]))
 
 
 def _plan(options: dict[str, Any]) -> Any:

@@ -42,6 +42,7 @@ from mavfi_cli.cli.parameters import (
     WORLD,
 )
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
+from mavfi_cli.core.terminal import echo, note_error
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.run_folder import Run
@@ -228,14 +229,14 @@ def fly(
     if picture:
         write_figure(draw_top_view(run), folder.picture)
     if as_json:
-        click.echo(json.dumps(run.result, indent=2, sort_keys=True))
+        echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:
         drawn = folder_lines(run, folder.picture if picture else None)
-        click.echo("\n".join([*summary_lines(run.result), *drawn, *_hint(run)]))
+        echo("\n".join([*summary_lines(run.result), *drawn, *_hint(run)]))
     if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
     if expect is not None and run.record.outcome != expect:
-        click.echo(f"error: expected {expect}, got {outcome_line(run.result)}", err=True)
+        note_error(f"expected {expect}, got {outcome_line(run.result)}")
         raise click.exceptions.Exit(1)
 
 

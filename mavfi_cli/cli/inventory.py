@@ -13,6 +13,7 @@ import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import PLATFORM, STACK
+from mavfi_cli.core.terminal import echo
 from mavfi_cli.report.columns import WIDTH, columns
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def _print_json(rows: Iterable[Any]) -> None:
-    click.echo(json.dumps([asdict(row) for row in rows], indent=2))
+    echo(json.dumps([asdict(row) for row in rows], indent=2))
 
 
 def _title(chosen: PlatformProfile | Stack) -> str:
@@ -49,9 +50,10 @@ def doctor(as_json: bool) -> None:
         if not as_json:
             colour, mark = _MARKS[check.verdict]
             first, *rest = textwrap.wrap(check.found, WIDTH - _FOUND) or [""]
-            click.echo(f"{click.style(f'{mark:<8}', fg=colour)}{check.name:<20} {first}")
+            click.secho(f"{mark:<8}", fg=colour, nl=False)
+            echo(f"{check.name:<20} {first}")
             for line in [*rest, *([f"-> {check.remedy}"] if check.remedy else [])]:
-                click.echo(f"{'':<{_FOUND}}{line}")
+                echo(f"{'':<{_FOUND}}{line}")
     if as_json:
         _print_json(checks)
     if any(check.verdict == FAILED for check in checks):
@@ -85,15 +87,15 @@ def platforms(names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         _print_json(profiles)
     elif names:
-        click.echo("\n\n".join("\n".join(_kernel_lines(profile)) for profile in profiles))
+        echo("\n\n".join("\n".join(_kernel_lines(profile)) for profile in profiles))
     else:
         for profile in profiles:
-            click.echo(
+            echo(
                 f"{profile.name:<12} {profile.cores:>3} cores {profile.power_w:>6.1f} W  "
                 f"board {1000 * profile.mass_kg:>3.0f} g  all kernels {_all_s(profile):>6.3f} s  "
                 f"{profile.description}"
             )
-        click.echo(_MORE_PLATFORMS)
+        echo(_MORE_PLATFORMS)
 
 
 def _all_s(profile: PlatformProfile) -> float:
@@ -174,10 +176,10 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         _print_json(found)
     elif not names:
-        click.echo("\n".join(f"{stack.name:<19}{stack.description}" for stack in found))
-        click.echo(_MORE_STACKS)
+        echo("\n".join(f"{stack.name:<19}{stack.description}" for stack in found))
+        echo(_MORE_STACKS)
     else:
-        click.echo("\n".join(_explained(found[0]) if len(found) == 1 else _compared(found)))
+        echo("\n".join(_explained(found[0]) if len(found) == 1 else _compared(found)))
 
 
 def _explained(stack: Stack) -> Iterator[str]:
@@ -244,6 +246,6 @@ def states(as_json: bool) -> None:
         for state in STATES
     ]
     if as_json:
-        click.echo(json.dumps(rows, indent=2))
+        echo(json.dumps(rows, indent=2))
         return
-    click.echo("\n".join(columns([[*rows[0]], *([*row.values()] for row in rows)])))
+    echo("\n".join(columns([[*rows[0]], *([*row.values()] for row in rows)])))

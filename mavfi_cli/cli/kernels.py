@@ -31,6 +31,7 @@ from mavfi_cli.cli.parameters import (
 )
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.terminal import echo, note
 
 if TYPE_CHECKING:
     from mavfi_cli.attack.campaign import Plan
@@ -185,13 +186,13 @@ def _attack(options: dict[str, Any]) -> None:
         if out is not None:
             files = ", ".join((*save_runs(out, summary, campaign), "runs.jsonl"))
     if options["as_json"]:
-        click.echo(json.dumps(summary, indent=2))
+        echo(json.dumps(summary, indent=2))
         return
-    click.echo(f"{table(summary)}\n")
+    echo(f"{table(summary)}\n")
     if out is not None:
-        click.echo(f"Files  {out}: {files}")
+        echo(f"Files  {out}: {files}")
     else:
-        click.echo("Nothing is saved; --out FOLDER keeps records, tables and plots.")
+        echo("Nothing is saved; --out FOLDER keeps records, tables and plots.")
 
 
 def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
@@ -200,7 +201,7 @@ def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
 
     kernels = select(options["kernel"])
     config = kernel_flight(options["world"], options["world_seed"])
-    click.echo(f"inputs: world {config.world}, seed {config.seed}", err=True)
+    note(f"inputs: world {config.world}, seed {config.seed}")
     return kernel_targets(kernels, config, folder, options["tolerance"])
 
 
@@ -253,6 +254,6 @@ def _replay_folder(
         total += 1
         equal += not result.differs
         if result.differs:
-            click.echo(f"{result.target} {result.run}: differs in {', '.join(result.differs)}")
-    click.echo(f"{equal} of {total} replays identical")
+            echo(f"{result.target} {result.run}: differs in {', '.join(result.differs)}")
+    echo(f"{equal} of {total} replays identical")
     return equal == total

@@ -11,7 +11,9 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
-from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS, Number, OutFile
+from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS, Number
+from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.terminal import echo, note
 
 _what = partial(click.option, cls=GroupedOption, group="Missions")
 _execution = partial(click.option, cls=GroupedOption, group="Execution")
@@ -61,14 +63,14 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     if as_json:
         told = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
                 "items": [asdict(table) for table in tables(plan)]}  # fmt: skip
-        click.echo(json.dumps(plain(told), indent=2, default=str))
+        echo(json.dumps(plain(told), indent=2, default=str))
         return
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
-        click.echo(table.text() if len(plan.items) == 1 else one_line, nl=False)
+        echo(table.text() if len(plan.items) == 1 else one_line, nl=False)
     if any(item.preset for item in plan.items):
-        click.echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
-        click.echo(f"The page            mavfi report {plan.out} -o report.html")
+        echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
+        echo(f"The page            mavfi report {plan.out} -o report.html")
 
 
 @click.command(cls=GroupedCommand)
@@ -98,7 +100,7 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
 
     evidence = Evidence.gather(places)
     for problem in evidence.problems:
-        click.echo(f"note: {problem}", err=True)
+        note(f"note: {problem}")
     content = document(evidence, upsets)
     page = render(content)
     write_text(output, page)
@@ -110,6 +112,6 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
         }
         summary = {"file": str(output), "bytes": size, "missions": missions, "verdicts": verdicts,
                    "problems": [*evidence.problems]}  # fmt: skip
-        click.echo(json.dumps(summary, indent=2))
+        echo(json.dumps(summary, indent=2))
     else:
-        click.echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")
+        echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")

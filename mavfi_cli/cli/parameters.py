@@ -1,4 +1,4 @@
-"""Types of options: bounded numbers, names that the shell completes, and files to write."""
+"""Types of options: bounded numbers, names that the shell completes, and run folders."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 import itertools
 import json
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from enum import EnumType
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from mavfi_cli.core.errors import RecordError
-from mavfi_cli.core.files import PACKAGE, require_folder, require_output
+from mavfi_cli.core.files import PACKAGE
+from mavfi_cli.core.output_paths import OutFolder
 
 # Numbers ------------------------------------------------------------------------------------------
 
@@ -173,41 +173,6 @@ def _folders(parent: Path) -> list[Path]:
         return [path for path in entries if path.name.isprintable() and path.is_dir()]
     except OSError:
         return []
-
-
-class OutFolder(click.Path):
-    """A folder for results, which is made if it does not exist."""
-
-    def __init__(self) -> None:
-        super().__init__(path_type=Path, file_okay=False)
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the path, or fail if the folder cannot be written."""
-        path = super().convert(value, param, ctx)
-        try:
-            require_folder(Path(str(path)))
-        except RecordError as error:
-            self.fail(f"{error}.", param, ctx)
-        return path
-
-
-class OutFile(click.Path):
-    """A file to write, with one of some suffixes."""
-
-    def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
-        super().__init__(path_type=Path, dir_okay=False, allow_dash=allow_dash)
-        self._suffixes = suffixes
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the path, or fail if the file cannot be written."""
-        path = super().convert(value, param, ctx)
-        if self.allow_dash and str(path) == "-":
-            return path
-        try:
-            require_output(Path(str(path)), self._suffixes)
-        except RecordError as error:
-            self.fail(f"{error}.", param, ctx)
-        return path
 
 
 OUT = OutFolder()

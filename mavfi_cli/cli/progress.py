@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-import click
-
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
+from mavfi_cli.core.terminal import cleaned, note
 from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ class _Lines:
         self._next_s, self._last_s = first_s, 0.0
 
     def note(self, *parts: _Part) -> None:
-        click.echo("".join(p if isinstance(p, str) else p[0] for p in parts), err=True)
+        note("".join(p if isinstance(p, str) else p[0] for p in parts))
 
     def update(self, text: str, at_s: float, *, last: bool = False) -> None:
         if at_s < self._last_s:  # the next campaign
@@ -51,7 +50,8 @@ class _LiveLine(_Lines):
     def note(self, *parts: _Part) -> None:
         from rich.text import Text  # no markup: an autopilot may send any text
 
-        self._live.console.print(Text.assemble(*parts))
+        cleaned_parts = [cleaned(p) if isinstance(p, str) else (cleaned(p[0]), p[1]) for p in parts]
+        self._live.console.print(Text.assemble(*cleaned_parts))
 
     def update(self, text: str, at_s: float, *, last: bool = False) -> None:
         from rich.text import Text
@@ -59,7 +59,7 @@ class _LiveLine(_Lines):
         now_s = time.monotonic()
         if now_s >= self._next_s or last:  # to draw takes longer than some of what is told
             self._next_s = now_s + _REDRAW_S
-            self._live.update(Text(text), refresh=True)
+            self._live.update(Text(cleaned(text)), refresh=True)
 
 
 @contextmanager

@@ -9,15 +9,12 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
-from mavfi_cli.cli.parameters import NUMBER, OUT, OutFile, RunPath
-from mavfi_cli.core.errors import printable
+from mavfi_cli.cli.parameters import NUMBER, OUT, RunPath
+from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
 
 _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
-
-
-def _note(text: str) -> None:
-    click.echo(text, err=True)
 
 
 @click.command(cls=GroupedCommand)
@@ -49,11 +46,11 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
             drawn = draw_top_view(recorded)
         write_figure(drawn, picture)
     if as_json:
-        click.echo(json.dumps(recorded.result, indent=2, sort_keys=True))
+        echo(json.dumps(recorded.result, indent=2, sort_keys=True))
         return
     golden = None
     if recorded.record.fault:
-        golden = paired_golden(recorded, _note) if pair else recorded.golden
+        golden = paired_golden(recorded, note) if pair else recorded.golden
     with reading(recorded.folder.path):
         lines = summary_lines(recorded.result)
         if golden is not None:
@@ -62,7 +59,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
             lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
         if events:
             lines += ["", "Events", *event_lines(recorded.result)]
-    click.echo("\n".join(map(printable, [*lines, *folder_lines(recorded, picture)])))
+    echo("\n".join([*lines, *folder_lines(recorded, picture)]))
 
 
 @click.command(cls=GroupedCommand)
@@ -104,7 +101,7 @@ def replay(
         raise click.UsageError("--gdb needs a run folder, which --mission does not")
     else:
         comparison, lines = _repeat_mission(run, number, out, **options)
-    click.echo(json.dumps(comparison, indent=2) if as_json else "\n".join(lines))
+    echo(json.dumps(comparison, indent=2) if as_json else "\n".join(lines))
     if not comparison["identical"] and not how["without_fault"]:
         raise click.exceptions.Exit(1)
 
@@ -125,11 +122,11 @@ def _repeat_run(
     if gdb and not (with_fault and run.record.config.get("instruction")):
         raise click.UsageError("--gdb needs an instruction-level fault to stop at")
     for text in version_differences(run.record.versions, installed_versions()):
-        _note(f"warning: another build: {text}")
+        note(f"warning: another build: {text}")
     flown: Any = {"with_fault": with_fault, "firmware": firmware}
     config = run.mission(**flown)
     what = "again" if with_fault else "without its fault"
-    _note(f"flying {config.world}, seed {config.seed}, {what}")
+    note(f"flying {config.world}, seed {config.seed}, {what}")
     again = fly_again(run, out, **flown, for_debugger=_say_where if gdb else None)
     ignored = _TELL_ACTIVATION if gdb else ()
     differing = [name for name in run.differing_sections(again) if name not in ignored]
@@ -165,7 +162,7 @@ def _repeat_mission(
     config, row = mission_of(campaign, number)
     config.require_firmware(firmware)
     config = config if with_fault else config.golden
-    _note(f"flying mission {number}: {config.world}, seed {config.seed}")
+    note(f"flying mission {number}: {config.world}, seed {config.seed}")
     again = fly_to_end(config, out)
     changed = differing(row, again.result)
     comparison = {
@@ -182,7 +179,7 @@ def _repeat_mission(
 
 
 def _say_where(pid: int) -> None:
-    _note(
+    note(
         f"the node waits at the injected instruction, the fault in place: gdb -p {pid}  "
         f"(or let it go on: kill -CONT {pid})"
     )

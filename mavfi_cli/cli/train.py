@@ -21,6 +21,7 @@ from mavfi_cli.cli.parameters import (
     STACK,
     WORLD,
 )
+from mavfi_cli.core.terminal import echo
 
 _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 
@@ -88,16 +89,16 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
         write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")
     if as_json:
         told = {kind: dict(model.provenance) for kind, (model, _) in models.items()}
-        click.echo(json.dumps(told, indent=2))
+        echo(json.dumps(told, indent=2))
         return
     failed = f"{left} flights failed and are left out"
     left_out = failed if flown is None else f"left out: {left}"
     samples = sum(len(flight.deltas) for flight in dataset.flights)
-    click.echo(
+    echo(
         f"Data set    {len(dataset)} flights of {stack}, {samples} samples"
         + (f"; {left_out}" if left else "")
     )
     for kind, (model, path) in models.items():
-        click.echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")
+        echo(f"{kind:<11} threshold {model.provenance['threshold']:.6g}  {path}")
     files = ["dataset.parquet", *(["loss.svg"] if "aad" in models else [])]
-    click.echo(f"\nFiles  {out}: {', '.join(files)}")
+    echo(f"\nFiles  {out}: {', '.join(files)}")

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
-from mavfi_cli.cli.parameters import OutFile, RunPath
+from mavfi_cli.cli.parameters import RunPath
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import reading
+from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.terminal import echo, note
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.progress import Recorder
@@ -47,22 +50,23 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
     flights = [
         ViewedFlight(name=name, run=each, recorder=_again(each)) for name, each in named.items()
     ]
-    viewers.save(flights, save)
+    with reading(recorded.folder.path):
+        viewers.save(flights, save)
     if as_json:
         told = [
             {"name": each.name, "run": str(each.run.folder.path),
              "outcome": each.run.record.outcome, "frames": each.recorder is not None}
             for each in flights
         ]  # fmt: skip
-        click.echo(json.dumps({"file": str(save), "flights": told}, indent=2))
+        echo(json.dumps({"file": str(save), "flights": told}, indent=2))
     elif save is not None:
-        click.echo(save)
+        echo(str(save))
     if layout is not None:
         from mavfi_cli.report.view.mcap_file import write_layout
 
         write_layout(flights, layout)
         if not as_json:
-            click.echo(layout)
+            echo(str(layout))
 
 
 def _golden(run: Run) -> Run | None:
@@ -70,9 +74,9 @@ def _golden(run: Run) -> Run | None:
     from mavfi_cli.mission.run import paired_golden
 
     try:
-        return paired_golden(run, _note)
+        return paired_golden(run, note)
     except RecordError as error:
-        _note(f"without the golden flight: {error}")
+        note(f"without the golden flight: {error}")
         return None
 
 
@@ -82,16 +86,12 @@ def _again(run: Run) -> Recorder | None:
 
     try:
         config = run.mission()
-        _note(f"flying again: {config.world}, seed {config.seed}")
+        note(f"flying again: {config.world}, seed {config.seed}")
         recorder, same = watch_again(run)
     except RecordError as error:
-        _note(f"without depth frames, cloud and map: {error}; `mavfi fly --record` keeps them")
+        note(f"without depth frames, cloud and map: {error}; `mavfi fly --record` keeps them")
         return None
     if not same:
-        _note(f"warning: {run.folder.path}: the repetition differs: depth frames, cloud and map "
+        note(f"warning: {run.folder.path}: the repetition differs: depth frames, cloud and map "
               "are those of the repetition")  # fmt: skip
     return recorder
-
-
-def _note(text: str) -> None:
-    click.echo(text, err=True)

@@ -22,6 +22,7 @@ from mavfi_cli.cli.parameters import (
     STACK,
     WORLD,
 )
+from mavfi_cli.core.terminal import echo
 
 _FLYING = ("worlds", "stack", "missions", "first_seed", "models", "train", "jobs", "quiet")
 
@@ -121,12 +122,12 @@ def vpm(
         told = _flown(chosen, known, choices, out, options)
     files = [] if out is None else _save(told, out)
     if as_json:
-        click.echo(json.dumps(plain(told), indent=2, sort_keys=True))
+        echo(json.dumps(plain(told), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(model_csv(told["flights"] if fly else told), nl=False)
+        echo(model_csv(told["flights"] if fly else told), nl=False)
     else:
         written = ["", f"Files  {out}: {', '.join(files)}"] if files else []
-        click.echo("\n".join([*model_lines(told), *written]))
+        echo("\n".join([*model_lines(told), *written]))
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:

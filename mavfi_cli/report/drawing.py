@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.files import require_output, write_atomically
+from mavfi_cli.core.terminal import cleaned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,7 +115,10 @@ def svg(figure: Figure) -> str:
 
 def _drawn(figure: Figure, form: str) -> bytes:
     import matplotlib as mpl
+    from matplotlib.text import Text
 
+    for text in figure.findobj(Text):
+        text.set_text(cleaned(text.get_text()))  # of a record of anybody's
     with mpl.rc_context(
         {"svg.hashsalt": "mavfi", "svg.fonttype": "none", "pdf.fonttype": 42}  # text stays text
     ):

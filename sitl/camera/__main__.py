@@ -12,6 +12,8 @@ import click
 import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
+from mavfi_cli.core.output_paths import OutFolder
+from mavfi_cli.core.terminal import exit_code, note
 from mavfi_cli.link.codec import signing_from_file
 from sitl.camera.component import Camera
 from sitl.camera.station import PoseTracker, Station, Witness
@@ -20,7 +22,6 @@ from sitl.command_line import (
     Place,
     Triple,
     camera_options,
-    exit_code,
     stop_on_signals,
     world_and_vehicle,
 )
@@ -50,7 +51,7 @@ from sitl.world import load_world
     help="Offset of the lens from the vehicle's position: forward, left, up in m  [--vehicle's].",
 )  # fmt: skip
 @click.option(
-    "--truth", type=click.Path(path_type=Path), metavar="DIR",
+    "--truth", type=OutFolder(), metavar="DIR",
     help="Folder for the briefing and, at the end, the referee's log and verdict.",
 )  # fmt: skip
 @signing_options
@@ -99,14 +100,14 @@ def _camera(
     )  # fmt: skip
     place = f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}"
     with contextlib.closing(station):
-        click.echo(place, err=True)
+        note(place)
         try:
             station.run(lambda: not stopped())
         except LinkLost:
             if not stopped():
                 raise
         finally:
-            click.echo(f"{station.frames_sent} frames sent", err=True)
+            note(f"{station.frames_sent} frames sent")
             if truth is not None:
                 witness.save(truth)
 

@@ -13,7 +13,9 @@ from typing import Any
 import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
-from sitl.command_line import CONTEXT, Triple, complete_world, exit_code, places
+from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.terminal import echo, exit_code
+from sitl.command_line import CONTEXT, Triple, complete_world, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg
 from sitl.world.world import World, load_world, named_worlds, show
 
@@ -50,27 +52,27 @@ def _list(as_json: bool) -> None:
     """List all named worlds."""
     if as_json:
         rows = [{"name": name, "description": text} for name, text in named_worlds().items()]
-        click.echo(json.dumps(rows, indent=1))
+        echo(json.dumps(rows, indent=1))
         return
     for name, description in named_worlds().items():
-        click.echo(f"{name:<14}{description}")
-    click.echo("\nAlso gen:density,size (such as gen:0.1,4) and the path of a TOML file.")
+        echo(f"{name:<14}{description}")
+    echo("\nAlso gen:density,size (such as gen:0.1,4) and the path of a TOML file.")
 
 
 @_world.command(name="make", epilog=_WORLD_HELP, short_help="Write a world as a TOML file.")
 @_on_world
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="TOML file  [stdout].")
+@click.option("-o", "--output", type=OutFile(), help="TOML file  [stdout].")
 def _make(made: World, as_json: bool, output: Path | None) -> None:
     """Write a world as a TOML file of boxes, which every --world option accepts."""
     text = made.toml()
     if output is not None:
         write_text(output, text)
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "file": output and str(output)}, indent=1))
+        echo(json.dumps({**made.as_json(), "file": output and str(output)}, indent=1))
     elif output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
     else:
-        click.echo(f"{output}: {_boxes(made)}")
+        echo(f"{output}: {_boxes(made)}")
 
 
 @_world.command(name="check", epilog=_WORLD_HELP, short_help="Check that a world can be flown.")
@@ -90,7 +92,7 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
     """
     found = check_world(made, clearance_m=clearance)
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "check": found.as_json()}, indent=1))
+        echo(json.dumps({**made.as_json(), "check": found.as_json()}, indent=1))
     else:
         near_start, near_goal = (
             f"{m:.1f} m away" if math.isfinite(m) else "none"
@@ -98,7 +100,7 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
         )
         start, goal = map(show, (made.start_enu_m, made.goal_enu_m))
         path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
-        click.echo(
+        echo(
             f"{_boxes(made)}\n"
             f"start  {start}, nearest obstacle {near_start}\n"
             f"goal   {goal}, nearest obstacle {near_goal}\n"
@@ -111,7 +113,7 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
 
 @_world.command(name="draw", epilog=_WORLD_HELP)
 @_on_world
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="SVG file  [WORLD-SEED.svg].")
+@click.option("-o", "--output", type=OutFile((".svg",)), help="SVG file  [WORLD-SEED.svg].")
 @click.option("--path", "with_path", is_flag=True, help="Also draw the path that `check` finds.")
 def _draw(made: World, as_json: bool, output: Path | None, with_path: bool) -> None:
     """Draw a world from above, as SVG."""
@@ -121,9 +123,9 @@ def _draw(made: World, as_json: bool, output: Path | None, with_path: bool) -> N
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))
     if as_json:
-        click.echo(json.dumps({**made.as_json(), "file": str(file)}, indent=1))
+        echo(json.dumps({**made.as_json(), "file": str(file)}, indent=1))
     else:
-        click.echo(f"{file}: {_boxes(made)}")
+        echo(f"{file}: {_boxes(made)}")
 
 
 def _boxes(made: World) -> str:

@@ -116,6 +116,12 @@ def test_a_difference_after_the_faults_is_refused_and_not_resumed(echoing, tmp_p
     assert len((folder / "runs.jsonl").read_text().splitlines()) == 12
 
 
+def test_a_program_that_prints_the_second_is_refused_however_short_the_campaign(target):
+    """Golden runs, null runs and runs would end within one second, so the last null run waits."""
+    with pytest.raises(TargetError, match=r"^seconds: .* differ"):
+        run_campaign(Plan(runs=1, seed=1), [target("seconds")])
+
+
 def test_a_time_rule_leaves_out_flips_too(target):
     plan = Plan(runs=6, seed=6, rule="cpu-time", null=True)
     (runs,) = run_campaign(plan, [target("counting", "4000000")])

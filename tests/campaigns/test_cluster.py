@@ -292,11 +292,13 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port,
 
 
 @pytest.mark.parametrize(
-    "address", ["nonsense", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://127.0.0.1:port"]
+    "address", ["nonsense", "127.0.0.1:8786", "tcp://127.0.0.1", "tcp://127.0.0.1:port", ""]
 )
-def test_what_is_no_address_is_refused_at_once(address):
-    with pytest.raises(CampaignStopped, match="expected the scheduler's address, such as tls://"):
-        Cluster(address, Keep.NONE)
+def test_what_is_no_address_is_wrong_usage(address, mavfi):
+    run = mavfi("campaign", "run", "table4", "--cluster", address, "--quiet")
+    assert (run.returncode, run.stdout) == (2, "")
+    expected = f"expected an address such as tls://host:8786, got {address!r}"
+    assert run.stderr == f"error: --cluster: {expected}\n"
 
 
 @pytest.mark.slow

@@ -88,23 +88,23 @@ def test_a_table_of_other_contents_is_refused_in_one_line(tmp_path, columns):
         whole = whole.set_column(whole.column_names.index(name), name, pa.array(values))
     path = tmp_path / "strange.parquet"
     pq.write_table(whole, path)
-    with pytest.raises(RecordError, match="strange"):
-        opened(path)
+    with pytest.raises(RecordError, match="strange"), opened(path):
+        pass
 
 
 @pytest.mark.parametrize("metadata", ["{", "[1]", "3"])
 def test_damaged_metadata_are_refused(tmp_path, metadata):
     path = tmp_path / "strange.parquet"
     pq.write_table(pq.read_table(EXPORT).replace_schema_metadata({"mavfi": metadata}), path)
-    with pytest.raises(RecordError, match=r"not an export .* metadata are damaged"):
-        opened(path)
+    with pytest.raises(RecordError, match=r"not an export .* metadata are damaged"), opened(path):
+        pass
 
 
 def test_a_table_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.parquet"
     pq.write_table(pa.table({"number": [1]}), path)
-    with pytest.raises(MavfiError, match="not an export of a campaign"):
-        opened(path)
+    with pytest.raises(MavfiError, match="not an export of a campaign"), opened(path):
+        pass
 
 
 def test_a_folder_is_a_folder_whatever_its_name(tmp_path):

@@ -149,7 +149,9 @@ def test_a_rule_that_makes_no_sense_is_refused(old, new, error, told):
 def test_a_world_of_the_rule_that_no_mission_flies_is_refused(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text(SPEC.replace('worlds = ["rising"]', 'worlds = ["risin"]'))
-    with pytest.raises(UnknownName, match=r"fixed_world.worlds: world 'risin'; did you mean 'ris"):
+    with pytest.raises(
+        UnknownName, match=r"unknown world of \[fixed_world\] 'risin'; did you mean 'ris"
+    ):
         load_spec(str(file))
     file.write_text(SPEC)
     assert load_spec(str(file)).fixed_world.worlds == ("rising",)

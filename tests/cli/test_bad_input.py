@@ -263,6 +263,13 @@ def test_a_folder_that_could_not_be_read_again_is_refused_before_the_flight(refu
     assert f"'--out': {why}" in refused(*SHORT_LINE[1:], "--quiet", "--out", out, code=2)
 
 
+@pytest.mark.parametrize("arguments", ["states", "states --json", "--help", "world list"])
+def test_an_output_that_cannot_be_written_is_one_line(tmp_path, arguments):
+    line = f"{sys.executable} -m mavfi_cli {arguments} > /dev/full"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "error: No space left on device\n")
+
+
 def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
     line = f"{sys.executable} -m mavfi_cli world list | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)

@@ -8,6 +8,7 @@ from mavfi_cli import cli, studies
 from mavfi_cli.attack import campaign as attacks
 from mavfi_cli.campaigns import begin, run
 from mavfi_cli.cli.parameters import Name
+from mavfi_cli.core.output_paths import OutFile, OutFolder
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.paper import flying
 from mavfi_cli.studies import compare
@@ -71,6 +72,13 @@ def test_a_number_that_cannot_be_is_wrong_usage_of_its_option(refused, words, pa
 @pytest.mark.parametrize(("words", "param"), _options((click.Choice,)))
 def test_a_choice_that_does_not_exist_is_wrong_usage_of_its_option(refused, words, param):
     assert param.opts[-1] in refused(*words, f"{param.opts[-1]}=no-such-choice")
+
+
+@pytest.mark.parametrize(("words", "param"), _options((OutFile, OutFolder)))
+def test_an_empty_path_to_write_is_wrong_usage(refused, words, param):
+    needed = ["table4"] if words in {("campaign", "draw"), ("campaign", "export")} else []
+    given = [""] if isinstance(param, click.Argument) else [f"{param.opts[-1]}="]
+    assert refused(*words, *needed, *given).endswith(": the name is empty.")
 
 
 BESIDES = {("campaign", "draw"): ["--output", "a.svg"], ("campaign", "export"): ["a.csv"]}

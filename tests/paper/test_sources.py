@@ -151,7 +151,7 @@ def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
     found = Evidence.gather([tmp_path])
     assert len(found.campaigns) == 1
     (problem,) = found.problems
-    assert "kernels.json: not a whole summary of `mavfi kernels`" in problem
+    assert "kernels.json: damaged (" in problem
 
 
 def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):

@@ -41,8 +41,11 @@ def write_rrd(flights: Sequence[ViewedFlight], path: Path | None) -> None:
         recording.flush()
         return
     stream = recording.binary_stream()
-    _log(recording, flights)
-    write_atomically(path, lambda file: file.write(stream.read(flush=True) or b""))
+    try:
+        _log(recording, flights)
+    finally:  # else rerun warns of data that nobody read
+        data = stream.read(flush=True) or b""
+    write_atomically(path, lambda file: file.write(data))
 
 
 def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:

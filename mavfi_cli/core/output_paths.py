@@ -1,0 +1,53 @@
+"""Types of options: files and folders that a command writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import require_folder, require_output
+
+
+class _OutPath(click.Path):
+    """A path to write: not empty, which would mean the current folder."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the path, or fail if it cannot be written."""
+        if not str(value):
+            self.fail("the name is empty.", param, ctx)
+        path = super().convert(value, param, ctx)
+        try:
+            self._require(Path(str(path)))
+        except RecordError as error:
+            self.fail(f"{error}.", param, ctx)
+        return path
+
+    def _require(self, path: Path) -> None:
+        """Reject what cannot be written. Raises RecordError."""
+        raise NotImplementedError
+
+
+class OutFolder(_OutPath):
+    """A folder for results, which is made if it does not exist."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def _require(self, path: Path) -> None:
+        require_folder(path)
+
+
+class OutFile(_OutPath):
+    """A file to write, with one of some suffixes."""
+
+    def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
+        super().__init__(path_type=Path, dir_okay=False, allow_dash=allow_dash)
+        self._suffixes = suffixes
+
+    def _require(self, path: Path) -> None:
+        if not (self.allow_dash and str(path) == "-"):
+            require_output(path, self._suffixes)

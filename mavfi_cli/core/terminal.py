@@ -1,0 +1,70 @@
+"""Output of commands, and how they end. No text in it is a command to the terminal."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+
+import click
+
+from mavfi_cli.core.errors import Interrupted, MavfiError, described, nearest, printable
+
+
+def cleaned(text: str) -> str:
+    """Return lines without control characters."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def echo(text: str, *, nl: bool = True) -> None:
+    """Print text to stdout. Raises OSError if stdout cannot be written."""
+    click.echo(cleaned(text), nl=nl)
+
+
+def note(text: str) -> None:
+    """Print text to stderr."""
+    click.echo(cleaned(text), err=True)
+
+
+def exit_code(program: Callable[[], object]) -> int:
+    """Call click's `main`, not standalone. Return its exit code.
+
+    A known error, wrong usage (code 2) and output that cannot be written are printed in one line.
+    """
+    try:
+        code = program()
+    except click.exceptions.Exit as left:
+        return left.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:
+        note(error.format_message())
+        return error.exit_code
+    except click.ClickException as error:
+        unknown = isinstance(error, click.NoSuchOption) and _no_such_option(error)
+        note_error(unknown or error.format_message())
+        return error.exit_code
+    except (Interrupted, KeyboardInterrupt, click.Abort) as error:
+        note(str(error) or "interrupted")
+        return 128 + signal.SIGINT
+    except MavfiError as error:
+        note_error(error)
+        return error.exit_code
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the rest of stdout fails at exit, too
+        if not isinstance(error, BrokenPipeError):
+            place = "" if error.filename is None else f"{error.filename}: "
+            note_error(f"{place}{error.strerror or described(error)}")
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _no_such_option(error: click.NoSuchOption) -> str:
+    params = error.ctx.command.params if error.ctx is not None else []
+    known = [name.lstrip("-") for param in params for name in param.opts]
+    match = nearest(error.option_name.lstrip("-"), known)
+    hint = f"; did you mean '--{match}'?" if match else ""
+    return f"no such option {error.option_name!r}{hint}"
+
+
+def note_error(problem: object) -> None:
+    """Print an error to stderr, in one line."""
+    note("error: " + " ".join(str(problem).splitlines()))
