@@ -15,7 +15,6 @@ SOURCES = {
     for package in ("mavfi_cli", "sitl")
     for path in sorted((ROOT / package).rglob("*.py"))
 }
-LONGEST_STUDY = 150  # lines of a module
 LONGEST_CHAIN = 19  # modules, each of which imports the next, wherever the import stands
 MOST_FILES = 260
 MOST_NAMES = 800  # public classes and functions at the top level of modules
@@ -135,17 +134,6 @@ def test_tables_csv_and_pictures_are_made_in_report_only():
 
 def test_the_command_line_holds_no_data():
     assert {name for name in mentions(r"@dataclass") if name.startswith("mavfi_cli.cli")} == set()
-
-
-def test_a_study_is_short():
-    """A study is a preset: what it asks of flights belongs into analysis."""
-    lengths = {
-        name: len(path.read_text().splitlines())
-        for name, path in SOURCES.items()
-        if name.startswith("mavfi_cli.studies.")
-    }
-    assert lengths
-    assert {name: lines for name, lines in lengths.items() if lines > LONGEST_STUDY} == {}
 
 
 def test_every_public_function_has_a_caller():

@@ -8,7 +8,7 @@ overhead     cost of detection and recovery
 platforms    comparison of platforms: ratios, cost of faults, worst cases
 detectors    detection, false alarms, recovery, of pairs of flights
 scores       traces replayed through detectors; samples for training
-beside_model the performance model as missions, and beside their results
+beside_model the performance model beside its flights
 timeline     from one depth frame to its setpoint
 trajectories the flights of one picture
 """

@@ -20,7 +20,6 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
 from mavfi_cli.analysis.pairs import paired
-from mavfi_cli.campaigns.detector_plans import ERROR_FREE, FAULT, NONE
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
@@ -30,6 +29,8 @@ from mavfi_cli.stats.roc import curves
 from mavfi_cli.stats.shares import Interval, Share, mixture, rate
 
 LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
+NONE = "none"  # no detector: the reference of all others
+ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
 KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
 Flight = Mapping[str, Any]  # a row of `analysis.flights`
 Place = tuple[str, str, tuple[Any, ...]]  # kind, detector, KEY

@@ -15,9 +15,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.detectors import Scored, harmful
+from mavfi_cli.analysis.detectors import NONE, Scored, harmful
 from mavfi_cli.analysis.flights import chosen
-from mavfi_cli.campaigns.detector_plans import NONE, model_digest
 from mavfi_cli.core.errors import ModelError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.types import BY_NAME, Outcome, StackMark, Stage, Trajectory
@@ -57,8 +56,7 @@ def scored(
     with contextlib.suppress(OSError, ValueError):  # missing or damaged
         kept = json.loads(store.read_text(encoding="utf-8"))
     names = {
-        each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/"
-        f"{model_digest(each, stack)}"
+        each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/{each.model_digest(stack)}"
         for each in detectors
     }
     scores = {each.name: kept.setdefault(names[each.name], {}) for each in detectors}

@@ -132,8 +132,8 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
 
 
 def _plan(options: dict[str, Any]) -> Any:
-    from mavfi_cli.campaigns.detector_plans import DETECTORS, WORLDS, EvaluationPlan
     from mavfi_cli.spec.mission import MissionConfig
+    from mavfi_cli.studies.evaluate import DETECTORS, WORLDS, EvaluationPlan
 
     base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
     named = options["detectors"]

@@ -61,13 +61,13 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     The same command resumes an interrupted training. Fitting the autoencoder needs torch:
     pip install 'mavfi[train]'.
     """
-    from mavfi_cli.campaigns.detector_plans import TRAINING_WORLDS, TrainingPlan
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.detectors import draw_loss_curve
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
+    from mavfi_cli.studies.train import TRAINING_WORLDS, TrainingPlan
     from mavfi_cli.studies.train import train as run
 
     flown, stack, autopilot = (options[name] for name in ("flown", "stack", "autopilot"))

@@ -166,10 +166,9 @@ def _flown(
     out: Path,
     options: dict[str, Any],
 ) -> dict[str, Any]:
-    from mavfi_cli.analysis.beside_model import WORLDS, RedundancyPlan
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
-    from mavfi_cli.studies.redundancy import fly_and_report
+    from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
 
     same = ("missions", "first_seed", "models", "train", "stack")
     plan = RedundancyPlan(

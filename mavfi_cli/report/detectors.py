@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from mavfi_cli.analysis.detectors import ALL, CSV
-from mavfi_cli.campaigns.detector_plans import NONE
+from mavfi_cli.analysis.detectors import ALL, CSV, NONE
 from mavfi_cli.report.columns import columns, csv_text, number, percent, rate, spread
 from mavfi_cli.report.drawing import (
     NOTE,

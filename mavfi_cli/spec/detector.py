@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.types import Stage
 from mavfi_cli.spec.stack import load_stack
 
@@ -91,6 +92,11 @@ class DetectorConfig:
                 return path
             stack = flown.base
         return None
+
+    def model_digest(self, stack: str) -> str:
+        """Return the digest of the model file; `none` without one. Raises as `model_path`."""
+        path = self.model_path(stack)
+        return "none" if path is None else file_digest(path)
 
     def built(self, stack: str) -> Detector:
         """Create a new detector for a mission with the given stack.

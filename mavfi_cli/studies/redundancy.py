@@ -1,39 +1,237 @@
-"""`mavfi vpm --fly`: fly every row of the model, one plan per vehicle and scheme, and compare."""
+"""`mavfi vpm --fly`: fly every row of the model, one plan per vehicle and scheme, and compare.
+
+The simulated vehicle and platform are TOML files that a mission names by path. Their names contain
+a digest of their contents, so that equal names mean equal flights.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.beside_model import (
-    BASE,
-    FlightPlan,
-    Key,
-    RedundancyPlan,
-    side_by_side,
-)
+from mavfi_cli.analysis.beside_model import BASE, FlightSetup, Key, side_by_side
 from mavfi_cli.analysis.flights import chosen, flown
-from mavfi_cli.analysis.overhead import ComputeOverhead
+from mavfi_cli.analysis.overhead import TIMES, ComputeOverhead
 from mavfi_cli.campaigns.begin import check_names
-from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import canonical, changes_of
+from mavfi_cli.campaigns.missions import PlannedMission, canonical, changes_of
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
-from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.core.errors import CannotLift, VehicleProcessError
-from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.campaigns.specification import Keep, require_named
+from mavfi_cli.campaigns.specification_file import folder_name
+from mavfi_cli.companion.pipeline import BRAKE_SHARE
+from mavfi_cli.core.config import toml_text
+from mavfi_cli.core.errors import CannotLift, ConfigError, VehicleProcessError
+from mavfi_cli.core.files import write_text, writing
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.mission import LIMITS, MissionConfig
+from mavfi_cli.spec.platform import PlatformProfile, load_platform
+from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.studies import fly
-from mavfi_cli.studies.train import train
-from mavfi_cli.vpm.model import DETECTORS, ModelVehicle, Scheme, schemes_with
-from mavfi_cli.vpm.report import CHAINS, report
+from mavfi_cli.studies.train import TRAINING_WORLDS, TrainingPlan, train
+from mavfi_cli.vpm.model import (
+    DETECTORS,
+    ModelInputs,
+    ModelVehicle,
+    Scheme,
+    safe_velocity_mps,
+    schemes_with,
+)
+from mavfi_cli.vpm.report import CHAINS, Choices, report
 
 FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default
+WORLDS = ("sparse", "dense")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlan:
+    """Plan of the flights of a vehicle with a scheme.
+
+    Attributes:
+        mission: without world and seed.
+        files: of vehicle and platform, and their contents.
+    """
+
+    mission: MissionConfig
+    files: Mapping[Path, str]
+    setup: FlightSetup
+
+    @classmethod
+    def of(
+        cls,
+        setting: ModelInputs,
+        scheme: Scheme,
+        platform: PlatformProfile,
+        chain_s: float,
+        folder: Path,
+        models: Path | None = None,
+        stack: str = DEFAULT,
+    ) -> FlightPlan:
+        """The mission that flies a scheme at the model's safe velocity.
+
+        Args:
+            platform: platform whose latencies are scaled to the model's response time.
+            chain_s: response time of that platform in the model.
+            folder: absolute path of the folder for the files.
+            models: folder of model files NAME.json; None takes the shipped ones.
+
+        Raises:
+            CannotLift: the rotors cannot lift this many boards.
+            ConfigError: the model's numbers are not valid for a mission.
+            ModelError: the folder lacks the detector's model.
+        """
+        flown, boards_w = setting.performance(scheme), scheme.copies * setting.board.power_w
+        velocity, cut_v = _within("v_max_mps", flown["velocity_mps"], "velocity", "m/s")
+        accel, cut_a = _within("a_max_mps2", flown["acceleration_mps2"], "acceleration", "m/s²")
+        range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
+        rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
+        stem = folder_name(f"{setting.vehicle.name}-{scheme.name}")
+        vehicle = _file(folder, stem, _vehicle(setting, scheme, accel))
+        factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
+        board = _file(folder, folder_name(f"{stem}-{platform.name}"), _platform(platform, factor))
+        watched = scheme.name in DETECTORS
+        mission = MissionConfig(
+            vehicle=str(vehicle[0]),
+            platform=str(board[0]),
+            stack=stack,
+            v_max_mps=velocity,
+            a_max_mps2=accel,
+            map_range_m=range_m,
+            camera_rate_hz=rate_hz,
+            detector=DetectorConfig.with_model(scheme.name, models) if watched else None,
+        )
+        response_s = setting.response_s(scheme.overhead)
+        return cls(
+            mission=mission,
+            files=dict((vehicle, board)),
+            setup=FlightSetup(
+                v_max_mps=velocity,
+                a_max_mps2=accel,
+                braking_velocity_mps=safe_velocity_mps(
+                    BRAKE_SHARE * accel, response_s, setting.range_m
+                ),
+                rotors_w=flown["power_w"] - boards_w,
+                boards_w=boards_w,
+                cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
+            ),
+        )
+
+    def write(self) -> None:
+        """Write the files; a RecordError says why one cannot be written."""
+        for path, text in self.files.items():
+            with writing(path.parent):
+                path.parent.mkdir(parents=True, exist_ok=True)
+            write_text(path, text)
+
+
+def _vehicle(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
+    """The simulated equivalent of the model's vehicle, with a scheme's boards and heat sinks."""
+    vehicle, board, boards = setting.vehicle, setting.board, scheme.copies
+    return {
+        "name": f"{vehicle.name}-{scheme.name}",
+        "description": f"{vehicle.name} of the performance model with {boards} x {board.name}",
+        "base": vehicle.stand_in,
+        "mass_kg": vehicle.mass_kg,
+        "extra_payload_kg": setting.carried_kg(boards),
+        "rotor_pull_n": setting.pull_n,
+        "acceleration_mps2": acceleration_mps2,
+        "hover_power_w": vehicle.hover_power_w,
+        "battery_wh": vehicle.battery_wh,
+        "avionics_w": boards * board.power_w,
+    }
+
+
+def _platform(platform: PlatformProfile, factor: float) -> dict[str, Any]:
+    source = f"{platform.name}{TIMES}{factor:.6g}"
+    kernels = {
+        name: {"latency_s": factor * kernel.latency_s, "spread": kernel.spread, "source": source}
+        for name, kernel in platform.kernels.items()
+    }
+    return {
+        "name": source, "cores": platform.cores, "carried": platform.carried, "kernels": kernels,
+    }  # fmt: skip
+
+
+def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
+    """The nearest value that a mission allows, and a message if it differs."""
+    low, high = LIMITS[key]
+    taken = min(max(wanted, low), high)
+    told = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
+    return taken, "" if taken == wanted else told
+
+
+def _file(folder: Path, stem: str, values: Mapping[str, Any]) -> tuple[Path, str]:
+    text = toml_text(values)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return folder / f"{stem}-{digest}.toml", text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RedundancyPlan:
+    """Plan of the flights of all vehicles and schemes.
+
+    Attributes:
+        missions: number per scheme and world.
+        folder: folder of flights and pictures; recorded missions are not flown again.
+        models: folder of the detectors' models; None takes the shipped ones.
+        train: flights of each training world to which detectors are fitted for each vehicle; 0
+            fits none.
+        stack: stack of all flights.
+
+    Raises:
+        ConfigError, UnknownName: a world is missing or named twice, or the missions have seeds of
+            training flights, which no flight may share in any world.
+    """
+
+    vehicles: Sequence[ModelVehicle]
+    choices: Choices
+    worlds: tuple[str, ...] = WORLDS
+    missions: int
+    first_seed: int
+    folder: Path
+    models: Path | None = None
+    train: int = 0
+    stack: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        require_named("world", self.worlds)
+        first = TrainingPlan().first_seed
+        last = first + self.train * len(TRAINING_WORLDS) - 1
+        if self.train and self.first_seed <= last and first < self.first_seed + self.missions:
+            raise ConfigError(
+                f"seeds {first} to {last} are for training: choose another --first-seed",
+                key="first seed",
+            )
+
+    @property
+    def models_told(self) -> str:
+        """Origin of the detectors' models."""
+        if self.train:
+            return (
+                f"fitted for each vehicle to {self.train} error-free flights in each of "
+                f"{', '.join(TRAINING_WORLDS)} at its safe velocity"
+            )
+        if self.models is not None:
+            return f"of {self.models}"
+        return "the shipped ones, fitted to flights of the Solo at 3 m/s"
+
+    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
+        """The list mission by mission, so that pairs are complete if it is cut off."""
+        seeds = range(self.first_seed, self.first_seed + self.missions)
+        return [
+            PlannedMission(
+                config=replace(plan.mission, world=world, seed=seed),
+                labels={"group": vehicle, "arm": scheme, "world": world},
+                pair=f"{world}/{seed}",
+            )
+            for seed in seeds
+            for world in self.worlds
+            for (vehicle, scheme), plan in flown.items()
+        ]
 
 
 def _plans_of(
@@ -132,6 +330,11 @@ def fly_and_report(
         "first_seed": plan.first_seed,
         "stack": plan.stack,
         "detectors": plan.models_told,
-        **side_by_side(report(plan.vehicles, plan.choices, schemes), plans, table, measured),
+        **side_by_side(
+            report(plan.vehicles, plan.choices, schemes),
+            {key: each if isinstance(each, str) else each.setup for key, each in plans.items()},
+            table,
+            measured,
+        ),
     }
     return told

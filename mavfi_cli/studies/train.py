@@ -1,26 +1,66 @@
-"""`mavfi train`: error-free flights, the data set of their samples, and the models fitted to it."""
+"""`mavfi train`: error-free flights, the data set of their samples, and the models fitted to it.
+
+By default the paper's training set (section VI): two obstacle densities times two obstacle sizes,
+25 flights each. Every flight has its own world seed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavfi_cli.analysis.scores import flown_samples
 from mavfi_cli.campaigns.begin import check_kinds
-from mavfi_cli.campaigns.detector_plans import TrainingPlan
 from mavfi_cli.campaigns.ledger import RUNS
+from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.detect.base import Model
-from mavfi_cli.detect.fit import check, fit
+from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.offline import Dataset
 from mavfi_cli.detect.preprocess import PreprocessParams
-from mavfi_cli.spec.mission import OWN_AUTOPILOT
+from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
 DATASET, FLIGHTS = "dataset.parquet", "flights"
+TRAINING_WORLDS = ("train-0.05-3", "train-0.05-5", "train-0.2-3", "train-0.2-5")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingPlan:
+    """Plan of the flights and of the fit.
+
+    Attributes:
+        flights: number per world.
+        first_seed: seed of the first flight; each further flight of any world adds 1.
+        seed: seed of the split and of the initial weights.
+        n_sigma: threshold of the Gaussian model; None takes the default.
+        flown: folder of run folders to fit to; None flies the missions.
+    """
+
+    worlds: tuple[str, ...] = TRAINING_WORLDS
+    flights: int = 25
+    first_seed: int = 10_000  # far from the usual seeds of flights and evaluations
+    seed: int = 1
+    n_sigma: float | None = None
+    kinds: tuple[str, ...] = KINDS
+    base: MissionConfig = field(default_factory=MissionConfig)
+    flown: Path | None = None
+
+    def missions(self) -> list[PlannedMission]:
+        """The flights, world by world."""
+        return [
+            PlannedMission(
+                config=replace(
+                    self.base, world=world, seed=self.first_seed + place * self.flights + number
+                ),
+                labels={"world": world},
+            )
+            for place, world in enumerate(self.worlds)
+            for number in range(self.flights)
+        ]
 
 
 def train(

@@ -7,13 +7,14 @@ import re
 import pyarrow as pa
 import pytest
 
-from mavfi_cli.analysis.beside_model import FlightPlan, side_by_side
+from mavfi_cli.analysis.beside_model import side_by_side
 from mavfi_cli.analysis.overhead import ComputeOverhead
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model import PICTURES, model_csv, model_lines
 from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.studies.redundancy import FlightPlan
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
 
@@ -74,7 +75,7 @@ def spark(tmp_path):
     setting = Choices().inputs(vehicle)
     rows = {row["scheme"]: row for row in told["vehicles"][0]["schemes"]}
     plans = {
-        ("spark", name): FlightPlan.of(setting, scheme, x86, chain_s, tmp_path)
+        ("spark", name): FlightPlan.of(setting, scheme, x86, chain_s, tmp_path).setup
         for name, scheme in SCHEMES.items()
     }
 

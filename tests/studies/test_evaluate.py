@@ -7,7 +7,6 @@ import pyarrow as pa
 import pytest
 from evaluation_flights import error_free, flown, pair, struck, table
 
-from mavfi_cli.campaigns.detector_plans import EvaluationPlan
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.core.files import write_json
 from mavfi_cli.report.detectors import (
@@ -16,7 +15,7 @@ from mavfi_cli.report.detectors import (
     detector_lines,
 )
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.studies.evaluate import told
+from mavfi_cli.studies.evaluate import EvaluationPlan, told
 
 # The thresholds of the plan are not used: scores are given.
 PLAN = EvaluationPlan(worlds=("dense", "farm"), detectors=("gad",), flights=2, golden_flights=2)

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mavfi_cli.campaigns.detector_plans import INTEGER, NONE, EvaluationPlan
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.preprocess import EXTENDED
 from mavfi_cli.spec.stack import load_stack
+from mavfi_cli.studies.evaluate import INTEGER, NONE, EvaluationPlan
 
 PLAN = EvaluationPlan(
     worlds=("dense", "farm"), detectors=(NONE, "gad"), flights=2, harmless_flights=1,

@@ -2,11 +2,11 @@
 
 import pytest
 
-from mavfi_cli.analysis.beside_model import FlightPlan, RedundancyPlan
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies import redundancy
+from mavfi_cli.studies.redundancy import FlightPlan, RedundancyPlan
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices
 

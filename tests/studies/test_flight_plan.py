@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.analysis.beside_model import FlightPlan, RedundancyPlan
 from mavfi_cli.core.errors import CannotLift
 from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.studies.redundancy import FlightPlan, RedundancyPlan
 from mavfi_cli.vpm.model import SCHEMES, Board, ModelVehicle, hover_power_w
 from mavfi_cli.vpm.report import Choices
 
@@ -43,9 +43,9 @@ def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
     assert planned.mission.map_range_m == 7.0
     assert planned.mission.camera_rate_hz == 30.0
     assert planned.mission.detector is None
-    assert planned.boards_w == 10.0 * SCHEMES[scheme].copies
-    assert planned.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown["mass_kg"]))
-    assert vehicle["avionics_w"] == planned.boards_w
+    assert planned.setup.boards_w == 10.0 * SCHEMES[scheme].copies
+    assert planned.setup.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown["mass_kg"]))
+    assert vehicle["avionics_w"] == planned.setup.boards_w
 
 
 def test_the_stack_is_the_mission_s(tmp_path):
@@ -57,12 +57,12 @@ def test_the_stack_is_the_mission_s(tmp_path):
 
 def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
-    assert planned.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
-    assert plan("spark", "tmr")[0].cut == ()
+    assert planned.setup.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
+    assert plan("spark", "tmr")[0].setup.cut == ()
     fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=Board.load("ncs")))
     assert fast.mission.v_max_mps == 12.0
-    assert fast.cut[0].startswith("velocity 12 m/s instead of ")
-    assert fast.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
+    assert fast.setup.cut[0].startswith("velocity 12 m/s instead of ")
+    assert fast.setup.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
 
 
 @pytest.mark.parametrize("scheme", ["none", "tmr", "gad", "aad"])
