@@ -15,6 +15,7 @@ import sys
 import time
 from typing import Any
 
+from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.processes import PYTHON, receive, send
 from mavfi_cli.fi.tracer import linux
@@ -68,6 +69,7 @@ class ServedProcess:
 
     def _start(self) -> None:
         self.connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        choose_caches()  # or the first program alone would have to
         environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
         output = (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)
         actions = [

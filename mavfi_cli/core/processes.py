@@ -84,11 +84,14 @@ class _Values(pickle.Unpickler):
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
-    """Receive into a single buffer, so that a node's memory is the same in every run."""
+    """Receive into one buffer by one call, so that a node's memory is the same in every run.
+
+    Only a socket with a timeout, which no attacked node has, or a signal makes it several calls.
+    """
     data = bytearray(size)
     view, filled = memoryview(data), 0
     while filled < size:
-        count = connection.recv_into(view[filled:])
+        count = connection.recv_into(view[filled:], flags=socket.MSG_WAITALL)
         if not count:
             raise EOFError
         filled += count

@@ -49,3 +49,14 @@ def test_the_shell_leaves_no_traces_in_a_program(started, monkeypatch):
     assert len(started) == 5
     assert len(found) == 1
     assert b"PYTHONHASHSEED=0" in found.pop()
+
+
+def test_the_caches_are_chosen_before_the_first_program_starts(started, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+
+    def choose():
+        os.environ["NUMBA_CACHE_DIR"] = "/chosen"
+
+    monkeypatch.setattr(served, "choose_caches", choose)
+    served.ServedProcess.of(MODULE)
+    assert b"NUMBA_CACHE_DIR=/chosen" in environment(started[0].pid)

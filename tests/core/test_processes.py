@@ -4,6 +4,7 @@ import os
 import pickle
 import socket
 from dataclasses import dataclass
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -27,6 +28,20 @@ def test_values_arrive_as_they_were(pair):
     got = receive(pair[1])
     assert got[1:] == value[1:]
     np.testing.assert_array_equal(got[0].velocity_enu_mps, command.velocity_enu_mps)
+
+
+def test_a_value_that_arrives_in_pieces_is_received_by_one_call(pair):
+    class Counting:
+        def recv_into(self, *arguments, **options):
+            sizes.append(pair[1].recv_into(*arguments, **options))
+            return sizes[-1]
+
+    sizes, value = [], b"x" * 4_000_000  # more than a socket's buffer holds
+    sender = Thread(target=send, args=(pair[0], value))
+    sender.start()
+    assert receive(Counting()) == value
+    sender.join()
+    assert len(sizes) == 2  # its length and itself
 
 
 @dataclass

@@ -58,10 +58,16 @@ def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed)
 
 @traced
 def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(fly_short, tmp_path):
-    # Seed 1 strikes a pointer to the heap, which a flight of a fresh clone had elsewhere.
-    first = fly_short(instruction=InstructionConfig(target="planner", seed=2))
+    first = fly_short(instruction=InstructionConfig(target="planner", seed=1))
     config, recorded = load_run(first.path).mission(), records.read(first.fault)
     assert flown(fly_mission(config, tmp_path, Watcher(), repeat=recorded)) == flown(first)
+
+
+def test_a_node_gets_the_same_message_in_a_flight_and_in_its_replay(short_config, short_flight):
+    asked = replace(short_config, v_max_mps=3)
+    recorded = load_run(short_flight.path).mission()
+    assert (asked.goal_tolerance_m, recorded.goal_tolerance_m) == (None, 1.0)
+    assert Setup.of(asked, None, "planner") == Setup.of(recorded, None, "planner")
 
 
 @traced

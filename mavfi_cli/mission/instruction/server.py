@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mavfi_cli.attack.kernels.scope import node_scope
 from mavfi_cli.attack.served import CHANNEL, newest_cache_ns
@@ -26,6 +26,7 @@ class Setup:
 
     The memory of the node depends on the bytes of the message. So it has the golden mission, which
     all missions of a pair share, as text: a pickle tells which objects of a mission are identical.
+    The text is that of the mission as its record has it, which a replay reads.
 
     Attributes:
         golden: the mission without fault and protection, as JSON.
@@ -38,8 +39,10 @@ class Setup:
     @classmethod
     def of(cls, config: MissionConfig, briefing: Briefing, node: str) -> Setup:
         """The message for a node of a mission."""
-        golden = json.dumps(config.golden.to_dict(), sort_keys=True)
-        return cls(golden=golden, briefing=briefing, node=node)
+        own_m = config.loaded_stack().goal_tolerance_m
+        recorded = json.dumps(replace(config.golden, goal_tolerance_m=own_m).to_dict())
+        golden = structure(json.loads(recorded), MissionConfig).to_dict()
+        return cls(golden=json.dumps(golden, sort_keys=True), briefing=briefing, node=node)
 
     @property
     def config(self) -> MissionConfig:
