@@ -1,17 +1,20 @@
 """The detector's gate in a mission: decides whether to withhold, recompute or accept a message.
 
-A message that raises an alarm is withheld and its stage is recomputed (paper, section V-E). The
-number of recomputations is bounded: at the `alarms_max`-th consecutive alarm of a stage the vehicle
-holds and plans anew. The next message passes, because so many computations agree. Messages accepted
-while the vehicle hovers do not end the series, because they do not test the waypoints that raised
-the alarms.
+A message that raises an alarm is withheld and its stage is recomputed (paper, section V-E). A
+recomputed report that raises the same alarm confirms the withheld one and takes effect, so only a
+report that predicts a collision makes the vehicle stop and plan anew.
+
+The number of recomputations is bounded: at the `alarms_max`-th consecutive alarm of planning or
+control the vehicle holds and plans anew. The next message of the stage passes, because so many
+computations agree. Messages accepted while the vehicle hovers do not end the series, because they
+do not test the waypoints that raised the alarms.
 
 `Protection` judges and counts messages. `Recovery` applies its response to the mission: it
 recomputes the stage of a withheld message, or holds the vehicle.
 
     response    report                       plan              active plan          command
     RECOMPUTE   recompute perception         request another   drop the waypoint    recompute it
-    HOLD        recompute perception, hold   hold              hold                 hold
+    HOLD        never                        hold              hold                 hold
 
 Perception recomputes only if the alarm names it. A detector over all stages recomputes control
 (paper, section V-D), which happens in the next tick without the report.
@@ -66,6 +69,7 @@ class _Recovery:
     total_s: float = 0.0
     since_s: float | None = None
     in_a_row: int = 0
+    alarm: Alarm | None = None  # of the last message, if it raised one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,12 +209,13 @@ class Protection(NoProtection):
     def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Decision:
         recovery = self._recoveries[stage]
         recovery.in_a_row += 1
-        if recovery.in_a_row < self._config.alarms_max:
-            response = Response.RECOMPUTE
-        elif recovery.in_a_row == self._config.alarms_max:
-            response = Response.HOLD
-        else:
+        is_report, alarms_max = message == "report", self._config.alarms_max
+        response = Response.RECOMPUTE
+        if recovery.in_a_row > alarms_max or (is_report and alarm == recovery.alarm):
             response = Response.ACCEPT
+        elif recovery.in_a_row == alarms_max and not is_report:
+            response = Response.HOLD
+        recovery.alarm = alarm
         self._responses[response.value] += 1
         if recovery.since_s is None:
             recovery.since_s = stamp_s
@@ -248,6 +253,7 @@ class Protection(NoProtection):
                 the commands of a hover always pass.
         """
         recovery = self._recoveries[stage]
+        recovery.alarm = None
         if proven or recovery.in_a_row < self._config.alarms_max:
             recovery.in_a_row = 0
         if recovery.since_s is not None:

@@ -31,7 +31,8 @@ class DetectorConfig:
         protect: Stages with watched states.
         threshold: Replaces the model's threshold; a number of sigmas for gad.
         model: Path of a model file; None selects the one shipped for the mission's stack.
-        alarms_max: Number of consecutive alarms of a stage at which the vehicle holds and replans.
+        alarms_max: Number of consecutive alarms of planning or control at which the vehicle holds
+            and replans; also the maximum number of consecutive reports that are withheld.
         any_stack: Allow a model for another stack than the mission's.
         watch: Watched states: `paper` for the 13 states, `extended` adds three more.
     """

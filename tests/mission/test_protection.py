@@ -129,6 +129,35 @@ def test_a_wild_report_is_withheld(limit):
     assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
 
 
+CALM = CollisionReport(
+    stamp_s=0.0, collision=False, time_to_collision_s=np.inf, future_collision_seq=0
+)
+
+
+def test_a_report_that_its_recomputation_confirms_is_accepted(limit):
+    """A flip in the first report becomes the reference, so all correct reports raise an alarm."""
+    gate = protection(limit)
+    reports = [replace(CALM, future_collision_seq=1 << 13), CALM, CALM, CALM]
+    assert [gate.report(report, 0.3).response for report in reports] == [
+        Response.PASS, Response.RECOMPUTE, Response.ACCEPT, Response.PASS,
+    ]  # fmt: skip
+
+
+def test_reports_that_never_agree_are_accepted_in_the_end_and_never_hold_the_vehicle(limit):
+    gate = protection(limit)
+    reports = [replace(CALM, future_collision_seq=number) for number in (0, 50, 60, 70, 80)]
+    assert [gate.report(report, 0.3).response for report in reports] == [
+        Response.PASS, *[Response.RECOMPUTE] * limit.alarms_max, Response.ACCEPT,
+    ]  # fmt: skip
+
+
+def test_two_equal_alarms_with_a_good_report_between_them_confirm_nothing(limit):
+    gate = protection(limit)
+    wild = replace(CALM, future_collision_seq=1 << 13)
+    told = [gate.report(report, 0.3).response for report in (CALM, wild, CALM, wild)]
+    assert told[1] is told[3] is Response.RECOMPUTE
+
+
 @pytest.mark.parametrize(
     ("wrong", "error"),
     [
@@ -277,6 +306,26 @@ def test_a_stage_that_is_not_protected_is_not_watched(fly_short, limit):
     run = load_run(fly_short(detector=config, fault=FLIP).path)
     assert run.result["detection"]["alarm_count"] == 0
     assert run.result["fault"]["activation"]["activation"] == "read"
+
+
+@pytest.mark.parametrize("name", ["gad", "aad"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        FaultConfig(target="time_to_collision", at="invocation=1", exact_bits=(0,)),  # inf to NaN
+        FaultConfig(target="future_collision_seq", at="invocation=1", exact_bits=(13,)),
+    ],
+    ids=["time", "number"],
+)
+def test_alarms_about_correct_reports_do_not_lengthen_the_flight(
+    fly_short, short_flight, name, fault
+):
+    run = load_run(fly_short(detector=DetectorConfig(name=name), fault=fault).path)
+    responses = [alarm["response"] for alarm in run.result["detection"]["alarms"]]
+    assert responses == ["recompute", "accept"]
+    golden = load_run(short_flight.path).result
+    for section in ("plans", "quality_of_flight"):
+        assert run.result[section] == golden[section]
 
 
 @pytest.mark.slow
