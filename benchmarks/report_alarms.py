@@ -3,12 +3,15 @@ r"""What alarms about collision reports do to flights, with the recovery of two 
     python benchmarks/report_alarms.py docs/results/paper-mavbench.parquet \
         docs/results/report-alarms.parquet
 
-Compares an export of a campaign with the missions that `--fly FOLDER` has flown again. These are
-all missions with an alarm about a collision report, and those whose detector saves or causes harm.
-Recovery from other alarms has not changed, so every other mission of the export stays as it is. A
-flight does harm if it does not end in success, or takes more than 5 % longer than its golden
+Compares an export of a campaign with the missions that `--fly FOLDER` has flown again: all those
+with an alarm about a collision report. Recovery from other alarms has not changed, so every other
+mission of the export stays as it is. As a check, missions without such an alarm whose detector
+undoes or causes harm are flown again too.
+
+A flight does harm if it does not end in success, or takes more than 5 % longer than its golden
 flight. A detector causes harm if only its flight does harm, and undoes it if only the unprotected
-flight of the same fault does.
+flight of the same fault does. The mean added time is that of the protected flight over the
+unprotected one, if both succeed.
 
 `mavfi campaign export FOLDER docs/results/report-alarms.parquet` writes the second export.
 """
@@ -18,6 +21,7 @@ from __future__ import annotations
 import argparse
 import collections
 import json
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -77,29 +81,44 @@ def _fault(row: Row) -> str:
 
 
 def table(missions: Missions, again: list[Row]) -> list[str]:
-    """Return the lines of the table."""
+    """Return the lines of the table, and one line about the missions without an alarm."""
     cells: dict[Key, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    added_s: dict[tuple[Key, str], list[float]] = collections.defaultdict(list)
+    check: collections.Counter[bool] = collections.Counter()
     for new in again:
         old = missions.protected[new["label_mission"]]
-        bare, cell = missions.unprotected(old), cells[key(old, ARM)]
+        if not old["recovery_share_perception"]:
+            check[_flight(old) == _flight(new)] += 1
+            continue
+        bare, arm = missions.unprotected(old), key(old, ARM)
+        cell = cells[arm]
         cell["flown"] += 1
         for when, row in (("before", old), ("after", new)):
             cell[f"{when} {missions.effect(row)}"] += 1
             if bare is not None:
                 cell[f"{when} lost"] += lost(row) and not lost(bare)
-                cell[f"{when} equal"] += row["flight_time_s"] == bare["flight_time_s"]
+                cell[f"{when} equal"] += _flight(row) == _flight(bare)
+                if not lost(row) and not lost(bare):
+                    added_s[arm, when].append(row["flight_time_s"] - bare["flight_time_s"])
     lines = [
-        "| level | computer | detector | stages | flown again | harm caused | of it lost "
-        "| harm undone | time equal to the unprotected |",
-        "|" + "---|" * 9,
+        "| level | computer | detector | stages | missions | harm caused | of it lost "
+        "| harm undone | equal to the unprotected | mean added time, s |",
+        "|" + "---|" * 10,
     ]
     for arm, cell in sorted(cells.items()):
         columns = [
-            f"{cell[f'before {what}']} to {cell[f'after {what}']}"
+            f"{cell[f'before {what}']} → {cell[f'after {what}']}"
             for what in ("caused", "lost", "undone", "equal")
         ]
+        mean_s = [statistics.fmean(added_s[arm, when]) for when in ("before", "after")]
+        columns.append(f"{mean_s[0]:.2f} → {mean_s[1]:.2f}")
         lines.append(f"| {' | '.join([*arm, str(cell['flown']), *columns])} |")
-    return lines
+    equal = f"{check[True]} of {check.total()}"
+    return [*lines, "", f"Without an alarm about a report: {equal} flights are as before"]
+
+
+def _flight(row: Row) -> tuple[str, float]:
+    return row["outcome"], row["flight_time_s"]
 
 
 def main() -> None:
