@@ -1,8 +1,8 @@
-"""Archives: dataclasses with arrays as bytes, in numpy's `.npz`, read back without executing any.
+"""Archives: dataclasses with arrays as bytes, in numpy's `.npz`; reading one executes nothing.
 
-An archive has two arrays of bytes. `value` is JSON, in which an array is its place in `data`, its
-dtype, shape, order and writeability. An array that occurs twice is there once. Equal values give
-equal bytes. An archive may come from anybody: sizes are bounded, and types and shapes are checked.
+An archive has two arrays of bytes. `value` is JSON, in which an array is given by its offset in
+`data`, dtype, shape, order and writeability. An array that occurs twice is stored once. Equal
+values give equal bytes. An archive is untrusted: sizes are bounded, types and shapes are checked.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def pack(value: Any) -> bytes:
     data, places = bytearray(), dict[int, dict[str, Any]]()
 
     def place(item: Any) -> Any:
-        """Write what JSON lacks."""
+        """Convert what JSON lacks."""
         if isinstance(item, np.generic):
             return item.item()
         if id(item) not in places:
@@ -68,7 +68,7 @@ def unpack(archive: bytes, kind: type[T]) -> T:
     """Return the dataclass of an archive.
 
     Raises:
-        ValueError: The bytes are no archive of this dataclass.
+        ValueError: The bytes are not an archive of this dataclass.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(archive)) as parts:
@@ -79,14 +79,14 @@ def unpack(archive: bytes, kind: type[T]) -> T:
         known: dict[Any, Any] = {}
 
         def array(item: dict[str, Any]) -> Any:
-            """Return the array of its place, one for all that refer to it."""
+            """Return the array at an offset; all references share it."""
             if _MARK not in item:
                 return item
             at, dtype, shape, order, writeable = item[_MARK]
             place = at, dtype, *shape, order, writeable
             if place not in known:
                 if dtype not in _TYPES or at < 0 or min(shape, default=0) < 0:
-                    raise ValueError("has an array of another kind")
+                    raise ValueError("has an array of an unsupported kind")
                 count = int(np.prod(shape, dtype=object))
                 made = np.frombuffer(data, dtype, count, at).copy().reshape(shape, order=order)
                 made.flags.writeable = writeable
@@ -114,12 +114,12 @@ def _converter() -> cattrs.Converter:
         )
 
         def hook(value: Any, kind: Any) -> Any:
-            """Raise ValueError for an array of another shape."""
+            """Raise ValueError if an array has the wrong shape."""
             made = make(value, kind)
             for name, shape in _SHAPES.items():
                 array = getattr(made, name, None)
                 if array is not None and not _fits(array.shape, shape):
-                    raise ValueError(f"{name} has the shape {array.shape}")
+                    raise ValueError(f"{name} must have the shape {shape}, got {array.shape}")
             return made
 
         return hook
@@ -129,11 +129,11 @@ def _converter() -> cattrs.Converter:
 
 def _as_it_is(*kinds: type) -> Any:
     def hook(value: Any, _: Any) -> Any:
-        """Raise TypeError for a value of another type, ValueError for one beyond 64 bits."""
+        """Raise TypeError for a value of the wrong type, ValueError for one beyond 64 bits."""
         if isinstance(value, bool) is not (kinds[0] is bool) or not isinstance(value, kinds):
-            raise TypeError(f"{value!r} is no {kinds[0].__name__}")
+            raise TypeError(f"must be of type {kinds[0].__name__}, got {value!r}")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise ValueError(f"{value} has more than 64 bits")
+            raise ValueError(f"must fit in 64 bits, got {value}")
         return value
 
     return hook
@@ -146,7 +146,7 @@ def _is_array(kind: Any) -> bool:
 def _checked_array(value: Any, kind: Any) -> Any:
     (scalar,) = get_args(get_args(kind)[1])
     if not isinstance(value, np.ndarray) or value.dtype != np.dtype(scalar):
-        raise TypeError(f"no array of {scalar.__name__}")
+        raise TypeError(f"must be an array of {scalar.__name__}")
     return value
 
 

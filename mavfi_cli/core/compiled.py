@@ -46,7 +46,7 @@ def compiled(function: F) -> F:
     if cache_file is not None:
         _recover(cache)
         known: list[Any] = [function, *_callees(function)]
-        folders = sorted({Path(inspect.getfile(each)).parent for each in known})
+        folders = sorted({Path(inspect.getfile(function)).parent for function in known})
         cache_file._source_stamp = tuple(folder_digest(folder) for folder in folders)
     kernel: F = dispatcher
     return kernel
@@ -81,7 +81,7 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 
 def _recover(cache: Any) -> None:
-    """Have damaged entries of numba's cache compiled anew; it would raise their errors."""
+    """Make numba recompile damaged entries of its cache, whose errors it would raise."""
     load = cache.load_overload
 
     def load_overload(*arguments: Any) -> Any:
@@ -96,7 +96,7 @@ def _recover(cache: Any) -> None:
 
 
 def _numba() -> Any:
-    """Import numba without BLAS: no kernel multiplies matrices, and finding it takes 0.14 s."""
+    """Import numba without BLAS, which takes 0.14 s to load and which no kernel uses."""
     choose_caches()  # before numba reads the environment
     import numba
 
@@ -113,7 +113,7 @@ def _numba() -> Any:
 
 def _callees(function: Any) -> list[Any]:
     """Return the Python functions behind all compiled functions in the module of `function`."""
-    return [each.py_func for each in function.__globals__.values() if hasattr(each, "py_func")]
+    return [value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")]
 
 
 # Folders of caches --------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def choose_caches() -> None:
 
 
 def _home(variable: str, name: str) -> Path:
-    """A folder of the user as the XDG specification defines it; relative if there is no home."""
+    """The user's cache folder by the XDG specification; relative if there is no home."""
     given = Path(os.environ.get(variable, ""))
     return given if given.is_absolute() else Path(os.path.expanduser("~"), name)
 
@@ -154,12 +154,14 @@ def _folder() -> Path:
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError:
-        found = folder.lstat()
-        if (found.st_uid, found.st_mode) == (os.getuid(), stat.S_IFDIR | 0o700):
+        status = folder.lstat()
+        if (status.st_uid, status.st_mode) == (os.getuid(), stat.S_IFDIR | 0o700):
             return folder
-        folder = Path(tempfile.mkdtemp(prefix="mavfi-"))  # machine code of others must not run here
+        folder = Path(
+            tempfile.mkdtemp(prefix="mavfi-")
+        )  # machine code of other users must not run here
     sys.stderr.write(
-        f"caches are in {folder}: neither {PACKAGE} nor {home} can be written; XDG_CACHE_HOME "
-        "names another folder\n"
+        f"caches are in {folder}: neither {PACKAGE} nor {home} is writable; set XDG_CACHE_HOME "
+        "to choose another folder\n"
     )
     return folder

@@ -23,8 +23,8 @@ def load_toml(path: Path, cls: type[T]) -> T:
 
     Raises:
         ConfigError: The file cannot be read or parsed, a key is missing or has the wrong type, or
-            `cls` rejects a value (a ValueError from `__post_init__`) or does not have a key. Names
-            file, line and key, and the nearest key.
+            `cls` rejects a value (a ValueError from `__post_init__`) or has no such key. The
+            message names file, line and key, and the nearest key.
     """
     data, text = read_toml(path)
     return structure(data, cls, path=path, text=text)
@@ -36,14 +36,14 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     `structure` uses the text to find the line of an error.
 
     Raises:
-        ConfigError: The file cannot be read or parsed. Names file and line.
+        ConfigError: The file cannot be read or parsed. The message names file and line.
     """
     text = read_text(path)
     return parse_toml(text, path), text
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """Parse TOML. A ConfigError names `path`, and the line if the parser reports one."""
+    """Parse TOML. ConfigErrors name `path`, and the line if the parser reports one."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -86,10 +86,10 @@ class Shipped:
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def path(self, name_or_path: str) -> Path:
-        """Find a shipped file by its name, or a user's own by its path.
+        """Return the path of a shipped file by its name, or of a user's own file by its path.
 
         Raises:
-            UnknownName: Nothing shipped has this name, and it is not a path to a TOML file.
+            UnknownName: No shipped file has this name, and it is not a path to a TOML file.
             ConfigError: It is a path to a TOML file that does not exist.
         """
         path = Path(name_or_path)
@@ -105,7 +105,7 @@ class Shipped:
         """Return the `base` of a file if it names another shipped file.
 
         Raises:
-            ConfigError: It does not. Suggests the nearest name.
+            ConfigError: It names no shipped file. The message suggests the nearest name.
         """
         if name not in self.names or path == self.folder / f"{name}.toml":
             error = UnknownName(self.kind, str(name), set(self.names) - {path.stem})
@@ -122,7 +122,7 @@ def structure(
     except cattrs.BaseValidationError as group:
         key, error = _first_problem(group, "")
     if isinstance(error, ForbiddenExtraKeysError):
-        known = [each.name for each in dataclasses.fields(error.cl)]
+        known = [entry.name for entry in dataclasses.fields(error.cl)]
         key = f"{key}.{min(error.extra_fields)}".lstrip(".")
         raise ConfigError.unknown_key(key, known, path=path, line=_line_of(text, key))
     problem = "is missing" if isinstance(error, KeyError) else str(error)
@@ -148,7 +148,7 @@ _IN_WORDS = {int: "a whole number", float: "a number", bool: "true or false", st
 
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
-        """Raise TypeError for a value of another type and ValueError for one that is not finite."""
+        """Raise TypeError for a value of the wrong type, ValueError for one that is not finite."""
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
@@ -162,7 +162,7 @@ def _strict(kind: type, *accepted: type) -> Any:
 
 def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = None) -> Any:
     def hook(value: Any, cls: Any) -> Any:
-        """Raise TypeError for another shape. Text is an array of letters."""
+        """Raise TypeError for the wrong type or length. A text is not an array of letters."""
         if not isinstance(value, accepted):
             raise TypeError(f"expected {wanted}, got {value!r}")
         if length is not None and len(value) != length:
@@ -172,7 +172,7 @@ def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = No
     return hook
 
 
-_origin: Any = get_origin  # or mypy takes classes for ParamSpec
+_origin: Any = get_origin  # otherwise mypy takes classes for ParamSpec
 
 
 def _converter() -> cattrs.Converter:
@@ -208,10 +208,10 @@ _CONVERTER = _converter()
 
 
 def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
-    """Return key and innermost first failure of a cattrs error group."""
+    """Return the key and the innermost error of the first failure in a cattrs error group."""
     if not isinstance(error, ExceptionGroup):
         return key, error
-    extra = [each for each in error.exceptions if isinstance(each, ForbiddenExtraKeysError)]
+    extra = [item for item in error.exceptions if isinstance(item, ForbiddenExtraKeysError)]
     inner = (extra or error.exceptions)[0]
     for note in getattr(inner, "__notes__", []):
         if isinstance(note, AttributeValidationNote):

@@ -1,4 +1,4 @@
-"""The errors that users see. Each composes its own message of one line."""
+"""The errors that users see. Each one composes its own one-line message."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ def described(error: BaseException) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a line without control characters, which could be commands to a terminal."""
+    """Return a line without control characters, which a terminal could obey."""
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lack_of(error: Exception) -> str:
-    """Return what is wrong with a file's contents, by the error that their use has raised."""
+    """Describe what is wrong with a file's contents, from the error that their use raised."""
     return f"it has no {error}" if isinstance(error, KeyError) else described(error)
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name most similar to `name`, ignoring case and folder, or None."""
-    for each in known:
-        if each.endswith(f"/{name}"):
-            return each
-    spelled = {each.lower(): each for each in known}
-    alike = [each for each in spelled if each[:1] == name[:1].lower()]
+    for candidate in known:
+        if candidate.endswith(f"/{name}"):
+            return candidate
+    spelled = {candidate.lower(): candidate for candidate in known}
+    alike = [lower for lower in spelled if lower[:1] == name[:1].lower()]
     for names, cutoff in ((spelled, 0.6), (alike, 0.5)):
         if matches := difflib.get_close_matches(name.lower(), names, n=1, cutoff=cutoff):
             return spelled[matches[0]]
@@ -53,7 +53,7 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """A name that does not exist: wrong usage. Suggests the nearest known name."""
+    """An unknown name, which is wrong usage. The message suggests the nearest known name."""
 
     exit_code = 2
 
@@ -62,10 +62,10 @@ class UnknownName(MavfiError):
 
 
 def named_member(kind: type[E], what: str, name: str | E) -> E:
-    """Return the member of an enumeration with this value.
+    """Return the member of an enumeration that has this value.
 
     Raises:
-        UnknownName: No member has this value. Suggests the nearest.
+        UnknownName: No member has this value. The message suggests the nearest.
     """
     try:
         return kind(name)
@@ -74,7 +74,7 @@ def named_member(kind: type[E], what: str, name: str | E) -> E:
 
 
 class ConfigError(MavfiError):
-    """A file or a value that cannot be used. Gives file, line, key and the problem."""
+    """A file or value that cannot be used. The message gives file, line, key and problem."""
 
     def __init__(
         self, problem: str, *, path: Path | None = None, line: int | None = None, key: str = ""
@@ -90,23 +90,23 @@ class ConfigError(MavfiError):
     def unknown_key(
         cls, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
     ) -> Self:
-        """Return the error about a key that no setting has. It suggests the nearest known key."""
+        """Return the error about an unknown key. It suggests the nearest known key."""
         problem = f"unknown key; {_suggestion(key.rpartition('.')[2], known)}"
         return cls(problem, path=path, line=line, key=key)
 
 
 class WorldError(MavfiError):
-    """The boxes of a world, or the numbers that it is generated from, are invalid."""
+    """The boxes of a world, or the parameters of its generator, are invalid."""
 
 
 class PlaceError(WorldError):
-    """Start or goal is blocked or outside the world: wrong usage."""
+    """Start or goal is blocked or outside the world, which is wrong usage."""
 
     exit_code = 2
 
 
 class LinkError(MavfiError):
-    """The MAVLink connection failed or cannot be opened, or what answers cannot be flown."""
+    """The MAVLink connection failed, cannot be opened, or leads to no usable vehicle."""
 
 
 class NoAutopilot(LinkError):
@@ -126,7 +126,7 @@ class CannotLift(MavfiError):
 
 
 class VehicleProcessError(MavfiError):
-    """The simulated vehicle could not start, or ended early; its exit code is passed on."""
+    """The simulated vehicle could not start or ended early; keeps its exit code."""
 
     def __init__(self, problem: str, exit_code: int = 1) -> None:
         super().__init__(problem)
@@ -134,7 +134,7 @@ class VehicleProcessError(MavfiError):
 
 
 class ModelError(MavfiError):
-    """A detector model, or a data set to fit one, that cannot be used or created."""
+    """A detector model, or its training data, that cannot be used or created."""
 
     def __init__(self, problem: str, *, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
@@ -153,7 +153,7 @@ class FaultSpecError(FaultError):
 
 
 class TracingForbidden(FaultError):
-    """The operating system does not permit tracing. Says how to allow it."""
+    """The operating system does not permit tracing. The message explains how to allow it."""
 
     def __init__(self, what: str, problem: str, remedy: str) -> None:
         super().__init__(f"{what} is not possible here ({problem}): {remedy}")
@@ -167,11 +167,11 @@ class TargetError(FaultError):
 
 
 class BuildMismatch(FaultError):
-    """A fault record made with another build. Names each object that differs."""
+    """A fault record of another build. The message names every object that differs."""
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record is of another build: {'; '.join(differences)}")
 
 
 class Interrupted(MavfiError):
-    """The user asked to stop."""
+    """The user requested a stop."""

@@ -1,7 +1,7 @@
 """Files: atomic writes, scratch folders, and digests of source code.
 
-A kill leaves the old file or the new one, never a partial one. A folder of results may come from
-anybody: nothing is written through a link in it, and what is read has bounds.
+A kill leaves the old file or the new one, never a partial one. A folder of results is untrusted:
+nothing is written through a link in it, and everything read from it has bounds.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def file_digest(name: str | Path) -> str:
 
 @contextlib.contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Turn an OSError of the block into a RecordError that names the place."""
+    """Turn an OSError of the block into a RecordError that names the path."""
     try:
         yield
     except OSError as error:
@@ -52,7 +52,7 @@ def writing(place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(place: Path) -> Iterator[None]:
-    """Turn an error that damaged contents of a file raise where they are used into RecordError."""
+    """Turn the errors that damaged contents of a file cause into RecordError."""
     try:
         yield
     except (
@@ -62,43 +62,43 @@ def reading(place: Path) -> Iterator[None]:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """Read a regular file. No link is followed, and no pipe is waited for.
+    """Read a regular file without following links or waiting for pipes.
 
     Args:
-        limit: the most bytes that it may have.
+        limit: largest allowed size in bytes.
 
     Raises:
-        RecordError: It cannot be read, is another kind of file, or is larger.
+        RecordError: It cannot be read, is not a regular file, or is larger.
     """
     with writing(path), open(os.open(path, _READ), "rb") as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
             raise RecordError(f"{path}: is not a regular file")
         if about.st_size > limit:
-            raise RecordError(f"{path}: has {about.st_size} bytes, more than {limit}")
+            raise RecordError(f"{path}: must have at most {limit} bytes, got {about.st_size}")
         return file.read(limit)
 
 
 def read_json(path: Path, limit: int) -> dict[str, Any]:
-    """Read a JSON object from a file. Raises RecordError, as `read_bounded` or if it is damaged."""
+    """Read a JSON object from a file. Raises as `read_bounded`; RecordError if it is damaged."""
     with reading(path):
-        found = json.loads(read_bounded(path, limit))
-    if not isinstance(found, dict):
+        value = json.loads(read_bounded(path, limit))
+    if not isinstance(value, dict):
         raise RecordError(f"{path}: not a JSON object")
-    return found
+    return value
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Open a file of ours, or create it; return its descriptor. A link raises OSError."""
+    """Open or create a file that mavfi owns; return its descriptor. A link raises OSError."""
     return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def own_folder(path: Path) -> Path:
-    """Make a folder of ours unless it is there, and return its path.
+    """Make a folder that mavfi owns unless it exists, and return its path.
 
     Raises:
         RecordError: It cannot be made, or something else has its name. A link to a folder is
-            refused too, because files are removed in folders of ours.
+            refused too, because mavfi removes files in its folders.
     """
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
@@ -119,7 +119,7 @@ def inflate(data: bytes, limit: int) -> bytes:
     except zlib.error as error:
         raise ValueError(str(error)) from None
     if not inflater.eof:
-        raise ValueError(f"is cut off, or has more than {limit >> 20} MB")
+        raise ValueError(f"is truncated, or has more than {limit >> 20} MB")
     return whole
 
 
@@ -134,7 +134,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with writing(path):
-        temporary.unlink(missing_ok=True)  # of a killed process, or a link
+        temporary.unlink(missing_ok=True)  # left by a killed process, or a link
         try:
             with open(open_own(temporary, os.O_WRONLY | os.O_EXCL), "wb") as file:
                 write(file)
@@ -151,18 +151,19 @@ _SCRATCH, _OWNED = "mavfi-", ".mavfi-scratch"
 
 
 class ScratchFolder:
-    """A private temporary folder, which is removed whatever ends the process.
+    """A private temporary folder that is removed however the process ends.
 
     `close`, the end of the object or the end of the process removes it. A killed process leaves
-    it behind; then the next process that makes a scratch folder in the same place removes it. A
+    it behind; the next process that makes a scratch folder in the same place removes it. A
     lock on a file in the folder shows that the process, or a fork of it, is still running. A fork
     never removes the folder of its parent.
 
-    As a context manager it gives the path.
+    As a context manager it returns the path.
 
     Args:
-        what: One word of its name, `mavfi-WHAT-...`.
-        parent: The place, by default the temporary directory. In any other the name is hidden.
+        what: A word of its name, `mavfi-WHAT-...`.
+        parent: Folder to make it in, by default the temporary directory. Elsewhere its name begins
+            with a dot.
 
     Attributes:
         path: The folder.
@@ -194,7 +195,7 @@ def _locked_folder(place: Path, prefix: str) -> tuple[Path, int]:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if os.fstat(lock).st_nlink:
             return path, lock
-        os.close(lock)  # another process took it for an abandoned one before it was locked
+        os.close(lock)  # another process removed it as abandoned before it was locked
 
 
 def _remove_scratch(path: Path, lock: int, owner: int) -> None:
@@ -205,9 +206,9 @@ def _remove_scratch(path: Path, lock: int, owner: int) -> None:
 
 @cache
 def _remove_abandoned(place: Path) -> None:
-    """Remove this user's scratch folders of killed processes, once in the life of this process."""
+    """Remove this user's scratch folders of killed processes, once per process."""
     for path in [*place.glob(f"{_SCRATCH}*"), *place.glob(f".{_SCRATCH}*")]:
-        with contextlib.suppress(OSError):  # none of ours, or its process is running
+        with contextlib.suppress(OSError):  # not ours, or its process is running
             about = path.lstat()
             if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
                 continue
@@ -220,7 +221,7 @@ def _remove_abandoned(place: Path) -> None:
 
 
 def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
-    """Reject the name of a file that could not be written, before its contents are computed.
+    """Check that a file can be written, before its contents are computed.
 
     Raises:
         RecordError: The name has none of the suffixes, if any are given, or the folder does not
@@ -238,10 +239,10 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Reject a folder that cannot be made or written, before its contents are computed.
+    """Check that a folder can be made and written, before its contents are computed.
 
     Raises:
-        RecordError: Its name is not UTF-8, which tables need, or it cannot be made or written.
+        RecordError: Its name is not UTF-8, as tables require, or it cannot be made or written.
     """
     try:
         str(folder).encode()
@@ -252,7 +253,7 @@ def require_folder(folder: Path) -> None:
 
 
 def can_write(folder: Path) -> bool:
-    """True if a folder can be written, or made if it does not exist."""
+    """Return True if a folder is writable, or can be made."""
     place = folder.absolute()
     while place != place.parent and not os.path.lexists(place):
         place = place.parent
@@ -280,7 +281,7 @@ def read_parquet(path: Path, what: str) -> Any:
     """Read an Arrow table.
 
     Raises:
-        RecordError: The file is missing or damaged; `what` is the word for it.
+        RecordError: The file is missing or damaged. The message calls it `what`.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -320,8 +321,8 @@ def folder_digest(folder: Path, *, deep: bool = False) -> str:
     `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
     """
     digest = hashlib.sha256()
-    found = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
-    for path in sorted(found):
+    paths = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
+    for path in sorted(paths):
         digest.update(str(path.relative_to(folder)).encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -329,5 +330,5 @@ def folder_digest(folder: Path, *, deep: bool = False) -> str:
 
 def own_digest() -> str:
     """Return the SHA-256 of all sources and settings of mavfi and of the simulated vehicle."""
-    parts = [folder_digest(each, deep=True) for each in (PACKAGE, PACKAGE.parent / "sitl")]
+    parts = [folder_digest(folder, deep=True) for folder in (PACKAGE, PACKAGE.parent / "sitl")]
     return hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""A process that has loaded everything once, and forks a fresh worker for every order.
+"""A process that loads everything once and forks a fresh worker for every order.
 
     python -m mavfi_cli.core.fork_server FD MODULE
 
@@ -7,18 +7,19 @@
                   │     └─ worker: MODULE.perform(task, folder)
                   └─ guard ...
 
-A worker is a fork of a process with a single thread that has done nothing but load. It dies with
-its guard; when it ends, or its time runs out, the guard ends all that it has started and only then
-reports. When the client closes the channel of an order, or dies, the guard ends the worker.
-Whatever is killed, nothing goes on in secret and nobody waits for ever.
+A worker is forked from a single-threaded process that has only loaded modules. It dies with its
+guard. When it ends or its time runs out, the guard kills every process that it started, and only
+then reports. When the client dies or closes the channel of an order, the guard kills the worker.
+Killing any process leaves no orphan and no blocked peer.
 
-`multiprocessing` has a fork server too. There each child keeps the server's pipe open, so one that
-hangs outlives a killed client; each child imports the client's main module again; nothing reaps
-what a child leaves; and a daemonic process, as dask's workers are, may not use it.
+The fork server of `multiprocessing` does not serve: its children keep the server's pipe open, so a
+child that hangs outlives a killed client; every child imports the client's main module again;
+nothing reaps the processes that a child leaves; and daemonic processes, such as dask's workers,
+may not use it.
 
-FD is a socket to the client. Each packet on it is an order in JSON, {"task", "folder", "limit_s"},
-with the descriptor of a channel on which the guard says {"pid"} at the begin and at the end
-{"exit" | "signal" | "timeout", "report", "wall_s"}.
+FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s"},
+with the descriptor of a channel. The guard sends {"pid"} on this channel at the start, and
+{"exit" | "signal" | "timeout", "report", "wall_s"} at the end.
 """
 
 from __future__ import annotations
@@ -50,37 +51,37 @@ from mavfi_cli.core.files import open_own
 from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
-# What ps calls them.
+# Process names in ps.
 SERVER, GUARD, WORKER = "mavfi-server", "mavfi-guard", "mavfi-worker"
 ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
-"""Environment of a process that forks itself. Its libraries then start no threads."""
+"""Environment of a process that forks itself, so that its libraries start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
-PACKET = 1 << 17  # bytes, of an order or a report
+PACKET = 1 << 17  # largest order or report, bytes
 ERRORS, SCRATCH = "stderr.txt", "tmp"
 _READY = b"ready"
-_STOP_S = 10.0  # from the closing of the server until it is killed
-_TRACEBACK = 8000  # characters of a traceback that are reported, the last ones
+_STOP_S = 10.0  # time to end after `close`, before it is killed
+_TRACEBACK = 8000  # trailing characters of a traceback that are reported
 _LONGEST_WAIT_S = 3600.0
 
 
 class _Module(Protocol):
     def prepare(self) -> None:
-        """Load everything, once; starts no thread."""
+        """Load everything once, without starting a thread."""
 
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
-        """Do a task; the folder that it left, in `folder`."""
+        """Do a task. Return the folder that it made in `folder`."""
 
 
 # The client's side --------------------------------------------------------------------------------
 
 
 class ForkServer:
-    """Starts workers that call a module's `perform`, and the server again if it was killed."""
+    """Starts workers that call a module's `perform`. Restarts the server if it was killed."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -88,10 +89,10 @@ class ForkServer:
         self._control: socket.socket | None = None
 
     def start(self, task: Mapping[str, Any], folder: Path, limit_s: float) -> socket.socket:
-        """Have a fresh worker do a task; the channel on which its guard reports.
+        """Start a worker for a task. Return the channel on which its guard reports.
 
         Args:
-            folder: for what the worker leaves, its standard error and temporary files included.
+            folder: for the worker's results, its standard error and its temporary files.
 
         Raises:
             MavfiError: the server cannot be started.
@@ -103,12 +104,12 @@ class ForkServer:
             for _ in range(2):
                 try:
                     socket.send_fds(self._running(), [order], [theirs.fileno()])
-                except OSError:  # it was killed since
+                except OSError:  # the server was killed
                     self.close()
                     continue
                 undo.pop_all()
                 return ours
-        raise MavfiError("the process that forks the workers ends at once")
+        raise MavfiError("the process that forks the workers ended at once")
 
     def _running(self) -> socket.socket:
         if self._control is not None:
@@ -124,10 +125,10 @@ class ForkServer:
                 env={**os.environ, **ONE_THREAD},
                 start_new_session=True,  # Ctrl-C is for the client
             )
-        said = b""
+        answer = b""
         with contextlib.suppress(OSError):
-            said = ours.recv(len(_READY))
-        if said != _READY:
+            answer = ours.recv(len(_READY))
+        if answer != _READY:
             ours.close()
             self._process.wait()
             raise MavfiError("the process that forks the workers could not start")
@@ -158,14 +159,14 @@ def _serve() -> NoReturn:
     module.prepare()
     gc.collect()
     if (count := len(os.listdir("/proc/self/task"))) > 1:
-        sys.exit(f"error: {count} threads where one is needed: a fork would lack the others")
-    gc.freeze()  # the collector would touch, and so copy, every page that forks share
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the guards
+        sys.exit(f"error: must have one thread to fork, got {count}")
+    gc.freeze()  # a collection would write to, and so copy, every page that forks share
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # guards need no wait()
     control.send(_READY)
     while True:
         packet, channels, _, _ = socket.recv_fds(control, PACKET, 1)
         if not packet:
-            os._exit(0)  # an orderly end would have native libraries complain of what is loaded
+            os._exit(0)  # on an orderly exit native libraries print warnings
         fork(functools.partial(_guard, control, packet, channels[0], module))
         os.close(channels[0])
 
@@ -174,46 +175,46 @@ def _serve() -> NoReturn:
 
 
 def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Module) -> int:
-    """The whole life of a guard; the server's socket is not for it."""
+    """Run a guard: fork the worker, wait for it, report its end."""
     control.close()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     order, channel = json.loads(packet), socket.socket(fileno=descriptor)
     _call_this_process(GUARD)
-    _request(_PR_SET_CHILD_SUBREAPER, 1)  # its descendants' orphans become its children
+    _request(_PR_SET_CHILD_SUBREAPER, 1)  # orphaned descendants become its children
     begun_s, guard = time.monotonic(), os.getpid()
     reading, writing = os.pipe()
 
     def work() -> NoReturn:
-        """Do the work in the fork, without the guard's ends of channels."""
+        """Close the guard's ends of the channels and do the work."""
         channel.close()
         os.close(reading)
         _work(order, module, guard, writing)
 
     worker = fork(work)
     os.close(writing)
-    with contextlib.suppress(OSError):  # the client is gone: so will be the guard
+    with contextlib.suppress(OSError):  # the client is gone, so the guard ends too
         channel.send(json.dumps({"pid": worker}).encode())
         late = _await(worker, channel, begun_s + float(order["limit_s"]))
         _, status = os.waitpid(worker, 0)
         _end_children()
-        told: dict[str, Any] = {"report": _last_words(reading)}
+        end: dict[str, Any] = {"report": _report_of_worker(reading)}
         if late:
-            told["timeout"] = True
+            end["timeout"] = True
         elif os.WIFSIGNALED(status):
-            told["signal"] = os.WTERMSIG(status)
+            end["signal"] = os.WTERMSIG(status)
         else:
-            told["exit"] = os.WEXITSTATUS(status)
-        told["wall_s"] = round(time.monotonic() - begun_s, 6)
-        channel.send(json.dumps(told).encode())
+            end["exit"] = os.WEXITSTATUS(status)
+        end["wall_s"] = round(time.monotonic() - begun_s, 6)
+        channel.send(json.dumps(end).encode())
     _end_children()
     return 0
 
 
 def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
-    """Until the worker has ended; True where it was killed because its time ran out.
+    """Wait until the worker has ended. Return True if it was killed because its time ran out.
 
     Raises:
-        ConnectionError: the client has closed the channel.
+        ConnectionError: the client closed the channel.
     """
     process = os.pidfd_open(worker)
     poller = select.poll()
@@ -223,8 +224,8 @@ def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
     while True:
         left_s = math.inf if late else max(0.0, deadline_s - time.monotonic())
         ready = {descriptor for descriptor, _ in poller.poll(1e3 * min(left_s, _LONGEST_WAIT_S))}
-        if channel.fileno() in ready:  # nothing is said meanwhile
-            raise ConnectionError("the client has closed")
+        if channel.fileno() in ready:  # a client sends nothing, so this is its end
+            raise ConnectionError("the client closed the channel")
         if process in ready:
             return late
         if left_s <= 0.0:
@@ -232,12 +233,12 @@ def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
             os.kill(worker, signal.SIGKILL)
 
 
-def _last_words(reading: int) -> Any:
-    """The worker's report; None where it was ended before it had made a whole one."""
+def _report_of_worker(reading: int) -> Any:
+    """Return the worker's report, or None if it ended before the report was complete."""
     with open(reading, "rb") as pipe:
-        said = pipe.read()
+        text = pipe.read()
     try:
-        return json.loads(said)
+        return json.loads(text)
     except ValueError:
         return None
 
@@ -246,7 +247,7 @@ def _last_words(reading: int) -> Any:
 
 
 def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -> NoReturn:
-    """The whole life of a worker, in a process group of its own."""
+    """Run a worker in a process group of its own."""
     code, report = 1, {}
     try:
         _call_this_process(WORKER)
@@ -255,12 +256,12 @@ def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
         folder = Path(order["folder"])
-        _own_surroundings(folder)
+        _isolate_streams(folder)
         report = {"folder": module.perform(order["task"], folder).name}
         code = 0
     except MavfiError as error:
         report = {"error": type(error).__name__, "text": str(error)}
-    except BaseException:  # the process boundary: the traceback goes to the client
+    except BaseException:  # the process boundary; the client gets the traceback
         report = {"traceback": traceback.format_exc()[-_TRACEBACK:]}
     finally:
         with contextlib.suppress(OSError):
@@ -268,8 +269,8 @@ def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -
         os._exit(code)
 
 
-def _own_surroundings(folder: Path) -> None:
-    """Streams and temporary files of a worker of its own."""
+def _isolate_streams(folder: Path) -> None:
+    """Give the worker its own streams and its own folder for temporary files."""
     scratch = folder / SCRATCH
     scratch.mkdir(parents=True, exist_ok=True)
     os.environ["TMPDIR"] = tempfile.tempdir = str(scratch)
@@ -287,14 +288,14 @@ def _own_surroundings(folder: Path) -> None:
 
 
 def die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends. Exit now if it has already ended."""
+    """Let the kernel kill this process when its parent ends. Exit now if it has ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
 
 def _call_this_process(name: str) -> None:
-    """Set the name of this process in ps and top, at most 15 bytes."""
+    """Set the name of this process in ps and top (at most 15 bytes)."""
     _request(_PR_SET_NAME, ctypes.c_char_p(name.encode()))
 
 
@@ -305,9 +306,9 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
 
 
 def _end_children() -> None:
-    """Kill and reap every descendant of this process, which is their reaper.
+    """Kill and reap every descendant of this process.
 
-    A killed child leaves its own children to us, so the loop ends when there are none.
+    This process inherits the children of a killed child, so the loop repeats until there are none.
     """
     while children := _children():
         for pid in children:
@@ -319,8 +320,8 @@ def _end_children() -> None:
 
 
 def _children() -> list[int]:
-    """Return the children of this process, which has one thread; none if Linux does not tell."""
-    with contextlib.suppress(OSError):  # of a kernel without CONFIG_PROC_CHILDREN
+    """Return the children of this single-threaded process; none if Linux does not list them."""
+    with contextlib.suppress(OSError):  # a kernel without CONFIG_PROC_CHILDREN
         return [*map(int, Path("/proc/thread-self/children").read_text().split())]
     return []
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-# Limits of positions and velocities that arrive from a link, along each axis. A map ends at 6.5 km.
+# Limits along each axis of positions and velocities from a link. Maps end at 6.5 km.
 FARTHEST_M, FASTEST_MPS = 1e4, 1e3
 
 
@@ -26,9 +26,9 @@ def is_within(limit: float, values: Iterable[float]) -> bool:
 
 
 def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
-    """Return the scalar product of two vectors (n,), added up in their order.
+    """Return the dot product of two vectors (n,), summed in their order.
 
-    numpy gives `@`, `dot` and `linalg.norm` to BLAS, whose last digit depends on the processor.
+    numpy's `@`, `dot` and `linalg.norm` use BLAS, whose last digit depends on the processor.
     """
     total = 0.0
     for x, y in zip(_floats(a), _floats(b), strict=True):
@@ -42,7 +42,7 @@ def norm(vector: Vector | Sequence[float]) -> float:
 
 
 def rotate(rotation: Vector, vector: Vector | Sequence[float]) -> Vector:
-    """Return rotation @ vector, (3,), of a matrix (3, 3) and a vector (3,)."""
+    """Return rotation @ vector, (3,), for a matrix (3, 3) and a vector (3,)."""
     return np.array([dot(row, vector) for row in rotation])
 
 
@@ -76,7 +76,7 @@ _HALF_SQRT2 = math.sqrt(0.5)
 
 
 def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
-    """Body-FLU-to-ENU quaternion (4,) of a body-FRD-to-NED quaternion (4,), and back.
+    """Convert a body-FRD-to-NED quaternion (4,) to body-FLU-to-ENU, (4,), or back.
 
     q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
     and q(FRD<-FLU) = (0, 1, 0, 0). The result is a unit quaternion with w >= 0.
@@ -106,7 +106,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 
 def yaw_from_quaternion(quaternion: Vector | Sequence[float]) -> float:
-    """Yaw in [-pi, pi], rad, of a quaternion (4,)."""
+    """Return the yaw of a quaternion (4,), in [-pi, pi], rad."""
     w, x, y, z = (float(c) for c in quaternion)
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 

@@ -1,4 +1,4 @@
-"""What is installed: mavfi, the libraries that a record depends on, and plug-ins."""
+"""Installed versions of mavfi and its libraries, and plug-ins."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mavfi_cli.core.errors import MavfiError, UnknownName, described
 
 try:
     __version__ = importlib.metadata.version("mavfi")
-except importlib.metadata.PackageNotFoundError:  # a source tree that was never installed
+except importlib.metadata.PackageNotFoundError:  # a source tree without an installation
     __version__ = "0+unknown"
 _LIBRARIES = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "python-fcl")
 
@@ -34,12 +34,12 @@ def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]
 
 
 class PlugIns:
-    """What other packages, and ours, register under an entry point.
+    """The objects that mavfi and other packages register under an entry point.
 
     Args:
         group: Name of the entry point.
-        kind: Word for what is registered.
-        ours: Names that are known without an entry point.
+        kind: Noun for such an object in error messages.
+        ours: Names of mavfi's own objects, which need no entry point.
     """
 
     def __init__(self, group: str, kind: str, ours: Sequence[str] = ()) -> None:
@@ -47,27 +47,27 @@ class PlugIns:
 
     @cached_property
     def _entries(self) -> dict[str, EntryPoint]:
-        """The entry points by name. To find them reads the metadata of all packages."""
+        """The entry points by name. The first use reads the metadata of all packages."""
         return {entry.name: entry for entry in reversed([*entry_points(group=self.group)])}
 
     @property
     def names(self) -> list[str]:
-        """Known names: ours, then the others in alphabetical order."""
+        """Known names: mavfi's own, then the others in alphabetical order."""
         return [*self._ours, *sorted(self._entries.keys() - set(self._ours))]
 
     def load(self, name: str) -> Any:
-        """Return what the entry point of that name names.
+        """Load the object of the entry point with this name.
 
         Raises:
-            UnknownName: No plug-in has this name. Suggests the nearest.
-            MavfiError: Its module cannot be imported, or lacks the object.
+            UnknownName: No plug-in has this name. The message suggests the nearest.
+            MavfiError: Its module cannot be imported or lacks the object.
         """
         if name not in self._entries:
             raise UnknownName(self._kind, name, self.names)
         entry = self._entries[name]
         try:
             return entry.load()
-        except Exception as error:  # another package's code may raise anything
+        except Exception as error:  # code of another package may raise anything
             raise MavfiError(
-                f"the plug-in {name!r} ({entry.value}) does not load: {described(error)}"
+                f"the plug-in {name!r} ({entry.value}) cannot be loaded: {described(error)}"
             ) from None

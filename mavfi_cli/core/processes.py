@@ -1,4 +1,4 @@
-"""Processes: how one is forked, sent values, and interrupted."""
+"""Fork processes, send values between them, and handle interrupts."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from enum import EnumMeta
 from typing import Any
 
 PYTHON = (sys.executable, "-P")
-"""This interpreter, which imports nothing from the working directory: that is the user's."""
+"""This interpreter, without imports from the working directory, which is the user's."""
 
 _LENGTH = 8
 _libc = ctypes.CDLL(None)
 
 
 def fork(work: Callable[[], int], *, exact: bool = False) -> int:
-    """Do work in a fork of this process, which exits with the returned code, or 1 on an error.
+    """Do work in a fork of this process. It exits with the returned code, or 1 on an error.
 
     Args:
         exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
@@ -51,11 +51,11 @@ def send(connection: socket.socket, value: Any) -> None:
 
 
 def receive(connection: socket.socket) -> Any:
-    """Receive one value. Bytes that a corrupted process sends can call none of our functions.
+    """Receive one value. Bytes from a corrupted process cannot call any function.
 
     Raises:
         EOFError: The other end has closed.
-        pickle.UnpicklingError: The value has a type that no message has.
+        pickle.UnpicklingError: The value has a type that messages do not have.
     """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
     return _Values(io.BytesIO(_exactly(connection, size))).load()
@@ -71,16 +71,16 @@ _BUILT_IN = {
 
 
 class _Values(pickle.Unpickler):
-    """Reads dataclasses and enumerations of ours, and values of numpy."""
+    """Unpickles only mavfi's dataclasses and enumerations, and numpy's values."""
 
     def find_class(self, module: str, name: str) -> Any:
         if module in sys.modules and name in _BUILT_IN.get(module, ()):
             return getattr(sys.modules[module], name)
         if module.startswith(("mavfi_cli.", "sitl.")):
-            found = operator.attrgetter(name)(importlib.import_module(module))
-            if dataclasses.is_dataclass(found) or (type(found) is EnumMeta):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no value")
+            kind = operator.attrgetter(name)(importlib.import_module(module))
+            if dataclasses.is_dataclass(kind) or (type(kind) is EnumMeta):
+                return kind
+        raise pickle.UnpicklingError(f"{module}.{name} is not a message type")
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
@@ -105,13 +105,13 @@ def interruptible() -> Iterator[list[int]]:
 
     Yields a list that is empty until a signal arrives. Has no effect outside the main thread.
     """
-    asked: list[int] = []
+    received: list[int] = []
     previous: dict[signal.Signals, Any] = {}
     for number in (signal.SIGINT, signal.SIGTERM):
         with contextlib.suppress(ValueError):  # not the main thread
-            previous[number] = signal.signal(number, lambda n, _frame: asked.append(n))
+            previous[number] = signal.signal(number, lambda n, _frame: received.append(n))
     try:
-        yield asked
+        yield received
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -2,7 +2,7 @@
 
 Messages are frozen records in SI units, ENU world frame and FLU body frame. A state is a scalar, or
 one component of a vector, that one kernel passes to the next. fi, detect and report iterate over
-the table. All reads and writes of a state go through it, so that no other module knows its place.
+the table. All reads and writes of a state go through it, so only the table depends on its location.
 Source of the list: the paper, sections IV-C and V-A, and the messages of its released code
 (MAVBench/MAV_apps, branch mavfi).
 """
@@ -61,13 +61,13 @@ class Briefing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightTruth:
-    """What the vehicle's side leaves of a flight at its end.
+    """Records of the vehicle's side at the end of a flight.
 
     Attributes:
         log: Columns of the referee, (n,) or (n, 3 or 4), one row per control tick.
         report: The referee's report, as in the section `referee` of a record, and its `world`.
-        stage_wall_s: Time of this machine by part, s.
-        memory_mb: Largest memory of the process.
+        stage_wall_s: Wall-clock time by part, s.
+        memory_mb: Peak memory of the process.
     """
 
     log: Mapping[str, FloatArray]
@@ -128,7 +128,7 @@ class Trajectory:
     waypoints: FloatArray  # (n, 10) in the order of WAYPOINT_FIELDS; m, rad, m/s, m/s^2, ENU
     durations_s: FloatArray  # (n,) duration of each waypoint
     trajectory_seq: int
-    future_collision_seq: int  # the newest predicted collision that the planner knew of
+    future_collision_seq: int  # number of the newest predicted collision when it was planned
 
     @property
     def duration_s(self) -> float:
@@ -144,7 +144,7 @@ class Command:
     velocity_enu_mps: FloatArray  # (3,)
     yaw_rad: float
     acceleration_enu_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,)
-    pace: float = 1.0  # rate of the trajectory's clock while this command holds, 0..1
+    pace: float = 1.0  # rate of the trajectory's clock during this command, 0..1
     skips_waypoint: bool = False  # True ends the current waypoint
 
 

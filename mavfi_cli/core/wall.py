@@ -1,4 +1,4 @@
-"""Wall-clock time of the host. It enters only the record's `host` section, never the mission."""
+"""Wall-clock time of the host. Only the record's `host` section contains it, never the mission."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class WallClock:
         self.newest: dict[str, float] = {}
 
     def measure(self, name: str) -> _Measurement:
-        """A context that adds what its block takes to a name."""
+        """A context that adds the time of its block to a name."""
         return _Measurement(self, name)
 
     def add(self, name: str, seconds: float) -> None:
@@ -23,7 +23,7 @@ class WallClock:
 
 
 class _Measurement:
-    """One block; a class of its own, because 20 are measured in a tick."""
+    """One timed block. A class is faster than a generator, and a tick times 20 blocks."""
 
     __slots__ = ("_begun", "_clock", "_name")
 

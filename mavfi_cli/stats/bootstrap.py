@@ -18,7 +18,7 @@ from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 RESAMPLES = 9999
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
 LARGE = 500  # from here on the mean is normal and the bootstrap would only be slow
-CHUNK = 4_000_000  # numbers drawn at once
+_CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
@@ -81,7 +81,7 @@ def _resampled(
                 (sample,), lambda drawn, **_axis: statistic(drawn), vectorized=True,
                 method=method, confidence_level=confidence,
                 n_resamples=0 if result else resamples, bootstrap_result=result,
-                batch=max(1, CHUNK // len(sample)), rng=np.random.default_rng(seed),
+                batch=max(1, _CHUNK // len(sample)), rng=np.random.default_rng(seed),
             )  # fmt: skip
         ends = float(result.confidence_interval.low), float(result.confidence_interval.high)
         if not any(map(math.isnan, ends)):

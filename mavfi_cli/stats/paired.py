@@ -20,11 +20,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from mavfi_cli.stats.bootstrap import CHUNK, RESAMPLES
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
 OWN = (1.0,)  # golden values over their own, for `worst_case` whatever the missions' lengths
+_PATTERNS = 9999  # of signs, in `sign_flips`
+_CHUNK = 4_000_000  # signs drawn at once
 _DIGITS = 9  # of a sum over the largest sum; equal sums differ by rounding
 
 
@@ -101,8 +102,8 @@ def sign_flips(differences: Sequence[float]) -> float:
 
     Without an effect both signs of a difference are equally likely. The test assumes no
     distribution, so it is valid if most differences are zero and a bootstrap interval is too
-    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried if there
-    are at most RESAMPLES patterns, else RESAMPLES seeded random patterns.
+    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried if they
+    have at most _PATTERNS patterns, else _PATTERNS seeded random patterns.
 
     Args:
         differences: one for each independent pair; zeros have no effect.
@@ -120,7 +121,7 @@ def sign_flips(differences: Sequence[float]) -> float:
         (values,),
         lambda flipped, axis: np.round(np.abs(flipped.sum(axis)) / scale, _DIGITS),
         permutation_type="samples", alternative="greater", vectorized=True,
-        n_resamples=RESAMPLES, batch=max(1, CHUNK // len(values)), rng=np.random.default_rng(1),
+        n_resamples=_PATTERNS, batch=max(1, _CHUNK // len(values)), rng=np.random.default_rng(1),
     )  # fmt: skip
     return float(result.pvalue)
 

@@ -71,6 +71,6 @@ def test_a_corrupted_process_cannot_have_its_parent_call_anything(
 ):
     monkeypatch.chdir(tmp_path)
     send(pair[0], call)
-    with pytest.raises(pickle.UnpicklingError, match="is no value"):
+    with pytest.raises(pickle.UnpicklingError, match="not a message type"):
         receive(pair[1])
     assert not (tmp_path / "struck").exists()
