@@ -1,7 +1,7 @@
 """Encodes, decodes and signs MAVLink frames, on pymavlink's `common` dialect.
 
 This module implements the frame layer (markers, lengths, checksum, signature), because pymavlink's
-generic parser is slower and loses the frames after a false marker in noise. Message classes,
+generic parser is slower and loses the frames that follow a false marker in noise. Message classes,
 layouts and constructors are pymavlink's. The caller supplies the clock of signatures.
 Sources: https://mavlink.io/en/guide/serialization.html for frames, and
 https://mavlink.io/en/guide/message_signing.html for signatures: a block of link id (1 byte),
@@ -32,15 +32,17 @@ NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
 
 _TIMESTAMP_END = 2**48
 _LINK_ID = 0  # of our channel
-_RADIO_STATUS = 109  # sent by telemetry radios, which hold no key; the guide says to accept it
+_RADIO_STATUS = (
+    109  # sent by telemetry radios, which hold no key; the guide recommends to accept it
+)
 
 MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
 
 _MARKER = re.compile(rb"[\xfd\xfe]")
 _SIGNED = 0x01
 _INCOMPLETE = -1
-_OF_FRAME = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame tells
-_PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array stays in one piece
+_OF_FRAME = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame determines
+_PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array is unpacked at once
 
 _KINDS: dict[int, _Kind] = {}
 
@@ -86,7 +88,7 @@ class Signing:
         return True
 
     def vouches(self, data: bytes) -> bool:
-        """Return True if data begins with a signed frame that is authentic and no replay.
+        """Return True if data begins with a signed frame that is authentic and not a replay.
 
         The frame is not remembered, so `accept` takes it afterwards.
         """
@@ -159,7 +161,7 @@ _CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
 
 
 class _Kind:
-    """One message class and how it lies on the wire.
+    """One message class and its wire layout.
 
     An array of bytes is packed and unpacked in one piece, which is faster than byte by byte.
     """
@@ -183,7 +185,7 @@ class _Kind:
             (place, length, kinds[name] == "uint8_t")
             for place, (name, length) in enumerate(zip(names, cls.lengths, strict=True))
             if length > 1
-        ]  # place among the fields, length, and whether it lies there in one piece
+        ]  # index of the field, length, and whether its bytes are contiguous
         if cls.msgname == _PACKET:
             self._columns, self._arrays = lambda packet: (packet.seqnr, bytes(packet.data)), []
 
@@ -200,7 +202,7 @@ class _Kind:
     def values(self, frame: bytes, start: int, length: int) -> Sequence[Any]:
         """Return the fields of a payload. Arrays become lists, and texts lose their padding."""
         size = self.size
-        if length != size:  # a sender cuts zeros off, and a newer one adds fields
+        if length != size:  # senders cut trailing zeros, and newer ones add fields
             frame, start = frame[start : start + length].ljust(size, b"\0"), 0
         unpacked = self.unpack_from(frame, start)
         if not (self._arrays or self._texts):
@@ -217,9 +219,9 @@ class _Kind:
 def _received(cls: Any) -> Any:
     """Return a subclass for received messages, which differs in its constructor only.
 
-    The constructor takes _OF_FRAME and the fields in the order of the wire. It is generated, as
-    those of dataclasses are. With pymavlink's, a frame takes a third longer to decode, because each
-    message then begins with an empty header and attributes that are equal in the whole class.
+    The constructor takes _OF_FRAME and the fields in wire order. It is generated, like those of
+    dataclasses. With pymavlink's, a frame takes a third longer to decode, because every message
+    then gets an empty header and attributes that are equal in the whole class.
     """
     kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
     blank = vars(cls(*(b"" if kind == "char" else 0 for kind in cls.fieldtypes)))
@@ -255,7 +257,7 @@ class Codec:
         self._sequence = 0
         self._rest = b""
         self.bad_bytes = 0  # received bytes that belong to no frame
-        self.unknown = 0  # skipped frames with an id that the dialect lacks
+        self.unknown = 0  # skipped frames whose id the dialect lacks
         self.refused = 0  # frames that signing rejected
 
     def encode(self, message: Message) -> bytes:

@@ -46,7 +46,7 @@ class Ticket:
     parameters: tuple[float, ...]
     refusals_left: int
     accepted: bool | None = None  # None until it is decided; False if refused or given up
-    result: str = "no answer"  # the peer's answer in words
+    result: str = "no answer"  # description of the peer's answer
     sent: int = 0
     sent_since_answer: int = 0
     due_s: float = -1.0
@@ -60,8 +60,8 @@ class Ticket:
 class Commands:
     """Commands of a session to the components of one system.
 
-    Any number of submitted commands is under way. Beside them a phase of the session has one
-    request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the present
+    Any number of submitted commands may be pending. In addition, a phase of the session has one
+    request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the current
     stamp, before any request. Acknowledgements for other systems and components are ignored.
     """
 
@@ -97,7 +97,7 @@ class Commands:
         return ticket
 
     def acknowledge(self, message: Message) -> None:
-        """Handle a COMMAND_ACK. It is ignored if it answers none of our commands."""
+        """Handle a COMMAND_ACK. Acknowledgements of foreign commands are ignored."""
         if message.target_system not in (0, self._own[0]):
             return
         if message.target_component not in (0, self._own[1]):
@@ -135,7 +135,7 @@ class Commands:
                 lane.popleft().accepted = False
         return due
 
-    # Requests of the present phase
+    # Requests of the current phase
 
     def begin(self) -> None:
         """Begin a phase and forget the requests of the last one."""
@@ -145,7 +145,7 @@ class Commands:
         self._texts_before = self._telemetry.texts.total
 
     @property
-    def asked(self) -> bool:
+    def commanded(self) -> bool:
         """True once this phase has sent a command."""
         return self._ticket is not None
 
@@ -153,8 +153,8 @@ class Commands:
         """Raise CommandRefused with the autopilot's texts since the start of the phase."""
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
-        said = (each for each in texts.since(self._texts_before) if each.severity <= _WARNING)
-        words = "; ".join(dict.fromkeys(text.text for text in said))
+        warnings = (text for text in texts.since(self._texts_before) if text.severity <= _WARNING)
+        words = "; ".join(dict.fromkeys(text.text for text in warnings))
         quoted = f" ({words})" if words else ""
         raise CommandRefused(f"autopilot refused {command}: {result}{quoted}")
 
@@ -192,7 +192,7 @@ class Commands:
         if not pending and self.now_s - self._mode_since_s >= _MODE_PATIENCE_S:
             if self._mode_tries >= _MODE_TRIES:
                 result = self._ticket.result if self._ticket is not None else ""
-                self.refuse(f"mode {mode}", f"{result}, mode stays {self._telemetry.mode}")
+                self.refuse(f"mode {mode}", f"{result}, the mode is still {self._telemetry.mode}")
             self._mode_tries += 1
             self._mode_since_s = self.now_s
             enabled = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED

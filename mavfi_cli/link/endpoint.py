@@ -1,4 +1,4 @@
-"""Endpoint URLs, such as `udpin:127.0.0.1:14540`: what they name, and who sends there."""
+"""Endpoint URLs, such as `udpin:127.0.0.1:14540`, and the sender that an endpoint admits."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class Endpoint:
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
         try:
-            found = socket.getaddrinfo(self.host, self.port, type=kind)
+            entries = socket.getaddrinfo(self.host, self.port, type=kind)
         except (OSError, UnicodeError):
             raise LinkError(f"{self.url}: no such host {self.host!r}") from None
-        found.sort(key=lambda entry: entry[0] != socket.AF_INET)  # IPv4 first
-        family, address = found[0][0], str(found[0][4][0])
+        entries.sort(key=lambda entry: entry[0] != socket.AF_INET)  # IPv4 first
+        family, address = entries[0][0], str(entries[0][4][0])
         if not (beyond or ipaddress.ip_address(address.partition("%")[0]).is_loopback):
             raise LinkError(
                 f"{self.url}: {address} is beyond this machine, where MAVLink signing is required: "
@@ -125,7 +125,7 @@ def parse_endpoint(url: str) -> Endpoint:
         if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
             raise malformed
         if int(text) > largest:
-            raise LinkError(f"{url}: {text} is more than {largest}")
+            raise LinkError(f"{url}: must be at most {largest}, got {text}")
         return int(text)
 
     if scheme == "fd":
@@ -148,7 +148,7 @@ def parse_endpoint(url: str) -> Endpoint:
 
 
 Sender = TypeVar("Sender")
-SILENCE_S = 5.0  # time after which another sender may take a silent one's place
+SILENCE_S = 5.0  # silence after which another sender may take the place
 TWO_AUTOPILOTS = "two autopilots send here"
 
 
@@ -157,12 +157,12 @@ class SenderSlot(Generic[Sender]):
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self.holder: Sender | None = None  # the sender that counts
-        # A sender that spoke although the place was taken, and whom the holder has outlived: not an
+        self.holder: Sender | None = None  # the current sender
+        # A sender that spoke while the place was taken, and whom the holder has outlived: not an
         # autopilot that restarts at another port.
         self.rival: Sender | None = None
         self._challenger: Sender | None = None
-        self._silent_from_s = 0.0  # then the holder has been silent for too long
+        self._silent_from_s = 0.0  # the holder has been silent for too long
 
     @property
     def is_free(self) -> bool:

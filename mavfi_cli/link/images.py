@@ -1,8 +1,8 @@
-"""Receives depth frames, in spite of loss and reordering.
+"""Receives depth frames despite loss and reordering.
 
 A frame consists of CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels in
-`file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives its
-place in a frame, but not the frame. The checksum of the pixels identifies the frame.
+`file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives
+its place in a frame, but not the frame. The checksum of the pixels identifies the frame.
 Source of the protocol: https://mavlink.io/en/services/image_transmission.html.
 """
 
@@ -27,14 +27,14 @@ MAX_PIXELS = 1 << 20
 DEPTH_UNIT_M = 0.1
 NOTHING = 255  # pixel value where nothing was in range
 
-_NARROWEST_RAD, _WIDEST_RAD = 0.005, 3.13  # believed field of view
-_OPEN_FRAMES = 3  # the newest frames, by index, may still become whole
+_NARROWEST_RAD, _WIDEST_RAD = 0.005, 3.13  # accepted fields of view
+_OPEN_FRAMES = 3  # newest frames, by index, that may still be completed
 _FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
 _COPY = 4  # largest number of messages from a packet to its copy
-_STRAY = 8  # messages of others among those of a frame
+_STRAY = 8  # messages of other frames among those of a frame
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
-_LARGEST_GAP = 10_000  # a bigger jump of the index is a restarted camera
-_REMEMBERED = 64  # indices of frames that are done with
+_LARGEST_GAP = 10_000  # a larger jump of the index means a restarted camera
+_REMEMBERED = 64  # indices of finished frames
 
 _DEPTH_M = np.array([*(DEPTH_UNIT_M * level for level in range(NOTHING)), math.inf])  # by pixel
 
@@ -107,7 +107,9 @@ class ImageReceiver:
         self.received = 0  # complete frames
         self._shape: _Shape | None = None
         self._places = _FIRST_PLACES  # packets in a frame of this shape
-        self._packets: dict[int, deque[_Packet]] = {}  # by place; the newest that no frame took
+        self._packets: dict[
+            int, deque[_Packet]
+        ] = {}  # by place; the newest that belong to no complete frame
         self._open: list[_Announced] = []  # oldest first
         self._count = 0  # messages of the protocol so far
         self._closed: deque[int] = deque(maxlen=_REMEMBERED)
@@ -127,11 +129,11 @@ class ImageReceiver:
         return self._lost_before + counted - whole - len(self._open)
 
     def feed(self, message: Message) -> list[ImageFrame]:
-        """Take one of IMAGE_MESSAGES; the frames that it completes, mostly none, at most a few."""
+        """Handle one of IMAGE_MESSAGES. Return the frames that it completes, mostly none."""
         return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
-        """Take 2 atan(sensor width / 2 focal length) of a CAMERA_INFORMATION, within limits."""
+        """Set the field of view of a CAMERA_INFORMATION: 2 atan(sensor width / 2 focal length)."""
         if message.focal_length > 0.0:
             hfov_rad = 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
             if _NARROWEST_RAD <= hfov_rad <= _WIDEST_RAD:
@@ -147,7 +149,7 @@ class ImageReceiver:
         match = _CHECKSUM.fullmatch(message.file_url)
         checksum = int(match[1], 16) if match else None
         self._open.append(_Announced(message.image_index, stamp_s, checksum, self._count + 2))
-        self._open.sort(key=lambda each: each.index)
+        self._open.sort(key=lambda frame: frame.index)
         while self._open and self._open[0].index <= self._newest - _OPEN_FRAMES:
             self._close(self._open[0])
         return self._finish()
@@ -155,7 +157,7 @@ class ImageReceiver:
     def _follow(self, index: int, stamp_s: float) -> bool:
         """Track the index. Return False for a frame that is known or too old.
 
-        A camera that counts anew has restarted: the index is smaller, but the stamp is newer.
+        A camera has restarted if the index is smaller but the stamp is newer.
         """
         restarted = index < self._newest and stamp_s > self._newest_s
         if self._first is None or restarted or abs(index - self._newest) > _LARGEST_GAP:
@@ -194,12 +196,12 @@ class ImageReceiver:
         if held is None:
             held = self._packets[place] = deque(maxlen=_OPEN_FRAMES)
         elif self._count - held[-1][0] <= _COPY and held[-1][1] == data:
-            held.pop()  # the same packet twice
+            held.pop()  # a duplicate packet
         held.append((self._count, data))
         return self._finish() if len(self._packets) >= self._places else []
 
     def _finish(self) -> list[ImageFrame]:
-        """Close and return the complete ones of the open frames."""
+        """Close and return the open frames that are complete."""
         done = []
         for frame in list(self._open):
             shape = self._shape
@@ -220,18 +222,18 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
-        """Return the pixels of the nearest or else the newest packets that match the checksum."""
+        """Return the pixels of the nearest or newest packets that match the checksum, or None."""
         newest = [self._packets[place][-1] for place in range(shape.packets)]
-        found = [
+        nearby = [
             min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])
             for place in range(shape.packets)
         ]
         end = frame.due + shape.packets - 1
         early = frame.due <= self._count < end
-        if early and frame.trials_left <= _TRIALS // 2 and max(off for off, _ in found) > _STRAY:
+        if early and frame.trials_left <= _TRIALS // 2 and max(off for off, _ in nearby) > _STRAY:
             frame.waits_until = end - _STRAY
-            return None  # of a frame that lost some: half of the trials wait for this one's packets
-        nearest = [packet for _, packet in found]
+            return None  # half of the trials wait for packets that have not arrived
+        nearest = [packet for _, packet in nearby]
         for packets in (nearest,) if nearest == newest else (nearest, newest):
             frame.trials_left -= 1
             data = b"".join([data[: shape.payload] for _, data in packets])
@@ -247,13 +249,13 @@ class ImageReceiver:
         return None
 
     def _forget(self, frame: _Announced, packets: list[_Packet]) -> None:
-        """Keep the packets of a complete frame that are another one's by their due time.
+        """Keep packets of a completed frame that belong to another one by their due time.
 
-        Equal parts of pictures, such as the sky, may be swapped.
+        Frames may exchange packets with equal pixels, such as the sky.
         """
         for place, packet in enumerate(packets):
             held, since = self._packets[place], packet[0] - place
-            if abs(since - frame.due) <= min(abs(since - each.due) for each in self._open):
+            if abs(since - frame.due) <= min(abs(since - other.due) for other in self._open):
                 held.remove(packet)
             if not held:
                 del self._packets[place]

@@ -37,7 +37,7 @@ _HEARD = (
 _HEARTBEAT_INTERVAL_S = 1.0
 _MAX_ANSWERS = 64  # maximum replies per tick; further requests are ignored
 _HEIGHT_REACHED_M = 0.3  # tolerance below the take-off height
-_LISTEN_S = 1.2  # time in which a second autopilot would send a HEARTBEAT, too
+_LISTEN_S = 1.2  # time within which a second autopilot would send a HEARTBEAT
 _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the vehicle itself
 
 
@@ -75,7 +75,7 @@ class Phase(Enum):
 class SessionSettings:
     """Settings and time-outs of the session, in simulated seconds."""
 
-    system: int = 1  # own system id, which is that of the vehicle
+    system: int = 1  # system id of the companion, equal to the vehicle's
     component: int = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
     takeoff_height_m: float = 2.5  # above the ground at take-off
     request_streams: bool = True  # request message streams; lockstep sends them anyway
@@ -94,7 +94,7 @@ class OffboardSession:
 
     Args:
         url: URL of the link, for error messages.
-        telemetry: Newest telemetry of the autopilot, if this session is not the first on its link.
+        telemetry: Telemetry of an earlier session on this link, if any.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class OffboardSession:
         own = self._settings.system, self._settings.component
         self._commands = Commands(*own, self.telemetry)
         self._camera_heard = self._greeted = False
-        self._origin_asked: Ticket | None = None
+        self._origin_request: Ticket | None = None
         self.hold()
         self._answers: list[Message] = []  # sent at the next tick
         self._next_heartbeat_s = -math.inf
@@ -183,14 +183,14 @@ class OffboardSession:
         )  # fmt: skip
 
     def request_land(self) -> None:
-        """Land at the present position and disarm. Before arming, end the session at once."""
+        """Land at the current position and disarm. Before arming, end the session at once."""
         if self.phase not in (Phase.LANDING, Phase.DONE):
             self._enter(Phase.LANDING)
 
     # Received messages --------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:
-        """Handle a received message. Only the autopilot and its camera are heard."""
+        """Handle a message of the autopilot or its camera. Other senders are ignored."""
         telemetry, number = self.telemetry, type(message).id
         telemetry.handle(message)
         if number not in _HEARD:
@@ -200,7 +200,7 @@ class OffboardSession:
             return
         reply = None
         if number == dialect.MAVLINK_MSG_ID_TIMESYNC:
-            if message.tc1 == 0:  # a request; the reply to one of our own needs none
+            if message.tc1 == 0:  # a request; a reply to our own request needs no reply
                 reply = dialect.MAVLink_timesync_message(round(self._now_s * 1e9), message.ts1)
         elif number == dialect.MAVLINK_MSG_ID_PING:
             if message.target_system == message.target_component == 0:
@@ -215,9 +215,9 @@ class OffboardSession:
             self._answers.append(reply)
 
     def _hear_camera(self, number: int, message: Message) -> None:
-        """Handle what the camera says, which has the referee of a foreign autopilot."""
+        """Handle a message of the camera, which runs the referee of a foreign autopilot."""
         if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET:
-            if self.phase is Phase.CONNECTING:  # later, the origin would move a flying vehicle
+            if self.phase is Phase.CONNECTING:  # a later origin would displace a flying vehicle
                 origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
                 self.telemetry.move_origin(origin)
         elif number == dialect.MAVLINK_MSG_ID_STATUSTEXT:
@@ -229,12 +229,12 @@ class OffboardSession:
                 self._ask_camera()
 
     def _ask_camera(self) -> None:
-        """Ask for the origin, or else, where positions are the world's, for information."""
+        """Request the origin, or the camera's information if positions are the world's."""
         wanted = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
         if self._settings.needs_camera:
             wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
         request = dialect.MAV_CMD_REQUEST_MESSAGE
-        self._origin_asked = self._commands.submit(request, wanted, component=CAMERA)
+        self._origin_request = self._commands.submit(request, wanted, component=CAMERA)
 
     # Sent messages ------------------------------------------------------------------------------
 
@@ -287,8 +287,9 @@ class OffboardSession:
         if not self.telemetry.heard:
             if self._elapsed_s() >= self._settings.connect_timeout_s:
                 waited_s = self._settings.connect_timeout_s
-                told = f"no autopilot at {self._url}: no heartbeat within {waited_s:g} s"
-                raise NoAutopilot(told)
+                raise NoAutopilot(
+                    f"no autopilot at {self._url}: no heartbeat within {waited_s:g} s"
+                )
             return
         if not self._greeted:
             self._greeted, self._phase_since_s = True, self._now_s
@@ -296,17 +297,17 @@ class OffboardSession:
                 self._commands.streams(self._settings.state_rate_hz)
             if self._settings.needs_camera:
                 self._ask_camera()
-        if self._knows_place():
+        if self._position_known():
             self._enter(Phase.WAITING_READY)
 
     def _require_fit(self) -> None:
         if self.telemetry.unfit:
             raise LinkError(f"{self._url}: {self.telemetry.unfit}")
 
-    def _knows_place(self) -> bool:
-        """Return True once a needed camera has told the origin, if any, and a state came."""
-        settings, asked = self._settings, self._origin_asked
-        if not settings.needs_camera or asked is None:
+    def _position_known(self) -> bool:
+        """Return True once a state has arrived and a required camera has answered."""
+        settings, request = self._settings, self._origin_request
+        if not settings.needs_camera or request is None:
             return True
         if not self._camera_heard and self._elapsed_s() >= settings.camera_timeout_s:
             raise LinkError(
@@ -317,7 +318,7 @@ class OffboardSession:
         self._require_soon()
         if self._elapsed_s() < _LISTEN_S:
             return False
-        return self._camera_heard and not asked.pending and self.telemetry.state is not None
+        return self._camera_heard and not request.pending and self.telemetry.state is not None
 
     def _waiting_ready(self) -> None:
         telemetry, commands = self.telemetry, self._commands
@@ -334,7 +335,7 @@ class OffboardSession:
             commands.home()
         elif in_mode and telemetry.ready and telemetry.state is not None:
             self._ground_m = float(telemetry.state.position_enu_m[2])
-            if self._settings.needs_camera:  # home may be that of an earlier flight
+            if self._settings.needs_camera:  # the home position may be from an earlier flight
                 self._ground_amsl_m = telemetry.amsl_m
             self._enter(Phase.ARMING)
             return
@@ -361,7 +362,7 @@ class OffboardSession:
         elif self._commands.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
             self._commands.look_at_heartbeat()
             if self._elapsed_s() >= self._settings.arm_timeout_s:
-                self._commands.refuse("arming", "accepted, but it did not arm")
+                self._commands.refuse("arming", "accepted, but the vehicle did not arm")
 
     def _taking_off(self) -> None:
         telemetry, commands = self.telemetry, self._commands
@@ -372,7 +373,7 @@ class OffboardSession:
             if commands.mode(telemetry.autopilot.offboard_mode):
                 self._enter(Phase.OFFBOARD)
             return
-        if not (commands.asked and telemetry.in_air):
+        if not (commands.commanded and telemetry.in_air):
             parameters = [telemetry.autopilot.unused] * 6 + [self._takeoff_altitude_m()]
             commands.insist("take-off", dialect.MAV_CMD_NAV_TAKEOFF, *parameters)
         timeout_s = self._settings.takeoff_timeout_s
@@ -426,7 +427,7 @@ class OffboardSession:
             self._commands.submit(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0)
 
     def _ended(self) -> None:
-        """Do nothing. Setpoints continue, because the other end may wait for them."""
+        """Do nothing. Setpoints continue, because a lockstep peer may wait for them."""
 
 
 _STEPS = {

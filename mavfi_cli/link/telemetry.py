@@ -63,7 +63,7 @@ class _AutopilotProfile:
 
 
 _PROFILES, _ = read_toml(Path(__file__).with_name("autopilots.toml"))
-PX4, ARDUCOPTER = (_AutopilotProfile(**_PROFILES[each]) for each in ("px4", "ardupilot"))
+PX4, ARDUCOPTER = (_AutopilotProfile(**_PROFILES[name]) for name in ("px4", "ardupilot"))
 
 _PROFILES = {dialect.MAV_AUTOPILOT_PX4: PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUCOPTER}
 _COPTERS = (
@@ -74,11 +74,11 @@ _COPTERS = (
 AUTOPILOT: int = dialect.MAV_COMP_ID_AUTOPILOT1
 CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _KEPT = 512
-_REORDERED_MS = 1000  # older by less: a late packet; older by more: a restarted clock
+_REORDERED_MS = 1000  # a stamp older by less is a late packet, by more a restarted clock
 
 
 class _StateHistory:
-    """The newest states in order of their stamps, _KEPT of them at least."""
+    """The newest states, at least _KEPT, in order of their stamps."""
 
     def __init__(self) -> None:
         self._stamps_ms: list[int] = []
@@ -149,7 +149,7 @@ class _Text(NamedTuple):
 
 
 class _Open(NamedTuple):
-    """A text of which chunks have come, by their numbers."""
+    """An incomplete text: its chunks by number."""
 
     severity: int
     started_s: float
@@ -157,7 +157,7 @@ class _Open(NamedTuple):
 
 
 class _TextCollector:
-    """Collects texts: the newest thousand, the number of all, and those with missing chunks."""
+    """Collects the newest thousand texts and those with missing chunks, and counts all."""
 
     def __init__(self) -> None:
         self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
@@ -188,7 +188,7 @@ class _TextCollector:
         return done
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
-        """Close and return texts with chunks missing for longer than the patience, with a gap."""
+        """Close and return texts whose chunks have been missing too long, with a gap."""
         late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
         return [self._finish(key) for key in late]
 
@@ -213,12 +213,14 @@ class Telemetry:
     """
 
     def __init__(self) -> None:
-        self.now_s = 0.0  # when handled messages count as received; the owner sets it
+        self.now_s = 0.0  # receive time of handled messages, set by the owner
         self.system = 0  # id of the autopilot; 0 before its first message
         self.unfit = ""  # why an autopilot on the link cannot be flown
         self.autopilot: _AutopilotProfile = PX4
         self.state: VehicleState | None = None  # None before position and attitude are known
-        self.origin_enu_m: FloatArray | None = None  # of its positions (3,); None for the world's
+        self.origin_enu_m: FloatArray | None = (
+            None  # origin of its positions (3,); None: the world's
+        )
         self.armed = False
         self.mode = ""  # name of the flight mode; "" before the first HEARTBEAT
         self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED  # a known one
@@ -268,8 +270,9 @@ class Telemetry:
             self.unfit = f"two autopilots are on this link, systems {self.system} and {system}"
         elif profile is None or message.type not in _COPTERS:
             self.unfit = (
-                f"system {system} is {_name('MAV_AUTOPILOT', message.autopilot)} with "
-                f"{_name('MAV_TYPE', message.type)}; PX4 and ArduPilot fly, with a multicopter"
+                f"system {system} must be PX4 or ArduPilot with a multicopter, got "
+                f"{_name('MAV_AUTOPILOT', message.autopilot)} with "
+                f"{_name('MAV_TYPE', message.type)}"
             )
         else:
             self.system, self.autopilot = system, profile
@@ -329,9 +332,9 @@ class Telemetry:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
     def move_origin(self, origin_enu_m: FloatArray) -> None:
-        """Set the origin of the positions (3,). States with another one are forgotten.
+        """Set the origin of the positions (3,). States with another origin are dropped.
 
-        An origin beyond all sense is ignored.
+        An origin beyond the limits is ignored.
         """
         if not is_within(FARTHEST_M, origin_enu_m):
             return
@@ -342,7 +345,7 @@ class Telemetry:
         self.state, self.history = None, _StateHistory()
 
     def take_text(self, message: Message) -> None:
-        """Handle a STATUSTEXT of the autopilot, or of a component that speaks for it."""
+        """Handle a STATUSTEXT of the autopilot or of its system's components."""
         self._look_for_verdict(self.texts.add(message, self.now_s))
 
     def expire(self) -> None:

@@ -4,8 +4,8 @@ A record is the time in microseconds since 1970 (8 bytes, big endian) and the un
 Received frames of messages that the `common` dialect lacks are left out.
 
 In simulation the time is EPOCH_UNIX_S plus the stamp, so the same flight gives the same bytes. For
-a foreign autopilot it is this computer's UTC, as in the logs of ground stations: what a simulated
-autopilot tells in SYSTEM_TIME may be any date.
+a foreign autopilot it is this computer's UTC, as in the logs of ground stations, because the
+SYSTEM_TIME of a simulated autopilot may be any date.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _FLUSH_INTERVAL_S = 1.0  # of the stamps
 def unix_time_of_stamp_0(path: Path) -> float:
     """Return the Unix time, s, of stamp 0 of a foreign flight, from the first state in its tlog.
 
-    EPOCH_UNIX_S without a state. Raises RecordError if the file cannot be read.
+    The time is EPOCH_UNIX_S without a state. Raises RecordError if the file cannot be read.
     """
     try:
         data = path.read_bytes()
@@ -47,7 +47,7 @@ def unix_time_of_stamp_0(path: Path) -> float:
 class _TlogWriter:
     """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
 
-    What is written before `open` waits for it. Every method may raise RecordError.
+    Records written before `open` are buffered. Every method may raise RecordError.
 
     Args:
         epoch_unix_s: Unix time of stamp 0.
@@ -80,7 +80,7 @@ class _TlogWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write pending records to the file, each whole or not at all."""
+        """Write pending records to the file. Every record is written whole or not at all."""
         if self._descriptor is None:
             return
         data, written = memoryview(b"".join(self._pending)), 0

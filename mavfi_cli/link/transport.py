@@ -17,10 +17,10 @@ from mavfi_cli.link.codec import Codec, begins_with_frame, dialect, frame_length
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, parse_endpoint
 
 MAX_PEERS = 16  # of one listener
-_CHUNK = 1 << 16  # bytes that are received at once
-_SMALL_CHUNK = 2048  # bytes that a client of a listener hands over at once, a datagram at most
-_SEND_TIMEOUT_S = 10.0  # a peer that reads nothing for this long counts as lost
-_BACKLOG = 1 << 16  # bytes that wait for a slow client of a listener
+_CHUNK = 1 << 16  # largest read, bytes
+_SMALL_CHUNK = 2048  # largest read from a client of a listener, bytes; at most a datagram
+_SEND_TIMEOUT_S = 10.0  # time without reading after which a peer counts as lost
+_BACKLOG = 1 << 16  # buffer for a slow client of a listener, bytes
 _MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
 _JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
 _PUMPED = 1000  # datagrams that one pass reads
@@ -36,7 +36,7 @@ class Transport(ABC):
 
     @property
     def rival_address(self) -> str:
-        """Address of an autopilot that sends here beside the peer; "" without one."""
+        """Address of a second autopilot that sends to this end; "" without one."""
         return ""
 
     @abstractmethod
@@ -44,7 +44,7 @@ class Transport(ABC):
         """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed."""
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next bytes, or b"" after `timeout_s` (inf waits without end).
+        """Return the next bytes, or b"" after `timeout_s` (inf: no limit).
 
         Raises LinkLost if the peer closed the connection, or the device was removed.
         """
@@ -71,7 +71,7 @@ class Transport(ABC):
         """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
 
     def _await(self, event: int, timeout_s: float) -> bool:
-        """Return True if a poll event or an error occurs within `timeout_s`; inf: without end."""
+        """Return True if a poll event or an error occurs within `timeout_s`; inf: no limit."""
         poller = select.poll()
         poller.register(self.fileno(), event)
         return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
@@ -107,11 +107,11 @@ def open_transport(
             `serial:device[:baud]` or `fd:number`; without a host it listens on loopback.
         signed: The caller signs this link, so it may reach beyond this machine.
         allow_unsigned: Allow an unsigned link to reach beyond this machine.
-        admits: Tells from a datagram of an unknown sender whether `udpin` takes it for its peer.
+        admits: Returns True if the sender of this datagram may become the peer of `udpin`.
 
     Raises:
-        LinkError: The URL is malformed, its scheme is unknown, its port is in use, nobody
-            listens, the device does not exist, or an unsigned link reaches beyond this machine.
+        LinkError: The URL is malformed, its scheme is unknown, its port is in use, no
+            peer listens, the device does not exist, or an unsigned link leaves this machine.
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "serial":
@@ -137,7 +137,7 @@ def open_listener(
 
     Args:
         url, signed, allow_unsigned: As in `open_transport`.
-        admits: Tells from the first datagram of an unknown sender whether it becomes a peer.
+        admits: Returns True if the sender of this first datagram may become a peer.
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "fd":
@@ -172,7 +172,7 @@ class _SocketOwner:
 
     @property
     def port(self) -> int:
-        """Local port. The system chooses it if the URL says 0."""
+        """Local port. The system chooses it if the URL has port 0."""
         return int(self._socket.getsockname()[1])
 
     def fileno(self) -> int:
@@ -193,8 +193,8 @@ def _text_of(address: Any) -> str:
 class _Stream(_SocketOwner, Transport):
     """A connected stream socket with one peer.
 
-    A patient one waits for a slow reader. Any other keeps what the reader's buffer does not take,
-    64 KiB at most, and drops the oldest sends first, so that what arrives is recent.
+    A patient stream waits for a slow reader. Any other buffers at most 64 KiB for it and drops the
+    oldest sends first, so that the reader gets recent data.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class _Stream(_SocketOwner, Transport):
         self.address = address
         self._patient = patient
         self._chunk = _CHUNK if patient else _SMALL_CHUNK
-        self._begun = b""  # rest of a send of which the peer has a part
+        self._begun = b""  # rest of a partly sent batch
         self._waiting: deque[bytes] = deque()
 
     def send(self, data: bytes) -> None:
@@ -257,14 +257,14 @@ class _TcpListener(_SocketOwner):
         while True:
             try:
                 connection, address = self._socket.accept()
-            except OSError:  # no client is waiting, or it has disconnected already
+            except OSError:  # no client is waiting, or it has disconnected
                 return clients
             self._peers = [peer for peer in self._peers if peer.fileno() >= 0]
             if len(self._peers) >= MAX_PEERS:
                 connection.close()
                 continue
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if not patient:  # the system's buffers would hold telemetry of half a minute
+            if not patient:  # the default buffers hold half a minute of telemetry
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BACKLOG)
             clients.append(
                 _Stream(connection, self.url, patient=patient, address=_text_of(address))
@@ -358,11 +358,12 @@ def _serial_reason(error: Exception, device: str) -> str:
 class _Udp(_SocketOwner, Transport):
     """A UDP socket with one peer.
 
-    A connected socket receives from that peer only. Any other takes the first admitted sender, and
-    another one in its place after some silence. Before the first one, everything it sends is lost.
+    A connected socket receives from its peer only. Any other takes the first admitted sender as its
+    peer, and replaces it after some silence. Data sent before the first peer appears is lost.
 
     Args:
-        admits: Tells from its datagram whether a sender becomes the peer; None: it is connected.
+        admits: Returns True if the sender of this datagram may become the peer. None connects
+            the socket.
     """
 
     datagram = True
@@ -399,7 +400,7 @@ class _Udp(_SocketOwner, Transport):
             self.address = _text_of(sender)
             return True
         messages = Codec(0, 0).decode(data, datagram=True)
-        if any(each.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1 for each in messages):
+        if any(m.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1 for m in messages):
             self._slot.challenge(sender)
         return False
 
@@ -407,7 +408,7 @@ class _Udp(_SocketOwner, Transport):
 def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
     """Return a datagram, up to a number of bytes, and its sender; b"" and None without one.
 
-    ECONNREFUSED means that nobody listens at the other end of a connected socket. It is not an
+    ECONNREFUSED means that no process listens at the other end of a connected socket. It is not an
     error for UDP, because the peer may start later.
     """
     try:
@@ -448,7 +449,7 @@ def _split_frames(data: bytes) -> list[bytes]:
 class _UdpListener(_SocketOwner):
     """A port on which every admitted sender becomes a peer. All peers share one socket.
 
-    There are at most MAX_PEERS, and while one of them is open nobody else takes its place.
+    There are at most MAX_PEERS. An open peer is never replaced.
     """
 
     def __init__(self, opened: socket.socket, url: str, admits: Callable[[bytes], bool]) -> None:
@@ -532,8 +533,8 @@ def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
 class _MemoryTransport(Transport):
     """One end of a link in memory; made in pairs by `memory_pair`.
 
-    Nobody else runs while one end waits. So an end that has nothing to receive first has its
-    `on_wait` called, in which the other end can act, and never sleeps.
+    Both ends run in one thread. So an end that has nothing to receive calls its `on_wait`, in
+    which the other end can act, and never sleeps.
     """
 
     def __init__(self, url: str) -> None:
