@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,14 @@ from mavfi_cli.campaigns.missions import Injected, canonical
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.stats.paired import McNemar
 from mavfi_cli.stats.shares import Share, wilson
 
 STAGES = tuple(stage.value for stage in Stage)
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
-LONGER = 1.05  # a flight is longer if it takes more than this times its own golden flight
+LONGER = 1.10  # a flight is longer if it takes more than this times its own golden flight
 _COLUMNS: Mapping[str, pa.DataType] = {
     **dict.fromkeys(("number", "seed", "fault_bits"), pa.int64()),
     **dict.fromkeys((
@@ -55,6 +57,32 @@ _NO_FAULT = canonical([None] * len(_FAULTS))
 _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
 
+class Fate(Enum):
+    """What a fault does to the node that it strikes."""
+
+    ALL = "all faults"
+    SILENT = "silent"  # the node goes on, with or without a wrong value
+    DEAD = "dead node"  # it crashes or hangs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Balance:
+    """What a detector undoes and what it causes on the same faults.
+
+    Attributes:
+        pairs: faults that were flown without and with the detector.
+        before: ills without it, such as lost missions.
+        undone, caused: ills that only the flight without it has, and that only that with it has.
+        p_value: of McNemar's exact test.
+    """
+
+    pairs: int
+    before: int
+    undone: int
+    caused: int
+    p_value: float
+
+
 @dataclass(frozen=True, slots=True)
 class Flights:
     """Missions that flew, a row each, in the columns that items and claims read.
@@ -67,14 +95,16 @@ class Flights:
             vehicle, speed, sensors, one flip of drawn bits, and 13 watched states.
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
+        ended: whether the fault ended a node, by a crash or a hang.
     Of its golden flight:
         own_lost: whether that is lost; empty if it is not there.
         own_flight_time_s: its flight time.
         over_own: flight time over it; empty if one of the two is lost.
+        added_s: flight time beyond it; empty if one of the two is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
     Of the flight with the same fault and no detector, empty if that is not there: bare_struck,
-    bare_lost, bare_over_own, bare_harmed.
+    bare_ended, bare_lost, bare_over_own, bare_harmed.
     """
 
     table: pa.Table
@@ -145,6 +175,43 @@ class Flights:
         """The flights with a detector of these stages, whose fault struck without it as well."""
         seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
         return self.chosen(**seen, **values)
+
+    def of_fate(self, fate: Fate) -> Flights:
+        """The flights without a fault, and those whose fault has this fate without a detector.
+
+        A fault that was not flown without a detector has no fate.
+        """
+        if fate is Fate.ALL:
+            return self
+        bare = pc.is_null(self.table["detector"])
+        ended = pc.if_else(bare, self.table["ended"], self.table["bare_ended"])
+        same = pc.fill_null(pc.equal(ended, fate is Fate.DEAD), _NO)
+        return Flights(self.table.filter(pc.or_(pc.is_null(self.table["level"]), same)))
+
+    @property
+    def seeds(self) -> list[tuple[str, int]]:
+        """World and seed of each flight: flights of one seed depend on each other."""
+        return list(zip(self["world"], self["seed"], strict=True))
+
+    def balance(
+        self, detector: str, protect: str = EVERY_STAGE, column: str = "harmed", **values: object
+    ) -> Balance:
+        """What a detector undoes and what it causes on the same faults.
+
+        Args:
+            column: of truth values that stand for an ill, such as `harmed` or `lost`.
+        """
+        seen = self.protected(detector, protect, **values)
+        pairs = zip(seen[f"bare_{column}"], seen[column], strict=True)
+        known = [(a, b) for a, b in pairs if a is not None and b is not None]
+        test = McNemar.of([a for a, _ in known], [b for _, b in known])
+        return Balance(
+            pairs=test.pairs,
+            before=test.both + test.only_first,
+            undone=test.only_first,
+            caused=test.only_second,
+            p_value=test.p_value,
+        )
 
     @property
     def golden(self) -> Flights:
@@ -219,6 +286,7 @@ def _flown(table: pa.Table) -> pa.Table:
         as_paper=pa.array(map(_as_paper, configs), pa.bool_()),
         struck=pc.and_not(flips, kills),
         lost=lost,
+        ended=pc.is_valid(table["node_ended"]),
     )
 
 
@@ -251,10 +319,16 @@ def _beside_golden(table: pa.Table) -> pa.Table:
     over_own = pc.if_else(pc.and_not(succeeds, table["lost"]), ratio, pa.scalar(None, ratio.type))
     harmed = pc.or_(table["lost"], pc.fill_null(pc.greater(over_own, LONGER), _NO))
     harmed = pc.if_else(succeeds, harmed, pa.scalar(None, pa.bool_()))
+    added = pc.multiply(own_time, pc.subtract(over_own, 1.0))
     table = _with_columns(
-        table, own_lost=own_lost, own_flight_time_s=own_time, over_own=over_own, harmed=harmed
+        table,
+        own_lost=own_lost,
+        own_flight_time_s=own_time,
+        over_own=over_own,
+        added_s=added,
+        harmed=harmed,
     )
-    names = ("struck", "lost", "over_own", "harmed")
+    names = ("struck", "ended", "lost", "over_own", "harmed")
     return _with_columns(table, **{f"bare_{name}": table[name].take(bare) for name in names})
 
 

@@ -6,16 +6,14 @@ VII-A and by 87.1 % in Fig. 14: 64.2 / 73.8 = 87.0 %. So the first is in points 
 and the second is a share of the increase. Both are given here.
 
 An effect is one number of a comparison: a difference of two rates, or the share of a loss that
-protection recovers. A claim gives the range in which the effect lies. `ClaimVerdict.of` compares
-the two.
+protection recovers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,60 +172,89 @@ def worst_case(
     }
 
 
-# Effects and claims ----------------------------------------------------------------------------
+# Effects ------------------------------------------------------------------------------------------
 
 DRAWS = 100_000  # of the three rates in `recovered_share`
 Count = tuple[int, int]  # successes, missions
 
 
-class ClaimVerdict(Enum):
-    """What the data say about a claim."""
+def paired_difference(
+    first: Sequence[bool] | BoolArray,
+    second: Sequence[bool] | BoolArray,
+    clusters: Sequence[Hashable],
+) -> Interval:
+    """Rate of the second minus rate of the first, of the same missions; NaN without any.
 
-    REPRODUCED = "reproduced"
-    NOT_REPRODUCED = "not reproduced"
-    OPEN = "not distinguishable"  # at this number of missions
-    NOT_FLOWN = "not flown"
-    NOT_JUDGED = "not judged"  # flown, but no number came of it
-
-    @classmethod
-    def of(
-        cls, effect: Interval | None, low: float = -math.inf, high: float = math.inf
-    ) -> ClaimVerdict:
-        """Compare the interval of an effect with the range that a claim gives.
-
-        The claim is reproduced if the whole interval is in the range, and not reproduced if no part
-        of it is. If the interval has a part on either side, the missions do not tell. The ends of a
-        direction are open: an interval that ends at 0 is not above 0.
-
-        Args:
-            effect: with its 95 % interval; None, or an interval without ends, if there are no data.
-            low, high: ends of the claimed range. Only finite ends are open.
-        """
-        if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
-            return cls.NOT_FLOWN
-        if low < effect.low and effect.high < high:
-            return cls.REPRODUCED
-        if effect.high <= low or effect.low >= high:
-            return cls.NOT_REPRODUCED
-        return cls.OPEN
-
-
-def correlation(pairs: Sequence[tuple[float, float]]) -> Interval:
-    """Pearson's correlation with Fisher's interval; NaN if one of the two does not vary.
+    The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
+    37, 2012). The number of pairs is divided by the design effect of the clusters.
 
     Args:
-        pairs: at least four.
+        first, second: whether each mission is a hit under each treatment, (n,).
+        clusters: key that missions share which depend on each other, (n,).
     """
-    from scipy.stats import pearsonr
-
-    first, second = (np.array(each) for each in zip(*pairs, strict=True))
-    if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
-        return Interval(value=math.nan, low=math.nan, high=math.nan, count=len(pairs))
-    found = pearsonr(first, second)
-    ends = found.confidence_interval()
-    return Interval(
-        value=float(found.statistic), low=float(ends.low), high=float(ends.high), count=len(pairs)
+    change = np.asarray(second, dtype=np.int64) - np.asarray(first, dtype=np.int64)
+    pairs = len(change)
+    if not pairs:
+        return NO_INTERVAL
+    effective = pairs / _cluster_effect(change, clusters)
+    gained, lost = (
+        (effective * float(np.mean(change == sign)) + 1.0) / (effective + 2.0) for sign in (1, -1)
     )
+    centre = gained - lost
+    half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (effective + 2.0))
+    return Interval(
+        value=float(change.mean()),
+        low=max(-1.0, centre - half),
+        high=min(1.0, centre + half),
+        count=pairs,
+    )
+
+
+def net_share(
+    before: BoolArray, after: BoolArray, clusters: Sequence[Hashable], *, seed: int = 1
+) -> Interval:
+    """Share of the hits that a treatment undoes, less those that it causes, of the same missions.
+
+    (hits before - hits after) / hits before. It is below 0 if the treatment causes more than it
+    undoes. The interval is that of percentiles of draws: of the share of missions that are hits
+    before, and of the shares of hits and of others that change, each from its posterior
+    distribution under Jeffreys' prior. The numbers of missions are divided by the design effect of
+    the clusters.
+
+    Args:
+        before, after: whether each mission is a hit without and with the treatment, (n,).
+        clusters: key that missions share which depend on each other, (n,).
+    """
+    hits, pairs = int(before.sum()), len(before)
+    if not hits:
+        return NO_INTERVAL
+    undone, caused = int((before & ~after).sum()), int((~before & after).sum())
+    change = after.astype(np.int64) - before.astype(np.int64)
+    effect = _cluster_effect(change, clusters)
+    rng = np.random.default_rng(seed)
+    hit, back, new = (
+        rng.beta(count / effect + 0.5, (total - count) / effect + 0.5, DRAWS)
+        for count, total in ((hits, pairs), (undone, hits), (caused, pairs - hits))
+    )
+    low, high = np.percentile(back - new * (1.0 - hit) / hit, [2.5, 97.5])
+    value = (undone - caused) / hits
+    # A share at an end of its range lies outside the percentiles of a continuous posterior.
+    return Interval(
+        value=value, low=min(value, float(low)), high=max(value, float(high)), count=pairs
+    )
+
+
+def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> float:
+    """Variance of a mean over that of as many independent values; at least 1."""
+    residuals = values - values.mean()
+    squares = float((residuals**2).sum())
+    sums: dict[Hashable, float] = {}
+    for key, residual in zip(clusters, residuals.tolist(), strict=True):
+        sums[key] = sums.get(key, 0.0) + residual
+    if squares == 0.0 or len(sums) < 2:
+        return 1.0
+    between = math.fsum(each**2 for each in sums.values()) * len(sums) / (len(sums) - 1)
+    return max(1.0, between / squares)
 
 
 def recovered_share(

@@ -85,17 +85,6 @@ class Share:
             raise ConfigError(f"must be at least 0, got {upsets_per_hour:g}", key="upsets_per_hour")
         return upsets_per_hour * self.share, upsets_per_hour * self.low, upsets_per_hour * self.high
 
-    def longest_reaches(self, flights: int) -> Interval:
-        """Probability that the longest of so many flights is one of this share p: 1 - (1 - p)^n.
-
-        The ends are those of p.
-        """
-        value, low, high = (
-            -math.expm1(flights * math.log1p(-each)) if each < 1.0 else 1.0
-            for each in (self.share, self.low, self.high)
-        )
-        return Interval(value=value, low=low, high=high, count=self.total)
-
 
 def wilson(
     count: int, total: int, *, design_effect: float = 1.0, confidence: float = 0.95

@@ -1,0 +1,398 @@
+"""Measures: the number of some flights, or of isolated kernels, that decides a claim.
+
+claims.toml names them. A measure takes flights, and the values of columns that choose some of them.
+Of faults without a detector it counts those that flipped a bit. Missions of one world and seed are a
+cluster: the intervals of shares have the design effect of these clusters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.analysis.failures import outcome_share
+from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, STAGES, Flights
+from mavfi_cli.analysis.summary import RESAMPLES
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.paper.verdicts import Finding
+from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.paired import net_share, paired_difference
+from mavfi_cli.stats.shares import Interval, Share, design_effect, wilson
+
+Where = Mapping[str, Any]  # values of columns; a tuple allows several
+Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
+NOT_FLOWN = Finding(why="not flown")
+_DRAWS = 20_000  # of a rank correlation
+_FEWEST = 5  # kernels of a rank correlation, and hits of a share of hits
+_DETECTORS = ("gad", "aad")
+
+
+def share(flights: Flights, column: str = "lost", *, value: bool = True) -> Share:
+    """The share in which a column has a value, among those in which it is not empty.
+
+    Missions of one seed are a cluster.
+    """
+    there = flights.where(each is not None for each in flights[column])
+    hits = [each is value for each in there[column]]
+    clusters = [(world, (world, seed)) for world, seed in there.seeds]
+    return wilson(sum(hits), len(hits), design_effect=design_effect(hits, clusters))
+
+
+def _of_share(found: Share, what: str, why: str = NOT_FLOWN.why) -> Finding:
+    if not found.total:
+        return Finding(why=why)
+    return Finding(effect=found.effect, counts=f"{found.counts} {what}")
+
+
+def _difference(shares: Sequence[Share], counts: str) -> Finding:
+    """The first minus the second of two shares."""
+    first, second = shares
+    if not (first.total and second.total):
+        return NOT_FLOWN
+    return Finding(effect=first.minus(second), counts=counts)
+
+
+def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
+    """The mean of a value over clusters of flights; NaN is left out."""
+    clusters: dict[tuple[str, int], list[float]] = {}
+    for seed, value in zip(flights.seeds, values, strict=True):
+        if not math.isnan(value):
+            clusters.setdefault(seed, []).append(value)
+    if not clusters:
+        return NOT_FLOWN
+    means = [math.fsum(those) / len(those) for those in clusters.values()]
+    found = interval(means, resamples=RESAMPLES)
+    number = sum(map(len, clusters.values()))
+    effect = Interval(value=found.value, low=found.low, high=found.high, count=number)
+    return Finding(effect=effect, counts=counts)
+
+
+# Flights without a fault --------------------------------------------------------------------------
+
+
+def golden_success(flights: Flights, **where: Any) -> Finding:
+    """Success of the golden flights."""
+    return _of_share(share(flights.golden.chosen(**where), value=False), "golden flights succeed")
+
+
+# Faults without a detector ------------------------------------------------------------------------
+
+
+def success_lost(flights: Flights, **where: Any) -> Finding:
+    """Success of the golden flights minus that of the same missions with a fault."""
+    both = flights.struck(**where).chosen(own_lost=(True, False))
+    if not len(both):
+        return NOT_FLOWN
+    counts = f"{both.share().counts} lost; golden {both.share('own_lost').counts}"
+    own, lost = both.flags("own_lost"), both.flags("lost")
+    return Finding(effect=paired_difference(~lost, ~own, both.seeds), counts=counts)
+
+
+def most_lost_kernel(flights: Flights, **where: Any) -> Finding:
+    """Success lost by faults in the kernel that loses most."""
+    hit = flights.struck(**where).by("struck_kernel")
+    kernels = {name: those.share().share for (name,), those in hit.items() if name}
+    if not kernels:
+        return NOT_FLOWN
+    most = max(kernels, key=lambda name: kernels[name])
+    found = success_lost(flights, **where, struck_kernel=most)
+    return Finding(effect=found.effect, counts=f"most in {most}: {found.counts}", why=found.why)
+
+
+def harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
+    """Share of harmful faults in the first of two groups minus that in the second."""
+    shares = [share(flights.struck(**where), "harmed") for where in groups.values()]
+    counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
+    return _difference(shares, f"harmful: {'; '.join(counts)}")
+
+
+def harmful(flights: Flights, **where: Any) -> Finding:
+    """Share of harmful faults."""
+    return _of_share(share(flights.struck(**where), "harmed"), "harmful")
+
+
+def loss_difference(
+    flights: Flights, first: Where, second: Where, counts: str, **where: Any
+) -> Finding:
+    """Share of lost missions in one group of faults minus that in another.
+
+    Args:
+        counts: a format of two texts.
+    """
+    shares = [share(flights.struck(**where, **each)) for each in (first, second)]
+    return _difference(shares, f"lost: {counts.format(*(each.counts for each in shares))}")
+
+
+def longer(flights: Flights, **where: Any) -> Finding:
+    """Share of successful flights that take more than LONGER times as long as golden."""
+    timed = flights.struck(**where).timed.chosen(lost=False)
+    ratios = timed.ratios
+    if not len(ratios):
+        return NOT_FLOWN
+    found = share(timed, "harmed")
+    most = 100.0 * (ratios.max() - 1.0)
+    return _of_share(found, f"over {100 * (LONGER - 1):.0f} % longer; longest {most:+.1f} %")
+
+
+def longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
+    """Share of longer flights, of those that succeed, in the first of two groups minus the second."""
+    timed = [flights.struck(**where).timed for where in groups.values()]
+    shares = [share(those, "harmed") for those in timed]
+    counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
+    return _difference(shares, f"over 10 % longer: {'; '.join(counts)}")
+
+
+def mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: Any) -> Finding:
+    """Mean change of a column from the golden flight of the same mission, where both succeed.
+
+    Args:
+        ratio: whether the change is relative.
+    """
+    golden = dict(zip(flights.golden["pair"], flights.golden[column], strict=True))
+    timed = flights.struck(**where).timed
+    changes = []
+    for pair, value in zip(timed["pair"], timed[column], strict=True):
+        own = golden.get(pair)
+        known = own is not None and value is not None and (own > 0.0 or not ratio)
+        changes.append((value - own) / (own if ratio else 1.0) if known else math.nan)
+    return _mean(timed, changes, f"{len(timed):,} flights that succeed with and without the fault")
+
+
+def single_flight(flights: Flights, why: str, **where: Any) -> Finding:
+    """No effect: one longest flight decides nothing. Names ours."""
+    ratios = flights.struck(**where).ratios
+    if not len(ratios):
+        return NOT_FLOWN
+    return Finding(counts=f"ours: {100 * (ratios.max() - 1):+.1f} % of {len(ratios):,}", why=why)
+
+
+def not_measured(flights: Flights, why: str) -> Finding:
+    """No effect, whatever was flown."""
+    return Finding(why=why)
+
+
+# The same faults without and with a detector ------------------------------------------------------
+
+
+def _net(seen: Flights, column: str, what: str) -> Finding:
+    """Share of an ill that a detector undoes, less what it causes on the same faults."""
+    seen = seen.where(each is not None for each in seen[f"bare_{column}"])
+    seen = seen.where(each is not None for each in seen[column])
+    if not len(seen):
+        return NOT_FLOWN
+    before, after = seen.flags(f"bare_{column}"), seen.flags(column)
+    undone, caused = int((before & ~after).sum()), int((~before & after).sum())
+    counts = f"of {before.sum():,} {what}, {undone:,} undone; {caused:,} newly caused"
+    if before.sum() < _FEWEST:
+        few = f"without the detector {before.sum():,} of {len(seen):,} are {what}"
+        return Finding(counts=counts if caused else "", why=f"{few}, too few to tell a share")
+    return Finding(effect=net_share(before, after, seen.seeds), counts=counts)
+
+
+def recovered(flights: Flights, detector: str, **where: Any) -> Finding:
+    """Share of lost missions that a detector saves, less those that it loses."""
+    return _net(flights.protected(detector, **where), "lost", "lost")
+
+
+def shortened(flights: Flights, detector: str, **where: Any) -> Finding:
+    """Share of longer flights that a detector brings back, less those that it lengthens."""
+    seen = flights.protected(detector, **where).chosen(bare_lost=False, lost=False)
+    return _net(seen, "harmed", f"over {100 * (LONGER - 1):.0f} % longer")
+
+
+def undone_difference(
+    flights: Flights, detector: str, first: str, others: Sequence[str], **where: Any
+) -> Finding:
+    """Net share of harm undone by watching some stages minus that by the best of others.
+
+    Args:
+        first, others: stages that the detector watches, joined by `+`.
+    """
+    found = {
+        name: _net(flights.protected(detector, name, **where), "harmed", "harmful")
+        for name in (first, *others)
+    }
+    best = None
+    for name in others:
+        effect = found[name].effect
+        if effect is None or found[first].effect is None:
+            return Finding(counts=found[name].counts, why=found[name].why or found[first].why)
+        if best is None or effect.value > best.value:
+            best = effect
+    effect = found[first].effect
+    assert effect is not None
+    assert best is not None
+    counts = "; ".join(f"{name}: {each.counts}" for name, each in found.items())
+    return Finding(effect=effect.minus(best), counts=counts)
+
+
+def density_gap(flights: Flights, detector: str, dense: str, free: str, **where: Any) -> Finding:
+    """Share of protected missions lost beyond golden in a dense world minus that in a free one."""
+    gaps = []
+    for world in (dense, free):
+        seen = flights.protected(detector, world=world, **where)
+        if not len(seen):
+            return NOT_FLOWN
+        gaps.append(share(seen, "harmed"))
+    return _difference(gaps, f"harmed with the detector: {dense} {gaps[0].counts}, "
+                             f"{free} {gaps[1].counts}")  # fmt: skip
+
+
+def autoencoder_better(flights: Flights, **where: Any) -> Finding:
+    """Success with the autoencoder minus success with the Gaussian detector, on the same faults."""
+    seen = [flights.protected(name, **where) for name in _DETECTORS]
+    gad, aad = (
+        {
+            fault: (seed, not lost)
+            for fault, seed, lost in zip(x.faults, x.seeds, x.flags("lost"), strict=True)
+        }
+        for x in seen
+    )
+    both = sorted(gad.keys() & aad.keys())
+    if not both:
+        return NOT_FLOWN
+    first, second = (np.array([those[key][1] for key in both]) for those in (gad, aad))
+    counts = (
+        f"{int((second & ~first).sum())} missions by AAD only, "
+        f"{int((first & ~second).sum())} by GAD only, of {len(both):,}"
+    )
+    effect = paired_difference(first, second, [gad[key][0] for key in both])
+    return Finding(effect=effect, counts=counts)
+
+
+# Costs of detectors -------------------------------------------------------------------------------
+
+_NO_COSTS = Finding(why="this export does not hold these times; a new one does")
+
+
+def overhead_of(
+    flights: Flights, detector: str, parts: Collection[str] = COSTS, **where: Any
+) -> Finding:
+    """Mean share of the flight time that parts of detection and recovery take."""
+    seen, shares = _overheads(flights, detector, parts, where)
+    return _costs(seen, shares, f"{len(seen):,} flights")
+
+
+def gaussian_dearer(flights: Flights, **where: Any) -> Finding:
+    """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
+    gad, aad = (_overheads(flights, name, COSTS, where) for name in _DETECTORS)
+    other = dict(zip(aad[0].faults, aad[1], strict=True))
+    more = [
+        cost - other.get(fault, math.nan) for fault, cost in zip(gad[0].faults, gad[1], strict=True)
+    ]
+    return _costs(gad[0], more, "the same faults with either detector")
+
+
+def _overheads(
+    flights: Flights, detector: str, parts: Collection[str], where: Where
+) -> tuple[Flights, FloatArray]:
+    """The flights with a detector, and the share of each flight time; NaN if unknown."""
+    seen = flights.struck(detector=detector, protect=EVERY_STAGE, **where)
+    return seen, np.sum([seen.numbers(name) for name in parts], axis=0)
+
+
+def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> Finding:
+    found = _mean(seen, list(costs), counts)
+    return _NO_COSTS if len(seen) and found.effect is None else found
+
+
+# Isolated kernels ---------------------------------------------------------------------------------
+
+
+def outcome_beside(
+    kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
+) -> Finding:
+    """The share of an outcome in one kernel minus that in the most extreme of others.
+
+    Args:
+        extreme: `most` or `least`.
+        others: none mean all.
+    """
+    there = [each for each in others or kernels if each in kernels and each != kernel]
+    if kernel not in kernels or not there:
+        return NOT_FLOWN
+    choose = max if extreme == "most" else min
+    other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
+    shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
+    counts = (f"{kernels[each]['title']} {100 * x.share:.1f} %" for each, x in shares.items())
+    effect = shares[kernel].minus(shares[other])
+    return Finding(effect=effect, counts=", ".join(counts))
+
+
+def least_benign(kernels: Kernels, but: str) -> Finding:
+    """The least share of benign runs of all kernels but one."""
+    shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
+    if not shares:
+        return NOT_FLOWN
+    least = min(shares, key=lambda each: shares[each].share)
+    return _of_share(shares[least], f"benign in {kernels[least]['title']}, the least")
+
+
+def benign(kernels: Kernels, kernel: str) -> Finding:
+    """The share of benign runs of a kernel."""
+    if kernel not in kernels:
+        return NOT_FLOWN
+    return _of_share(outcome_share(kernels[kernel], "benign"), "benign")
+
+
+def ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
+    """Spearman's correlation of silent corruption in isolation with harm in flight, over kernels.
+
+    The kernels are given, not drawn, so the interval is that of the shares: each is drawn from its
+    posterior distribution under Jeffreys' prior.
+    """
+    flown = {
+        name: share(those, "harmed")
+        for (name,), those in flights.struck(**where).by("struck_kernel").items()
+        if name in kernels
+    }
+    if len(flown) < _FEWEST:
+        return NOT_FLOWN
+    if len({each.share for each in flown.values()}) == 1:
+        return Finding(why="in flight all kernels do the same harm")
+    rng = np.random.default_rng(1)
+    silent = {name: outcome_share(kernels[name], "sdc") for name in flown}
+    drawn = [
+        np.stack([_posterior(each, rng) for each in those])
+        for those in (silent.values(), flown.values())
+    ]
+    low, high = np.percentile(_spearman(*drawn), [2.5, 97.5])
+    shares = (np.array([[each.share] for each in those.values()]) for those in (silent, flown))
+    value = float(_spearman(*shares)[0])
+    count = sum(each.total for each in flown.values())
+    order = sorted(flown, key=lambda name: -flown[name].share)
+    counts = f"harm in flight, most first: {', '.join(order)}"
+    effect = Interval(value=value, low=float(low), high=float(high), count=count)
+    return Finding(effect=effect, counts=counts)
+
+
+def _posterior(found: Share, rng: np.random.Generator) -> FloatArray:
+    return rng.beta(found.count + 0.5, found.total - found.count + 0.5, _DRAWS)
+
+
+def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Rank correlation down the columns of two arrays, (kernels, n); ties have mean ranks."""
+    from scipy.stats import rankdata
+
+    ranks = [rankdata(each, axis=0) for each in (first, second)]
+    a, b = (each - each.mean(axis=0) for each in ranks)
+    return np.asarray((a * b).sum(axis=0) / np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0)))
+
+
+MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__: measure for measure in (
+    golden_success, success_lost, most_lost_kernel, harm_difference, harmful, loss_difference,
+    longer, longer_difference, mean_change, single_flight, not_measured, recovered, shortened,
+    undone_difference, density_gap, autoencoder_better, overhead_of, gaussian_dearer,
+    outcome_beside, least_benign, benign, ranking,
+)}  # fmt: skip
+"""By the names that claims.toml uses."""
+OF_KERNELS = frozenset({"outcome_beside", "least_benign", "benign"})
+"""The measures that take isolated kernels and no flights."""
+WITHOUT_FATES = OF_KERNELS | {
+    "golden_success", "single_flight", "not_measured", "overhead_of", "gaussian_dearer",
+}  # fmt: skip
+"""The measures that do not depend on what a fault does to its node."""

@@ -1,0 +1,137 @@
+"""What an effect with its interval says about the range that a claim gives.
+
+The range was written before the data, in claims.toml. A verdict is a test of the nearest end of the
+range. The tests of one figure or table are a family, corrected by S. Holm (Scand. J. Statistics 6,
+1979).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from mavfi_cli.stats.paired import holm
+from mavfi_cli.stats.shares import Interval, wilson, z_of
+
+LEVEL = 0.05  # of a family
+_FAMILY = 4  # claims of a figure or table that `margin` allows for
+_STEP = 0.005  # margins are multiples of half a point
+_Z = z_of(1.0 - LEVEL)
+
+
+class Verdict(Enum):
+    """What the missions say about a claim."""
+
+    REPRODUCED = "reproduced"
+    CONTRADICTED = "contradicted"
+    UNDECIDED = "undecided"
+    NOT_DECIDABLE = "not decidable"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What the missions say about the number that decides a claim.
+
+    Attributes:
+        effect: with its 95 % interval; None if there is none.
+        counts: what the effect was computed from.
+        why: why there is no effect.
+    """
+
+    effect: Interval | None = None
+    counts: str = ""
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """A claim's verdict, and what it rests on.
+
+    Attributes:
+        effect: with its 95 % interval, which is not corrected; None if there is none.
+        counts: what the effect was computed from.
+        why: why nothing can decide the claim; empty of the other verdicts.
+        p: of the test against the nearest end of the range, corrected for its family; 1 without
+            an effect.
+        needed: observations that decide an undecided claim if the effect stays as it is; infinite
+            if it lies on an end of the range.
+    """
+
+    verdict: Verdict
+    effect: Interval | None = None
+    counts: str = ""
+    why: str = ""
+    p: float = 1.0
+    needed: float = 0.0
+
+
+def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) -> list[Judgement]:
+    """Judge a family of claims.
+
+    Args:
+        findings: of each claim.
+        ranges: low and high end of each claim's range, which belong to it.
+    """
+    z = [_z(found.effect, *ends) for found, ends in zip(findings, ranges, strict=True)]
+    tested = [place for place, each in enumerate(z) if not math.isnan(each)]
+    p = dict(zip(tested, holm([_two_sided(z[place]) for place in tested]), strict=True))
+    wanted_z = z_of(1.0 - LEVEL / len(tested)) if tested else _Z
+    judged = []
+    for place, (found, (low, high)) in enumerate(zip(findings, ranges, strict=True)):
+        judgement = Judgement(
+            verdict=Verdict.NOT_DECIDABLE,
+            counts=found.counts,
+            why=found.why or "the flights give no interval",
+        )
+        if place in p and found.effect is not None:
+            undecided = p[place] >= LEVEL
+            inside = low <= found.effect.value <= high
+            decided = Verdict.REPRODUCED if inside else Verdict.CONTRADICTED
+            more = (wanted_z / z[place]) ** 2 if z[place] else math.inf
+            judgement = replace(
+                judgement,
+                verdict=Verdict.UNDECIDED if undecided else decided,
+                effect=found.effect,
+                why="",
+                p=p[place],
+                needed=found.effect.count * more if undecided else 0.0,
+            )
+        judged.append(judgement)
+    return judged
+
+
+def _z(effect: Interval | None, low: float, high: float) -> float:
+    """Standard errors between the effect and the nearest end; NaN without an interval.
+
+    The standard error is that of the interval's side that faces the end.
+    """
+    if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
+        return math.nan
+    below, above = effect.value - effect.low, effect.high - effect.value
+    if effect.value < low:
+        distances = [(low - effect.value, above)]
+    elif effect.value > high:
+        distances = [(effect.value - high, below)]
+    else:
+        distances = [(effect.value - low, below), (high - effect.value, above)]
+    return min(
+        _Z * distance / side if side else math.inf if distance else 0.0
+        for distance, side in distances
+    )
+
+
+def _two_sided(z: float) -> float:
+    return math.erfc(z / math.sqrt(2.0))
+
+
+def margin(missions: int) -> float:
+    """The smallest effect that counts, at the number of missions of each of the paper's groups.
+
+    None of so many missions rules it out in a family of four claims, so that a claim can be
+    contradicted: the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to half a
+    point.
+    """
+    high = wilson(0, missions, confidence_z=z_of(1.0 - LEVEL / _FAMILY)).high
+    return math.ceil(high / _STEP) * _STEP
