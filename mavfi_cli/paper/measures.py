@@ -1,8 +1,8 @@
 """Measures: the number of some flights, or of isolated kernels, that decides a claim.
 
-claims.toml names them. A measure takes flights, and the values of columns that choose some of them.
-Of faults without a detector it counts those that flipped a bit. Missions of one world and seed are a
-cluster: the intervals of shares have the design effect of these clusters.
+claims.toml names them. A measure takes flights, and values of columns that choose some of them. It
+counts the faults that flipped a bit. Missions of one world and seed are a cluster: the intervals of
+shares have the design effect of these clusters.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS
-from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, STAGES, Flights
+from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
 from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.paper.verdicts import Finding
@@ -139,7 +139,7 @@ def longer(flights: Flights, **where: Any) -> Finding:
 
 
 def longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Share of longer flights, of those that succeed, in the first of two groups minus the second."""
+    """Share of longer flights that succeed in the first of two groups minus that in the second."""
     timed = [flights.struck(**where).timed for where in groups.values()]
     shares = [share(those, "harmed") for those in timed]
     counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
@@ -170,7 +170,7 @@ def single_flight(flights: Flights, why: str, **where: Any) -> Finding:
     return Finding(counts=f"ours: {100 * (ratios.max() - 1):+.1f} % of {len(ratios):,}", why=why)
 
 
-def not_measured(flights: Flights, why: str) -> Finding:
+def not_measured(_: Flights, why: str) -> Finding:
     """No effect, whatever was flown."""
     return Finding(why=why)
 

@@ -1,4 +1,4 @@
-"""Effects with intervals against scipy and closed forms, and the rule of the verdicts."""
+"""Effects with intervals, against scipy and closed forms."""
 
 import math
 
@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mavfi_cli.stats.paired import (
-    ClaimVerdict,
     McNemar,
-    correlation,
     excess_over_mean,
+    net_share,
+    paired_difference,
     recovered_share,
 )
 from mavfi_cli.stats.shares import Interval, wilson
@@ -20,24 +20,6 @@ from mavfi_cli.stats.shares import Interval, wilson
 
 def between(low, high):
     return Interval(value=(low + high) / 2, low=low, high=high, count=9)
-
-
-@pytest.mark.parametrize(
-    ("effect", "low", "high", "verdict"),
-    [
-        (between(0.1, 0.2), 0.0, math.inf, ClaimVerdict.REPRODUCED),
-        (between(0.0, 0.2), 0.0, math.inf, ClaimVerdict.OPEN),
-        (between(-0.1, 0.2), 0.0, math.inf, ClaimVerdict.OPEN),
-        (between(-0.2, 0.0), 0.0, math.inf, ClaimVerdict.NOT_REPRODUCED),
-        (between(0.1, 0.2), 0.0, 0.15, ClaimVerdict.OPEN),
-        (between(0.2, 0.3), 0.0, 0.15, ClaimVerdict.NOT_REPRODUCED),
-        (between(-0.3, -0.2), -math.inf, 0.0, ClaimVerdict.REPRODUCED),
-        (between(math.nan, math.nan), 0.0, math.inf, ClaimVerdict.NOT_FLOWN),
-        (None, 0.0, math.inf, ClaimVerdict.NOT_FLOWN),
-    ],
-)
-def test_the_whole_interval_decides(effect, low, high, verdict):
-    assert ClaimVerdict.of(effect, low, high) is verdict
 
 
 def test_newcombes_interval_of_his_own_example():
@@ -91,28 +73,46 @@ def test_recovered_is_a_ratio_whose_interval_is_wide_at_the_papers_n():
     assert (sure.low, sure.high) == pytest.approx((2 / 3 - half, 2 / 3 + half), abs=1e-3)
 
 
-def test_the_longest_of_many_flights():
-    found = wilson(1, 100).longest_reaches(300)
-    assert found.value == pytest.approx(1.0 - 0.99**300)
-    assert found.low < found.value < found.high <= 1.0
-    assert wilson(0, 10).longest_reaches(300).low == 0.0
-    assert wilson(10, 10).longest_reaches(3).value == 1.0
-
-
-def test_a_correlation_is_scipys():
-    rng = np.random.default_rng(5)
-    first = rng.normal(size=30)
-    second = first + rng.normal(size=30)
-    found = correlation([*zip(first.tolist(), second.tolist(), strict=True)])
-    z = math.atanh(stats.pearsonr(first, second).statistic)
-    half = stats.norm.ppf(0.975) / math.sqrt(27)
-    assert (found.low, found.high) == pytest.approx((math.tanh(z - half), math.tanh(z + half)))
-
-
-def test_a_constant_correlates_with_nothing():
-    assert math.isnan(correlation([(1.0, 2.0), (1.0, 3.0), (1.0, 4.0), (1.0, 5.0)]).value)
-
-
 def test_the_longest_over_the_mean():
     assert excess_over_mean([10.0, 20.0, 30.0], [40.0]) == (0.5, 1.0)
     assert all(map(math.isnan, excess_over_mean([], [40.0])))
+
+
+def test_without_clusters_a_paired_difference_is_that_of_mcnemars_counts():
+    first, second = [True] * 100, [False] * 30 + [True] * 70
+    assert paired_difference(first, second, range(100)) == McNemar.of(first, second).effect
+    assert math.isnan(paired_difference([], [], []).low)
+
+
+def test_copies_of_a_mission_tell_no_more_than_the_mission():
+    first, second = [True] * 40, [False] * 10 + [True] * 30
+    once = paired_difference(first, second, range(40))
+    twice = paired_difference(first * 2, second * 2, [*range(40)] * 2)
+    free = paired_difference(first * 2, second * 2, range(80))
+    wider = (once.high - once.low) / (twice.high - twice.low)
+    assert wider == pytest.approx(math.sqrt(39 / 40), abs=0.01)  # of a sample's variance
+    assert free.high - free.low < 0.75 * (twice.high - twice.low)
+    assert twice.count == 80
+
+
+def test_a_net_share_counts_what_is_undone_and_what_is_caused():
+    before = np.array([True] * 50 + [False] * 950)
+    undone, caused = np.array([False] * 1000), before.copy()
+    caused[60:85] = True
+    good, none, bad = (net_share(before, after, range(1000)) for after in (undone, before, caused))
+    assert (good.value, none.value, bad.value) == (1.0, 0.0, -0.5)
+    assert 0.9 < good.low < good.high == 1.0
+    assert none.low < 0.0 < none.high < 0.1
+    assert bad.low < -0.5 < bad.high < -0.25
+    assert math.isnan(net_share(undone, before, range(1000)).low)
+
+
+def test_a_net_share_covers_the_truth():
+    rng = np.random.default_rng(5)
+    inside = 0
+    for _ in range(200):
+        before = rng.random(400) < 0.2
+        after = np.where(before, rng.random(400) < 0.6, rng.random(400) < 0.05)
+        found = net_share(before, after, range(400))  # (0.08 - 0.04) / 0.2
+        inside += found.low <= 0.2 <= found.high
+    assert inside >= 184
