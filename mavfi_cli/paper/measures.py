@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavfi_cli.analysis.failures import outcome_share
-from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.flights import COSTS, known, numbers
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
 from mavfi_cli.analysis.summary import RESAMPLES
+from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
+from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.verdicts import Finding
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import net_share, paired_difference
@@ -77,6 +80,26 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
 def golden_success(flights: Flights, **where: Any) -> Finding:
     """Success of the golden flights."""
     return _of_share(share(flights.golden.chosen(**where), value=False), "golden flights succeed")
+
+
+def delta_range(flights: Flights, state: str, why: str) -> Finding:
+    """Reduction of a state's range from its values to its deltas, mean over golden flights.
+
+    Args:
+        state: column of the trace.
+        why: what is said if no run folder is there.
+    """
+    won = flights.golden.chosen(lost=False)
+    reduced = []
+    for run in won["path"]:
+        trace = Path(run or "") / TRACE
+        if run and trace.is_file():
+            values = known(numbers(read_parquet(trace, "trace"), state))
+            reduced.append(1.0 - float(np.ptp(np.diff(values))) / float(np.ptp(values)))
+        else:
+            reduced.append(math.nan)
+    found = _mean(won, reduced, "golden flights")
+    return Finding(why=why) if len(won) and found.effect is None else found
 
 
 # Faults without a detector ------------------------------------------------------------------------
@@ -384,8 +407,8 @@ def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__: measure for measure in (
-    golden_success, success_lost, most_lost_kernel, harm_difference, harmful, loss_difference,
-    longer, longer_difference, mean_change, single_flight, not_measured, recovered, shortened,
+    golden_success, delta_range, success_lost, most_lost_kernel, harm_difference, harmful,
+    loss_difference, longer, longer_difference, mean_change, single_flight, not_measured, recovered, shortened,
     undone_difference, density_gap, autoencoder_better, overhead_of, gaussian_dearer,
     outcome_beside, least_benign, benign, ranking,
 )}  # fmt: skip
@@ -393,6 +416,7 @@ MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__: measure for 
 OF_KERNELS = frozenset({"outcome_beside", "least_benign", "benign"})
 """The measures that take isolated kernels and no flights."""
 WITHOUT_FATES = OF_KERNELS | {
-    "golden_success", "single_flight", "not_measured", "overhead_of", "gaussian_dearer",
+    "golden_success", "delta_range", "single_flight", "not_measured", "overhead_of",
+    "gaussian_dearer",
 }  # fmt: skip
 """The measures that do not depend on what a fault does to its node."""
