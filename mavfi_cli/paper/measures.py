@@ -408,7 +408,8 @@ def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
 
 MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__: measure for measure in (
     golden_success, delta_range, success_lost, most_lost_kernel, harm_difference, harmful,
-    loss_difference, longer, longer_difference, mean_change, single_flight, not_measured, recovered, shortened,
+    loss_difference, longer, longer_difference, mean_change, single_flight, not_measured,
+    recovered, shortened,
     undone_difference, density_gap, autoencoder_better, overhead_of, gaussian_dearer,
     outcome_beside, least_benign, benign, ranking,
 )}  # fmt: skip
