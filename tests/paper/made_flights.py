@@ -10,7 +10,7 @@ _KINDS = {
     "number": pa.int64(), "pair": pa.string(), "world": pa.string(), "planner": pa.string(),
     "platform": pa.string(), "level": pa.string(), "fault_target": pa.string(),
     "fault_seed": pa.int64(), "fault_bits": pa.int64(), "fault_field": pa.string(),
-    "detector": pa.string(), "protect": pa.string(), "state": pa.string(), "outcome": pa.string(),
+    "node_ended": pa.string(), "detector": pa.string(), "protect": pa.string(), "state": pa.string(), "outcome": pa.string(),
     "flight_time_s": pa.float64(), "distance_m": pa.float64(), "energy_regression_j": pa.float64(),
     "replans": pa.int64(), "check_share": pa.float64(), "path": pa.string(),
     "changes": pa.string(),

@@ -4,7 +4,7 @@ import pyarrow as pa
 import pytest
 from made_flights import flight, struck, table
 
-from mavfi_cli.analysis.pairs import Flights
+from mavfi_cli.analysis.pairs import Fate, Flights
 
 
 def columns(found, *names):
@@ -14,14 +14,29 @@ def columns(found, *names):
 def test_each_flight_stands_beside_its_golden_one():
     found = table(
         flight("a", 20.0), flight("b", None),
-        struck("a", 22.0), struck("a", None), struck("b", 30.0), struck("c", 30.0),
+        struck("a", 23.0), struck("a", 21.0), struck("a", None), struck("b", 30.0),
+        struck("c", 30.0),
     )  # fmt: skip
-    assert columns(found, "own_lost", "over_own", "harmed")[2:] == [
-        (False, pytest.approx(1.1), True),
-        (False, None, True),
-        (True, None, None),  # the golden flight was lost
-        (None, None, None),  # there is none
+    assert columns(found, "own_lost", "over_own", "added_s", "harmed")[2:] == [
+        (False, pytest.approx(1.15), pytest.approx(3.0), True),
+        (False, pytest.approx(1.05), pytest.approx(1.0), False),  # 10 % longer is the limit
+        (False, None, None, True),
+        (True, None, None, None),  # the golden flight was lost
+        (None, None, None, None),  # there is none
     ]
+
+
+def test_the_fate_of_a_node_is_that_without_a_detector():
+    dead = {"fault_seed": 1, "node_ended": "hang"}
+    found = table(
+        flight("a", 20.0), struck("a", 20.0, **dead), struck("a", 21.0, fault_seed=2),
+        struck("a", 22.0, fault_seed=1, detector="gad"),
+        struck("a", 23.0, fault_seed=2, detector="gad", node_ended="hang"),
+        struck("a", 24.0, fault_seed=3, detector="gad"),  # not flown without
+    )  # fmt: skip
+    assert found.of_fate(Fate.ALL)["flight_time_s"] == found["flight_time_s"]
+    assert found.of_fate(Fate.DEAD)["flight_time_s"] == [20.0, 20.0, 22.0]
+    assert found.of_fate(Fate.SILENT)["flight_time_s"] == [20.0, 21.0, 23.0]
 
 
 def test_a_protected_flight_stands_beside_the_same_fault_without_a_detector():
@@ -51,7 +66,7 @@ def test_a_mission_of_several_campaigns_is_there_once():
 
 
 def test_flights_are_counted_where_a_column_is_known():
-    found = table(flight("a", 20.0), struck("a", 22.0), struck("b", 30.0))
+    found = table(flight("a", 20.0), struck("a", 23.0), struck("b", 30.0))
     assert (found.share("harmed").count, found.share("harmed").total) == (1, 2)
     assert found.share(value=False).count == 3
     worlds = found.by("world", "level")
