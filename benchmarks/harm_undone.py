@@ -4,10 +4,10 @@ r"""What detectors and protections save of the harm that faults do.
         docs/results/protected*.parquet --arms label_detector
 
 Reads exports of campaigns (`mavfi campaign export`). A fault is harmful if its unprotected flight
-(no detector, the first stack) does not end in success, or takes more than 5 % longer than its own
+(no detector, the first stack) does not end in success, or takes more than 10 % longer than its own
 golden flight. An arm is a value of the columns `--arms`: it flew the same fault in the same world.
 'Recovered' counts lost missions that the arm saves. 'Undone' counts harmful faults whose flight
-with the arm succeeds and takes at most 5 % longer than the golden flight. 'Broken' counts harmless
+with the arm succeeds and takes at most 10 % longer than the golden flight. 'Broken' counts harmless
 faults that do harm with the arm. Intervals are Wilson's, 95 %; two arms are compared on the faults
 that both flew by McNemar's exact test.
 """
@@ -63,7 +63,7 @@ class Faults:
         return float(row["flight_time_s"]) / self.golden_s[key(row, MISSION)] - 1.0
 
     def harms(self, row: Row) -> bool:
-        """Whether the mission is lost, or longer by more than 5 %."""
+        """Whether the mission is lost, or longer by more than 10 %."""
         return lost(row) or self.excess(row) > LONGER - 1.0
 
 

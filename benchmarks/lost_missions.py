@@ -5,7 +5,7 @@ r"""Lost and longer missions of flown campaigns, cell by cell.
 
 Reads exports of campaigns (`mavfi campaign export`). A cell counts the missions whose fault was
 read. A mission is lost if it does not end in success. It is longer if it succeeds and takes more
-than 5 % longer than its own golden flight: the flight of the setting `golden` with the same world,
+than 10 % longer than its own golden flight: the flight of the setting `golden` with the same world,
 world seed, seed, stack and platform. Intervals are Wilson's, 95 %.
 """
 
