@@ -47,7 +47,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--by", nargs="+", required=True, help="columns that name a cell")
     given = parser.parse_args()
-    print(f"| {' | '.join(given.by)} | lost | longer by > 5 % | ends |")
+    print(f"| {' | '.join(given.by)} | lost | longer by > 10 % | ends |")
     print("|---" * (len(given.by) + 3) + "|")
     print("\n".join(lines(flown(given.parts), given.by)))
 
