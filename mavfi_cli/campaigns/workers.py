@@ -44,7 +44,7 @@ class CampaignStopped(MavfiError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class AttemptResult:
     """The judgement of an attempt.
 
     Attributes:
@@ -81,7 +81,7 @@ class AttemptEnd:
     lost: str = "its guard was killed"
     wall_s: float = 0.0
 
-    def judge(self, out: Path, config: Mapping[str, Any], limit_s: float) -> Verdict:
+    def judge(self, out: Path, config: Mapping[str, Any], limit_s: float) -> AttemptResult:
         """Judge the end of the attempt.
 
         Args:
@@ -103,14 +103,14 @@ class AttemptEnd:
             reason = f"no end within {limit_s:g} s of wall time"
             return _cut_off(Outcome.HANG, reason, out, config)
         if self.signal is None and self.exit is None:
-            return Verdict(state=None, result={}, reason=self.lost)
+            return AttemptResult(state=None, result={}, reason=self.lost)
         if self.signal is not None:
             name = signal.Signals(self.signal).name
             if self.signal in _FROM_OUTSIDE:
-                return Verdict(state=None, result={}, reason=f"killed by {name}")
+                return AttemptResult(state=None, result={}, reason=f"killed by {name}")
             return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
         if "traceback" in report:  # our own defect; the ledger shows where
-            return Verdict(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
+            return AttemptResult(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
         return _cut_off(Outcome.CRASH, f"the companion ended with code {self.exit}", out, config)
 
 
@@ -193,7 +193,7 @@ _BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
 _OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
 
 
-def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
+def _recorded(run: Path, config: Mapping[str, Any]) -> AttemptResult:
     try:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -201,32 +201,32 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> Verdict:
     flight = record_of(result)
     outcome, reason = flight.outcome, flight.reason
     if outcome == Outcome.INTERRUPTED.value:
-        return Verdict(state=None, result={}, reason="interrupted")
+        return AttemptResult(state=None, result={}, reason="interrupted")
     crashes = [crash["how"] for node in flight.nodes.values() for crash in node["crashes"]]
     if config.get("link") is None:  # no fault of the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
-            return Verdict(state=None, result={}, reason=reason)
+            return AttemptResult(state=None, result={}, reason=reason)
         if flight.referee is None:
             reason = "the vehicle died before it had saved the truth"
-            return Verdict(state=None, result={}, reason=reason)
+            return AttemptResult(state=None, result={}, reason=reason)
     by_fault = flight.fault.get("stage") == PROCESS  # it kills a node itself
     doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
-    return Verdict(
+    return AttemptResult(
         state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=doubtful
     )
 
 
-def _refused(kind: str, text: str) -> Verdict:
+def _refused(kind: str, text: str) -> AttemptResult:
     if kind in _OF_THE_MACHINE:
         raise CampaignStopped(text)
     if kind == Interrupted.__name__:
-        return Verdict(state=None, result={}, reason="interrupted")
+        return AttemptResult(state=None, result={}, reason="interrupted")
     if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
-        return Verdict(state=None, result={}, reason=text)
-    return Verdict(state=ResultState.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
+        return AttemptResult(state=None, result={}, reason=text)
+    return AttemptResult(state=ResultState.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
 
 
-def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> Verdict:
+def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> AttemptResult:
     """Judge a mission whose process ended before it wrote its record, by what is known of it."""
     runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
     run = runs[0] if len(runs) == 1 else None
@@ -245,7 +245,7 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
         "quality_of_flight": {},
         "fault": fault,
     }
-    return Verdict(state=ResultState.FLOWN, result=result, reason=reason, run=run)
+    return AttemptResult(state=ResultState.FLOWN, result=result, reason=reason, run=run)
 
 
 # On dask.distributed --------------------------------------------------------------------------

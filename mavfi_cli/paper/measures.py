@@ -17,7 +17,6 @@ import numpy as np
 from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS, known, numbers
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
-from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
@@ -68,7 +67,7 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
     if not clusters:
         return NOT_FLOWN
     means = [math.fsum(those) / len(those) for those in clusters.values()]
-    found = interval(means, resamples=RESAMPLES)
+    found = interval(means)
     number = sum(map(len, clusters.values()))
     effect = Interval(value=found.value, low=found.low, high=found.high, count=number)
     return Finding(effect=effect, counts=counts)
@@ -77,12 +76,12 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
 # Flights without a fault --------------------------------------------------------------------------
 
 
-def golden_success(flights: Flights, **where: Any) -> Finding:
+def _golden_success(flights: Flights, **where: Any) -> Finding:
     """Success of the golden flights."""
     return _of_share(share(flights.golden.chosen(**where), value=False), "golden flights succeed")
 
 
-def delta_range(flights: Flights, state: str, why: str) -> Finding:
+def _delta_range(flights: Flights, state: str, why: str) -> Finding:
     """Reduction of a state's range from its values to its deltas, mean over golden flights.
 
     Args:
@@ -105,7 +104,7 @@ def delta_range(flights: Flights, state: str, why: str) -> Finding:
 # Faults without a detector ------------------------------------------------------------------------
 
 
-def success_lost(flights: Flights, **where: Any) -> Finding:
+def _success_lost(flights: Flights, **where: Any) -> Finding:
     """Success of the golden flights minus that of the same missions with a fault."""
     both = flights.struck(**where).chosen(own_lost=(True, False))
     if not len(both):
@@ -115,30 +114,30 @@ def success_lost(flights: Flights, **where: Any) -> Finding:
     return Finding(effect=paired_difference(~lost, ~own, both.seeds), counts=counts)
 
 
-def most_lost_kernel(flights: Flights, **where: Any) -> Finding:
+def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
     """Success lost by faults in the kernel that loses most."""
     hit = flights.struck(**where).by("struck_kernel")
     kernels = {name: those.share().share for (name,), those in hit.items() if name}
     if not kernels:
         return NOT_FLOWN
     most = max(kernels, key=lambda name: kernels[name])
-    found = success_lost(flights, **where, struck_kernel=most)
+    found = _success_lost(flights, **where, struck_kernel=most)
     return Finding(effect=found.effect, counts=f"most in {most}: {found.counts}", why=found.why)
 
 
-def harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
+def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
     shares = [share(flights.struck(**where), "harmed") for where in groups.values()]
     counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(counts)}")
 
 
-def harmful(flights: Flights, **where: Any) -> Finding:
+def _harmful(flights: Flights, **where: Any) -> Finding:
     """Share of harmful faults."""
     return _of_share(share(flights.struck(**where), "harmed"), "harmful")
 
 
-def loss_difference(
+def _loss_difference(
     flights: Flights, first: Where, second: Where, counts: str, **where: Any
 ) -> Finding:
     """Share of lost missions in one group of faults minus that in another.
@@ -150,7 +149,7 @@ def loss_difference(
     return _difference(shares, f"lost: {counts.format(*(each.counts for each in shares))}")
 
 
-def longer(flights: Flights, **where: Any) -> Finding:
+def _longer(flights: Flights, **where: Any) -> Finding:
     """Share of successful flights that take more than LONGER times as long as golden."""
     timed = flights.struck(**where).timed.chosen(lost=False)
     ratios = timed.ratios
@@ -161,7 +160,7 @@ def longer(flights: Flights, **where: Any) -> Finding:
     return _of_share(found, f"over {100 * (LONGER - 1):.0f} % longer; longest {most:+.1f} %")
 
 
-def longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
+def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of longer flights that succeed in the first of two groups minus that in the second."""
     timed = [flights.struck(**where).timed for where in groups.values()]
     shares = [share(those, "harmed") for those in timed]
@@ -169,7 +168,7 @@ def longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     return _difference(shares, f"over 10 % longer: {'; '.join(counts)}")
 
 
-def mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: Any) -> Finding:
+def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: Any) -> Finding:
     """Mean change of a column from the golden flight of the same mission, where both succeed.
 
     Args:
@@ -185,7 +184,7 @@ def mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: A
     return _mean(timed, changes, f"{len(timed):,} flights that succeed with and without the fault")
 
 
-def single_flight(flights: Flights, why: str, **where: Any) -> Finding:
+def _single_flight(flights: Flights, why: str, **where: Any) -> Finding:
     """No effect: one longest flight decides nothing. Names ours."""
     ratios = flights.struck(**where).ratios
     if not len(ratios):
@@ -193,7 +192,7 @@ def single_flight(flights: Flights, why: str, **where: Any) -> Finding:
     return Finding(counts=f"ours: {100 * (ratios.max() - 1):+.1f} % of {len(ratios):,}", why=why)
 
 
-def not_measured(_: Flights, why: str) -> Finding:
+def _not_measured(_: Flights, why: str) -> Finding:
     """No effect, whatever was flown."""
     return Finding(why=why)
 
@@ -216,18 +215,18 @@ def _net(seen: Flights, column: str, what: str) -> Finding:
     return Finding(effect=net_share(before, after, seen.seeds), counts=counts)
 
 
-def recovered(flights: Flights, detector: str, **where: Any) -> Finding:
+def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
     """Share of lost missions that a detector saves, less those that it loses."""
     return _net(flights.protected(detector, **where), "lost", "lost")
 
 
-def shortened(flights: Flights, detector: str, **where: Any) -> Finding:
+def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
     """Share of longer flights that a detector brings back, less those that it lengthens."""
     seen = flights.protected(detector, **where).chosen(bare_lost=False, lost=False)
     return _net(seen, "harmed", f"over {100 * (LONGER - 1):.0f} % longer")
 
 
-def undone_difference(
+def _undone_difference(
     flights: Flights, detector: str, first: str, others: Sequence[str], **where: Any
 ) -> Finding:
     """Net share of harm undone by watching some stages minus that by the best of others.
@@ -253,7 +252,7 @@ def undone_difference(
     return Finding(effect=effect.minus(best), counts=counts)
 
 
-def density_gap(flights: Flights, detector: str, dense: str, free: str, **where: Any) -> Finding:
+def _density_gap(flights: Flights, detector: str, dense: str, free: str, **where: Any) -> Finding:
     """Share of protected missions lost beyond golden in a dense world minus that in a free one."""
     gaps = []
     for world in (dense, free):
@@ -265,7 +264,7 @@ def density_gap(flights: Flights, detector: str, dense: str, free: str, **where:
                              f"{free} {gaps[1].counts}")  # fmt: skip
 
 
-def autoencoder_better(flights: Flights, **where: Any) -> Finding:
+def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
     """Success with the autoencoder minus success with the Gaussian detector, on the same faults."""
     seen = [flights.protected(name, **where) for name in _DETECTORS]
     gad, aad = (
@@ -292,7 +291,7 @@ def autoencoder_better(flights: Flights, **where: Any) -> Finding:
 _NO_COSTS = Finding(why="this export does not hold these times; a new one does")
 
 
-def overhead_of(
+def _overhead_of(
     flights: Flights, detector: str, parts: Collection[str] = COSTS, **where: Any
 ) -> Finding:
     """Mean share of the flight time that parts of detection and recovery take."""
@@ -300,7 +299,7 @@ def overhead_of(
     return _costs(seen, shares, f"{len(seen):,} flights")
 
 
-def gaussian_dearer(flights: Flights, **where: Any) -> Finding:
+def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
     """Overhead of the Gaussian detector minus that of the autoencoder, on the same faults."""
     gad, aad = (_overheads(flights, name, COSTS, where) for name in _DETECTORS)
     other = dict(zip(aad[0].faults, aad[1], strict=True))
@@ -326,7 +325,7 @@ def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> F
 # Isolated kernels ---------------------------------------------------------------------------------
 
 
-def outcome_beside(
+def _outcome_beside(
     kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
 ) -> Finding:
     """The share of an outcome in one kernel minus that in the most extreme of others.
@@ -346,7 +345,7 @@ def outcome_beside(
     return Finding(effect=effect, counts=", ".join(counts))
 
 
-def least_benign(kernels: Kernels, but: str) -> Finding:
+def _least_benign(kernels: Kernels, but: str) -> Finding:
     """The least share of benign runs of all kernels but one."""
     shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
     if not shares:
@@ -355,14 +354,14 @@ def least_benign(kernels: Kernels, but: str) -> Finding:
     return _of_share(shares[least], f"benign in {kernels[least]['title']}, the least")
 
 
-def benign(kernels: Kernels, kernel: str) -> Finding:
+def _benign(kernels: Kernels, kernel: str) -> Finding:
     """The share of benign runs of a kernel."""
     if kernel not in kernels:
         return NOT_FLOWN
     return _of_share(outcome_share(kernels[kernel], "benign"), "benign")
 
 
-def ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
+def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
     """Spearman's correlation of silent corruption in isolation with harm in flight, over kernels.
 
     The kernels are given, not drawn, so the interval is that of the shares: each is drawn from its
@@ -406,12 +405,12 @@ def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray((a * b).sum(axis=0) / np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0)))
 
 
-MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__: measure for measure in (
-    golden_success, delta_range, success_lost, most_lost_kernel, harm_difference, harmful,
-    loss_difference, longer, longer_difference, mean_change, single_flight, not_measured,
-    recovered, shortened,
-    undone_difference, density_gap, autoencoder_better, overhead_of, gaussian_dearer,
-    outcome_beside, least_benign, benign, ranking,
+MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__[1:]: measure for measure in (
+    _golden_success, _delta_range, _success_lost, _most_lost_kernel, _harm_difference, _harmful,
+    _loss_difference, _longer, _longer_difference, _mean_change, _single_flight, _not_measured,
+    _recovered, _shortened,
+    _undone_difference, _density_gap, _autoencoder_better, _overhead_of, _gaussian_dearer,
+    _outcome_beside, _least_benign, _benign, _ranking,
 )}  # fmt: skip
 """By the names that claims.toml uses."""
 OF_KERNELS = frozenset({"outcome_beside", "least_benign", "benign"})
