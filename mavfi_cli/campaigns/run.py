@@ -35,10 +35,10 @@ from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.workers import (
     TASK,
     AttemptEnd,
+    AttemptResult,
     CampaignStopped,
     Cluster,
     LocalWorkers,
-    Verdict,
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, Interrupted
@@ -425,7 +425,7 @@ class _Run:
             config = structure(changes, MissionConfig).with_firmware().golden
             shutil.rmtree(kept_in(self.profiles, config), ignore_errors=True)
 
-    def _settle(self, ended: AttemptEnd, verdict: Verdict, config: Mapping[str, Any]) -> None:
+    def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: Mapping[str, Any]) -> None:
         """Store a mission that is over: first its run folder, then its row."""
         assert verdict.state is not None
         number, result = ended.number, verdict.result

@@ -110,7 +110,8 @@ class AttemptEnd:
                 return AttemptResult(state=None, result={}, reason=f"killed by {name}")
             return _cut_off(Outcome.CRASH, f"the companion was killed by {name}", out, config)
         if "traceback" in report:  # our own defect; the ledger shows where
-            return AttemptResult(state=ResultState.ERROR, result={}, reason=report["traceback"].rstrip())
+            reason = report["traceback"].rstrip()
+            return AttemptResult(state=ResultState.ERROR, result={}, reason=reason)
         return _cut_off(Outcome.CRASH, f"the companion ended with code {self.exit}", out, config)
 
 
@@ -223,7 +224,8 @@ def _refused(kind: str, text: str) -> AttemptResult:
         return AttemptResult(state=None, result={}, reason="interrupted")
     if kind in _BY_CHANCE and text.endswith(_OUTSIDE_WORDS):
         return AttemptResult(state=None, result={}, reason=text)
-    return AttemptResult(state=ResultState.ERROR, result={}, reason=text, doubtful=kind in _BY_CHANCE)
+    doubtful = kind in _BY_CHANCE
+    return AttemptResult(state=ResultState.ERROR, result={}, reason=text, doubtful=doubtful)
 
 
 def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> AttemptResult:
