@@ -6,10 +6,11 @@ import json
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.pairs import LONGER, Flights
+from mavfi_cli.analysis.pairs import LONGER, Balance, Fate, Flights
 from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.paper.beyond import (
@@ -20,14 +21,15 @@ from mavfi_cli.paper.beyond import (
     kernel_flows,
     state_map,
 )
-from mavfi_cli.paper.claims import CLAIMS, ISOLATED
+from mavfi_cli.paper.claims import ISOLATED, JudgedClaim, judged
 from mavfi_cli.paper.figures import OVER_GOLDEN, draw, panel
-from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
+from mavfi_cli.paper.items import BY_NAME, ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
 from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence
 from mavfi_cli.paper.status import of_kernels, of_model
+from mavfi_cli.paper.verdicts import Verdict
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, draw_strips
-from mavfi_cli.stats.paired import ClaimVerdict, excess_over_mean
+from mavfi_cli.stats.paired import excess_over_mean
 from mavfi_cli.stats.shares import Share, wilson
 
 if TYPE_CHECKING:
@@ -50,7 +52,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
     kernels = evidence.isolated
     sdc = {name: each["outcomes"]["sdc"] for name, each in kernels.items()}
     silent = {name: (each["count"], each["of"]) for name, each in sdc.items()}
-    claims = [claim.judged(flights, kernels) for claim in CLAIMS]
+    claims = judged(flights, kernels)
     maps = {stack: state_map(as_paper[stack]) for stack in STACKS}
     return {
         "version": __version__,
@@ -59,14 +61,20 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
         "summary": _summary(flights, claims),
         "problems": evidence.problems,
         "claims": claims,
-        "verdicts": {where: _counted(claims, where) for where in (*STACKS, ISOLATED)},
+        "verdicts": {where: _counted(claims, where) for where in _PLACES},
         "worst": [row for stack in STACKS for row in _worst_flights(stack, flights[stack])],
+        "balances": [row for stack in STACKS for row in _balances(stack, flights[stack])],
         "spreads": {stack: _spread(flights[stack]) for stack in STACKS},
         "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
         "fates": FATES,
         "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
         "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
-        "item_titles": {item.name: f"{item.paper}: {item.title}" for item in ITEMS},
+        "item_titles": {
+            name: f"{printed_name(name)}: {BY_NAME[name].title}"
+            if name in BY_NAME
+            else printed_name(name)
+            for name in dict.fromkeys(each.claim.item for each in claims)
+        },
         "items": [*_shown_items(evidence, flown)],
         "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
         "detectors": ("", *DETECTOR_TITLES),
@@ -86,25 +94,29 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]
 # Claims -------------------------------------------------------------------------------------------
 
 
-def _counted(claims: Sequence[Mapping[str, Any]], where: str) -> dict[ClaimVerdict, int]:
-    found = Counter(each["cells"][where]["verdict"] for each in claims if where in each["cells"])
-    return {verdict: found[verdict] for verdict in ClaimVerdict}
+def _counted(claims: Sequence[JudgedClaim], where: str) -> dict[Verdict, int]:
+    counts = Counter(claim.verdict(where) for claim in claims)
+    return {verdict: counts[verdict] for verdict in Verdict}
 
 
 # Five sentences -----------------------------------------------------------------------------------
 
 
 def _extent(
-    flights: Mapping[str, Flights], kernels: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]
+    flights: Mapping[str, Flights], kernels: Mapping[str, Any], claims: Sequence[JudgedClaim]
 ) -> str:
     """What the page judges, and by how much."""
     missions = sum(len(those) for those in flights.values())
     runs = sum(each["runs"] for each in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
-    return f"{len(claims)} claims are judged by {missions:,} missions{attacked}."
+    decided = sum(
+        any(claim.verdict(where) not in (None, Verdict.NOT_DECIDABLE) for where in _PLACES)
+        for claim in claims
+    )
+    return f"{decided} of {len(claims)} claims are judged by {missions:,} missions{attacked}."
 
 
-def _summary(flights: Mapping[str, Flights], claims: Sequence[Mapping[str, Any]]) -> list[str]:
+def _summary(flights: Mapping[str, Flights], claims: Sequence[JudgedClaim]) -> list[str]:
     return [
         _verdict_sentence(claims),
         _cost_sentence(flights),
@@ -114,9 +126,9 @@ def _summary(flights: Mapping[str, Flights], claims: Sequence[Mapping[str, Any]]
     ]
 
 
-def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
+def _verdict_sentence(claims: Sequence[JudgedClaim]) -> str:
     parts = []
-    for name in (*STACKS, ISOLATED):
+    for name in _PLACES:
         found = _counted(claims, name)
         known = sum(found[each] for each, _ in _VERDICTS)
         if known:
@@ -129,10 +141,11 @@ def _verdict_sentence(claims: Sequence[Mapping[str, Any]]) -> str:
     return _sentence(parts)
 
 
+_PLACES = (*STACKS, ISOLATED)
 _VERDICTS = (
-    (ClaimVerdict.REPRODUCED, "reproduced"),
-    (ClaimVerdict.NOT_REPRODUCED, "not"),
-    (ClaimVerdict.OPEN, "not distinguishable at this n"),
+    (Verdict.REPRODUCED, "reproduced"),
+    (Verdict.CONTRADICTED, "contradicted"),
+    (Verdict.UNDECIDED, "undecided"),
 )
 
 
@@ -232,6 +245,42 @@ def _worst_flights(stack: str, flights: Flights) -> Iterator[dict[str, Any]]:
             "unpaired": longest,
             "golden": longest_golden,
         }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorBalance:
+    """What a detector undoes and what it causes on the same faults.
+
+    Attributes:
+        level: `source` or `instruction`.
+        fate: what the faults do to their nodes.
+        harmed, lost: of harmed and of lost missions.
+    """
+
+    stack: str
+    level: str
+    computer: str
+    detector: str
+    fate: Fate
+    harmed: Balance
+    lost: Balance
+
+
+def _balances(stack: str, flights: Flights) -> Iterator[DetectorBalance]:
+    """A row for each level, computer, detector and fate of which pairs were flown."""
+    watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
+    for level, computer, detector in sorted(watched.by("level", "platform", "detector"), key=str):
+        for fate in Fate:
+            where = {"level": level, "platform": computer}
+            harmed, lost = (
+                flights.of_fate(fate).balance(detector, column=column, **where)
+                for column in ("harmed", "lost")
+            )
+            if harmed.pairs:
+                yield DetectorBalance(
+                    stack=stack, level=level, computer=computer, detector=detector, fate=fate,
+                    harmed=harmed, lost=lost,
+                )  # fmt: skip
 
 
 def _spread(flights: Flights) -> dict[str, Any] | None:

@@ -27,7 +27,7 @@ _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys
-_ROMAN = ("", "I", "II", "III", "IV", "V")
+_ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
 
 
 class Source(Enum):
@@ -82,9 +82,9 @@ class Item:
 
 
 def printed_name(name: str) -> str:
-    """The paper's name of a figure or table, such as `Fig. 6` of `fig6`."""
-    table = name.removeprefix("table")
-    return f"Fig. {name.removeprefix('fig')}" if table == name else f"Table {_ROMAN[int(table)]}"
+    """The paper's name of a figure, table or section, such as `Fig. 6` of `fig6`."""
+    kind, number = name.rstrip("0123456789"), int(name.lstrip("abcdefghijklmnopqrstuvwxyz"))
+    return f"Fig. {number}" if kind == "fig" else f"{kind.capitalize()} {_ROMAN[number]}"
 
 
 def printed(item: str, *keys: object) -> Printed:

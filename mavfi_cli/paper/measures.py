@@ -17,6 +17,7 @@ import numpy as np
 from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS, known, numbers
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
+from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
@@ -67,7 +68,7 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
     if not clusters:
         return NOT_FLOWN
     means = [math.fsum(those) / len(those) for those in clusters.values()]
-    found = interval(means)
+    found = interval(means, resamples=RESAMPLES)
     number = sum(map(len, clusters.values()))
     effect = Interval(value=found.value, low=found.low, high=found.high, count=number)
     return Finding(effect=effect, counts=counts)
@@ -408,9 +409,8 @@ def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
 MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__[1:]: measure for measure in (
     _golden_success, _delta_range, _success_lost, _most_lost_kernel, _harm_difference, _harmful,
     _loss_difference, _longer, _longer_difference, _mean_change, _single_flight, _not_measured,
-    _recovered, _shortened,
-    _undone_difference, _density_gap, _autoencoder_better, _overhead_of, _gaussian_dearer,
-    _outcome_beside, _least_benign, _benign, _ranking,
+    _recovered, _shortened, _undone_difference, _density_gap, _autoencoder_better, _overhead_of,
+    _gaussian_dearer, _outcome_beside, _least_benign, _benign, _ranking,
 )}  # fmt: skip
 """By the names that claims.toml uses."""
 OF_KERNELS = frozenset({"outcome_beside", "least_benign", "benign"})

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.columns import WIDTH, blocks, csv_text
 from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Printed = float | str | None  # a number of the paper, its words for it, or nothing
+_RESAMPLES = 1999  # of the bootstrap interval of a cell
 DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
 
 
@@ -53,7 +53,7 @@ class PaperCell:
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
         """A mean with its bootstrap interval."""
-        return cls(**asdict(interval(values, resamples=RESAMPLES)), paper=paper)
+        return cls(**asdict(interval(values, resamples=_RESAMPLES)), paper=paper)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mavfi_cli.stats.paired import ClaimVerdict
+from mavfi_cli.paper.verdicts import Verdict
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -27,7 +27,7 @@ def test_a_script_gets_the_verdicts(command_line, tmp_path):
     assert (left, err, told["file"], told["missions"]) == (0, "", str(page), 40)
     assert told["bytes"] == page.stat().st_size
     assert set(told["verdicts"]) == {"mavbench", "hardened", "isolated kernels"}
-    known = {verdict.value for verdict in ClaimVerdict}
+    known = {verdict.value for verdict in Verdict}
     assert all(set(counts) == known for counts in told["verdicts"].values())
     assert sum(told["verdicts"]["mavbench"].values()) > 0
 

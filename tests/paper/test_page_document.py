@@ -6,10 +6,10 @@ import pytest
 from flown import row, table
 
 from mavfi_cli.analysis.flights import COSTS
-from mavfi_cli.analysis.pairs import Flights
+from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.sources import CampaignSource, Evidence
-from mavfi_cli.stats.paired import ClaimVerdict
+from mavfi_cli.paper.verdicts import Verdict
 
 
 def evidence(rows, name="mine", problems=()):
@@ -33,11 +33,17 @@ def told():
     return document(evidence(rows, problems=["something is missing."]), 2.0)
 
 
+def effect_of(judged, stack="mavbench"):
+    """The effect of all faults; None without one."""
+    by_fate = judged.judgements.get(stack, {})
+    return by_fate[Fate.ALL].effect if by_fate else None
+
+
 def test_five_sentences_say_what_was_counted(told):
-    assert told["extent"] == "43 claims are judged by 30 missions."
+    assert told["extent"] == "4 of 69 claims are judged by 30 missions."
     verdicts, cost, saved, saved_of_states, crashes = told["summary"]
-    told_of = [c["name"] for c in told["claims"] if c["cells"].get("mavbench", {}).get("effect")]
-    assert told_of == ["table4-dense", "table4-aad", "fig12-dense", "fig13-planning"]
+    judged = {each.claim.name for each in told["claims"] if effect_of(each)}
+    assert judged == {"table4-golden-dense", "table4-dense", "fig12-dense", "fig13-planning"}
     assert verdicts.startswith("Of 4 claims flown on mavbench, ")
     assert cost == (
         "On mavbench, a bit flip in an instruction loses 20 % (2 of 10; 95 % interval 6 to 51 %) "
@@ -67,7 +73,7 @@ def test_missions_unlike_the_papers_judge_no_claim():
     first = {"seed": 1, "fault": {"at": "invocation=1"}, "outcome": "timeout", **where}
     rows = [row(seed=1), row("planning", seed=1), row("waypoint_x", **first)]
     told = document(evidence(rows))
-    assert told["extent"] == "43 claims are judged by 2 missions."
+    assert told["extent"] == "1 of 69 claims are judged by 2 missions."
     assert [each["where"] for each in told["hourly"]["mavbench"]] == ["state: planning, sparse"]
     assert [each["lost"] for each in told["map_rows"]] == [1]
 
@@ -90,6 +96,17 @@ def test_the_longest_flight_is_paired_and_unpaired():
     assert (worst["longer"], worst["flights"]) == (1.0, 2)
 
 
+def test_what_a_detector_undoes_and_causes_stands_by_level_and_by_fate(told):
+    rows = {row.fate: row for row in told["balances"]}
+    assert {(row.level, row.computer, row.detector) for row in rows.values()} == {
+        ("instruction", "x86", "aad")
+    }
+    assert {fate: (row.lost.before, row.lost.undone) for fate, row in rows.items()} == {
+        Fate.ALL: (2, 1), Fate.SILENT: (0, 0), Fate.DEAD: (2, 1),
+    }  # fmt: skip
+    assert [row.lost.caused for row in rows.values()] == [0, 0, 0]
+
+
 def test_what_detectors_save_of_states_has_a_sentence_of_its_own():
     rows = [row(seed=1), row("planning", seed=1, outcome="timeout")]
     rows += [row("planning", seed=1, detector="gad")]
@@ -100,7 +117,7 @@ def test_what_detectors_save_of_states_has_a_sentence_of_its_own():
 
 
 def test_nothing_flown_is_said_in_sentences_too():
-    found = document(evidence([row()]))
+    found = document(evidence([row(config={"world": "nowhere"})]))
     assert found["summary"] == [
         "None of the claims has been flown yet.",
         "No flight with a fault has a golden flight beside it, so the cost is not known.",
@@ -110,24 +127,23 @@ def test_nothing_flown_is_said_in_sentences_too():
     ]
 
 
-def test_every_claim_has_a_cell_for_each_stack(told):
+def test_every_claim_is_judged_on_each_stack(told):
     assert told["problems"] == ["something is missing."]
-    for claim in told["claims"]:
-        stacks = {"isolated kernels"} if claim["isolated"] else {"mavbench", "hardened"}
-        assert claim["cells"].keys() == stacks
-    dense = next(each for each in told["claims"] if each["name"] == "table4-dense")
-    assert dense["cells"]["hardened"]["verdict"] is ClaimVerdict.NOT_FLOWN
-    model = next(each for each in told["claims"] if each["item"] == "fig15")
-    assert model["cells"]["mavbench"]["verdict"] is ClaimVerdict.NOT_JUDGED
+    for each in told["claims"]:
+        stacks = {"isolated kernels"} if each.claim.isolated else {"mavbench", "hardened"}
+        assert each.judgements.keys() == stacks
+    by_name = {each.claim.name: each for each in told["claims"]}
+    assert by_name["table4-dense"].judgements["hardened"][Fate.ALL].why == "not flown"
+    assert by_name["fig15-tmr"].verdict("mavbench") is Verdict.NOT_DECIDABLE
 
 
 def test_an_effect_without_an_interval_is_no_number():
     """The mean cost of one flight."""
     costs = dict.fromkeys(COSTS, 0.01)
     told = document(evidence([row("planning", instruction=True, detector="gad", **costs)]))
-    (gad,) = (each for each in told["claims"] if each["name"] == "table5-gad")
-    assert gad["cells"]["mavbench"]["effect"] is None
-    assert gad["cells"]["mavbench"]["verdict"] is ClaimVerdict.NOT_JUDGED
+    (gad,) = (each for each in told["claims"] if each.claim.name == "table5-gad")
+    assert effect_of(gad) is None
+    assert gad.verdict("mavbench") is Verdict.NOT_DECIDABLE
 
 
 def test_failures_an_hour_are_at_the_rate(told):
