@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -16,16 +15,12 @@ from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.shares import Interval, rate
-from mavfi_cli.vpm.model import (
-    REFERENCE,
-    SCHEMES,
-)
+from mavfi_cli.stats.shares import Interval, Share, rate
+from mavfi_cli.vpm.model import REFERENCE, SCHEMES, Performance
+from mavfi_cli.vpm.report import ModelReport, VehicleReport
 
 BASE = "none"  # reference of ratios: one board without protection
-MODEL = {"velocity": "velocity_mps", "flight_time": "flight_time_s", "energy": "energy_j"}
 PLACE = ("world", "seed")  # columns that identify a mission in all schemes
-_BY_PLACE = [(name, "ascending") for name in PLACE]
 Key = tuple[str, str]  # vehicle and scheme
 # Parts of the model that the simulation omits; printed with every report of flights.
 NOT_SCALED = (
@@ -58,173 +53,265 @@ class FlightSetup:
     boards_w: float
     cut: tuple[str, ...] = ()
 
-    def measured(self, name: str, flights: pa.Table) -> FloatArray:
-        """A quantity of MODEL for each flight, (n,); NaN if a flight has none.
+    def energy_j(self, flights: pa.Table) -> FloatArray:
+        """Electrical energy of rotors and boards for each flight, (n,); NaN if it has none.
 
-        Electrical energy of rotors and boards is shaft energy times the model's hover power over
-        the simulated vehicle's, which is the same for any number of boards, plus the boards' power
-        times the flight time.
+        Shaft energy times the model's hover power over the simulated vehicle's, which is the same
+        for any number of boards, plus the boards' power times the flight time.
         """
-        if name == "velocity":
-            return numbers(flights, "mean_speed_mps")
-        time_s = numbers(flights, "flight_time_s")
-        if name == "flight_time":
-            return time_s
-        shaft_j, hover_w = (numbers(flights, n) for n in ("energy_propeller_j", "hover_shaft_w"))
+        shaft_j, hover_w, time_s = (
+            numbers(flights, name)
+            for name in ("energy_propeller_j", "hover_shaft_w", "flight_time_s")
+        )
         return np.asarray(shaft_j * self.rotors_w / hover_w + self.boards_w * time_s)
 
 
-# Beside the model ------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelAndFlights:
+    """A number of the model and of its flights, with the difference over the model's."""
+
+    model: float
+    flights: Interval
+    difference_percent: float
+
+    @classmethod
+    def of(cls, model: float, flights: Interval) -> ModelAndFlights:
+        """Compare two numbers."""
+        difference = 100.0 * (flights.value / model - 1.0)
+        return cls(model=model, flights=flights, difference_percent=difference)
 
 
-def _arm(table: pa.Table, key: Key) -> pa.Table:
-    """The flights of a vehicle with a scheme."""
-    return chosen(table, label_group=key[0], label_arm=key[1])
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownNumbers:
+    """Numbers of a scheme's successful flights, and the model's for the same missions.
+
+    Attributes:
+        outcomes: number of flights by outcome, the most frequent first.
+        errors: reasons of missions that could not begin.
+        path_ratio: distance over the straight distance.
+        shaft_energy_j, hover_shaft_w, replans, alarms: means.
+    """
+
+    v_max_mps: float
+    a_max_mps2: float
+    braking_velocity_mps: float
+    cut: tuple[str, ...]
+    errors: tuple[str, ...]
+    success: Share
+    outcomes: dict[str, int]
+    velocity_mps: ModelAndFlights
+    top_velocity_mps: ModelAndFlights
+    flight_time_s: ModelAndFlights
+    path_ratio: ModelAndFlights
+    energy_j: ModelAndFlights
+    response_s: ModelAndFlights
+    shaft_energy_j: float
+    hover_shaft_w: float
+    replans: float
+    alarms: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownRatios:
+    """Geometric means over the missions in which both schemes succeeded."""
+
+    pairs: int
+    velocity_ratio: ModelAndFlights
+    flight_time_ratio: ModelAndFlights
+    energy_ratio: ModelAndFlights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownScheme:
+    """A scheme in flight.
+
+    Attributes:
+        problem: why it was not flown; then it has no numbers.
+        over_none, over_aad: None if the other scheme was not flown.
+    """
+
+    scheme: str
+    title: str
+    boards: int
+    overhead_percent: float
+    mass_kg: float
+    problem: str | None = None
+    flown: FlownNumbers | None = None
+    over_none: FlownRatios | None = None
+    over_aad: FlownRatios | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownVehicle:
+    """All schemes of a vehicle in flight."""
+
+    vehicle: str
+    board: str
+    schemes: tuple[FlownScheme, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredOverhead:
+    """The overhead of a detector in these flights, beside the paper's."""
+
+    detector: str
+    flights: int
+    alarms: int
+    measured_percent: float
+    checks_percent: float
+    checks_of_host_kernels_percent: float
+    paper_percent: float
+
+    @classmethod
+    def of(cls, overhead: ComputeOverhead) -> MeasuredOverhead:
+        """The same overhead, in per cent."""
+        return cls(
+            detector=overhead.detector,
+            flights=overhead.flights,
+            alarms=overhead.alarms,
+            measured_percent=100.0 * overhead.share,
+            checks_percent=100.0 * overhead.checks_share,
+            checks_of_host_kernels_percent=100.0 * overhead.checks_host_share,
+            paper_percent=100.0 * SCHEMES[overhead.detector].overhead,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightsReport:
+    """The flights of all vehicles and schemes.
+
+    Attributes:
+        detectors: origin of the detectors' models.
+    """
+
+    worlds: tuple[str, ...]
+    missions_each: int
+    first_seed: int
+    stack: str
+    detectors: str
+    ratios_over: str = BASE
+    paper_ratios_over: str = REFERENCE
+    not_scaled: tuple[str, ...] = NOT_SCALED
+    overheads: tuple[MeasuredOverhead, ...]
+    vehicles: tuple[FlownVehicle, ...]
 
 
 def side_by_side(
-    told: Mapping[str, Any],
-    plans: Mapping[Key, FlightSetup | str],
-    flights: pa.Table,
-    overheads: Mapping[str, ComputeOverhead],
-) -> dict[str, Any]:
-    """Unscaled properties, overheads, and one flat row per vehicle and scheme.
+    model: ModelReport, setups: Mapping[Key, FlightSetup | str], flights: pa.Table
+) -> tuple[FlownVehicle, ...]:
+    """Compare the flights of each vehicle and scheme with the model.
 
     Args:
-        told: the model's report, with the overheads of the plans.
-        plans: of each vehicle and scheme, or the reason why they cannot be flown.
-        flights: of the missions of `RedundancyPlan.list_of`, as in `analysis.flights`.
-        overheads: overheads measured in these flights, by detector.
+        model: the model's report, with the overheads with which the schemes were flown.
+        setups: of each vehicle and scheme, or the reason why they cannot be flown.
+        flights: as in `analysis.flights`, with the labels `group` for the vehicle and `arm` for the
+            scheme.
     """
-    return {
-        "ratios_over": BASE,
-        "paper_ratios_over": REFERENCE,
-        "not_scaled": list(NOT_SCALED),
-        "overheads": [
-            {
-                "detector": each.detector,
-                "flights": each.flights,
-                "alarms": each.alarms,
-                "measured_percent": 100.0 * each.share,
-                "checks_percent": 100.0 * each.checks_share,
-                "checks_of_host_kernels_percent": 100.0 * each.checks_host_share,
-                "paper_percent": 100.0 * SCHEMES[each.detector].overhead,
-            }
-            for each in overheads.values()
-        ],
-        "vehicles": [
-            {
-                "vehicle": one["vehicle"],
-                "board": one["board"],
-                "schemes": [
-                    _scheme(row, plans[one["vehicle"], row["scheme"]], flights, one["vehicle"])
-                    | _over(one, row, plans, flights)
-                    for row in one["schemes"]
-                ],
-            }
-            for one in told["vehicles"]
-        ],
-    }
+    return tuple(
+        FlownVehicle(
+            vehicle=vehicle.vehicle,
+            board=vehicle.board,
+            schemes=tuple(_schemes(vehicle, setups, flights)),
+        )
+        for vehicle in model.vehicles
+    )
 
 
-def _scheme(
-    row: Mapping[str, Any], plan: FlightSetup | str, flights: pa.Table, vehicle: str
-) -> dict[str, Any]:
-    told: dict[str, Any] = {
-        "scheme": row["scheme"], "title": row["title"], "boards": row["boards"],
-        "overhead_percent": row["overhead_percent"], "mass_kg": row["mass_kg"], "problem": None,
-        "errors": [], "cut": [],
-    }  # fmt: skip
-    if isinstance(plan, str):
-        return {**told, "problem": plan}
-    mine = _arm(flights, (vehicle, row["scheme"]))
-    return {
-        **told,
-        "v_max_mps": plan.v_max_mps,
-        "a_max_mps2": plan.a_max_mps2,
-        "braking_velocity_mps": plan.braking_velocity_mps,
-        "cut": list(plan.cut),
-        "errors": errors(mine, "{reason}"),
-        **_success(flown(mine)),
-        **_numbers(row, plan, flown(mine)),
-    }
+@dataclass(frozen=True, slots=True)
+class _Arm:
+    """A scheme that was flown."""
+
+    performance: Performance
+    setup: FlightSetup
+    flights: pa.Table  # of all its missions
+
+    def numbers(self) -> FlownNumbers:
+        ended, setup, performance = flown(self.flights), self.setup, self.performance
+        won = chosen(ended, succeeded=True)
+        straight_m = numbers(won, "straight_m")
+        # The straight distance at the model's velocity.
+        model_s = _mean(straight_m / performance.velocity_mps).value
+
+        def beside(model: float, values: FloatArray | str) -> ModelAndFlights:
+            values = numbers(won, values) if isinstance(values, str) else values
+            return ModelAndFlights.of(model, _mean(values))
+
+        return FlownNumbers(
+            v_max_mps=setup.v_max_mps,
+            a_max_mps2=setup.a_max_mps2,
+            braking_velocity_mps=setup.braking_velocity_mps,
+            cut=setup.cut,
+            errors=tuple(errors(self.flights, "{reason}")),
+            success=rate(won.num_rows, ended.num_rows),
+            outcomes=dict(Counter(ended["outcome"].to_pylist()).most_common()),
+            velocity_mps=beside(performance.velocity_mps, "mean_speed_mps"),
+            top_velocity_mps=beside(performance.velocity_mps, "max_speed_mps"),
+            flight_time_s=beside(model_s, "flight_time_s"),
+            path_ratio=beside(1.0, numbers(won, "distance_m") / straight_m),
+            energy_j=beside(performance.power_w * model_s, setup.energy_j(won)),
+            response_s=beside(1.0 / performance.throughput_hz, "response_median_s"),
+            shaft_energy_j=_mean(numbers(won, "energy_propeller_j")).value,
+            hover_shaft_w=_mean(numbers(won, "hover_shaft_w")).value,
+            replans=_mean(numbers(won, "replans")).value,
+            alarms=_mean(numbers(won, "alarm_count")).value,
+        )
+
+    def over(self, base: _Arm) -> FlownRatios:
+        """Ratios to another scheme on the same missions."""
+        own, other = paired(flown(self.flights), flown(base.flights), PLACE)
+        both = flags(own, "succeeded") & flags(other, "succeeded")
+        own, other = (
+            table.filter(pa.array(both)).sort_by([(name, "ascending") for name in PLACE])
+            for table in (own, other)
+        )
+
+        def ratio(model: float, before: FloatArray, after: FloatArray) -> ModelAndFlights:
+            flights = changed(range(len(before)), before.tolist(), after.tolist())
+            return ModelAndFlights.of(model, flights)
+
+        mine, theirs = self.performance, base.performance
+        velocity = ratio(
+            mine.velocity_mps / theirs.velocity_mps,
+            *(numbers(table, "mean_speed_mps") for table in (other, own)),
+        )
+        return FlownRatios(
+            pairs=velocity.flights.count,
+            velocity_ratio=velocity,
+            flight_time_ratio=ratio(
+                mine.flight_time_s / theirs.flight_time_s,
+                *(numbers(table, "flight_time_s") for table in (other, own)),
+            ),
+            energy_ratio=ratio(
+                mine.energy_j / theirs.energy_j,
+                base.setup.energy_j(other),
+                self.setup.energy_j(own),
+            ),
+        )
 
 
-def _over(
-    one: Mapping[str, Any],
-    row: Mapping[str, Any],
-    plans: Mapping[Key, FlightSetup | str],
-    flights: pa.Table,
-) -> dict[str, float]:
-    """Ratios to one board without protection and, as in the paper, to detection and recovery."""
-    rows = {each["scheme"]: each for each in one["schemes"]}
-    told: dict[str, float] = {}
-    for over, suffix, names in (
-        (BASE, "", tuple(MODEL)),
-        (REFERENCE, f"_over_{REFERENCE}", ("flight_time",)),
-    ):
-        keys = [(one["vehicle"], name) for name in (over, row["scheme"])]
-        base, own = (plans[key] for key in keys)
-        if isinstance(base, str) or isinstance(own, str):
+def _schemes(
+    vehicle: VehicleReport, setups: Mapping[Key, FlightSetup | str], flights: pa.Table
+) -> Iterator[FlownScheme]:
+    arms = {}
+    for row in vehicle.schemes:
+        setup = setups[vehicle.vehicle, row.scheme]
+        if row.performance is not None and not isinstance(setup, str):
+            mine = chosen(flights, label_group=vehicle.vehicle, label_arm=row.scheme)
+            arms[row.scheme] = _Arm(row.performance, setup, mine)
+    for row in vehicle.schemes:
+        scheme = FlownScheme(
+            scheme=row.scheme, title=row.title, boards=row.boards,
+            overhead_percent=row.overhead_percent, mass_kg=row.mass_kg,
+        )  # fmt: skip
+        arm = arms.get(row.scheme)
+        if arm is None:
+            yield replace(scheme, problem=str(setups[vehicle.vehicle, row.scheme]))
             continue
-        sides = [flown(_arm(flights, key)) for key in keys]
-        pairs = paired(sides[1], sides[0], PLACE)[::-1]
-        both = pa.array(np.logical_and(*(flags(each, "succeeded") for each in pairs)))
-        first, second = (pair.filter(both).sort_by([*_BY_PLACE]) for pair in pairs)
-        for name in names:
-            model = row[MODEL[name]] / rows[over][MODEL[name]]
-            before, after = base.measured(name, first), own.measured(name, second)
-            found = changed(range(len(before)), before.tolist(), after.tolist())
-            told |= _beside(f"{name}{suffix}", "_ratio", model, found)
-            told[f"pairs{suffix}"] = found.count
-    return told
-
-
-def _success(flights: pa.Table) -> dict[str, Any]:
-    success = rate(int(flags(flights, "succeeded").sum()), flights.num_rows)
-    return {
-        "missions": success.total,
-        "outcomes": dict(Counter(flights["outcome"].to_pylist()).most_common()),
-        "success_percent": 100.0 * success.share,
-        "success_low_percent": 100.0 * success.low,
-        "success_high_percent": 100.0 * success.high,
-    }
-
-
-def _numbers(row: Mapping[str, Any], plan: FlightSetup, flights: pa.Table) -> dict[str, Any]:
-    """Absolute numbers of the successful flights, and the model's for the same missions."""
-    won = chosen(flights, succeeded=True)
-    straight_m = numbers(won, "straight_m")
-    # The straight distance at the model's velocity.
-    model_s = _mean(straight_m / row["velocity_mps"]).value
-    energy_j, top = plan.measured("energy", won), _mean(numbers(won, "max_speed_mps"))
-    path = _mean(numbers(won, "distance_m") / straight_m)
-    return {
-        **_beside("velocity", "_mps", row["velocity_mps"], _mean(numbers(won, "mean_speed_mps"))),
-        **_beside("top_velocity", "_mps", row["velocity_mps"], top),
-        **_beside("flight_time", "_s", model_s, _mean(numbers(won, "flight_time_s"))),
-        **_beside("path", "_ratio", 1.0, path),
-        **_beside("energy", "_j", row["power_w"] * model_s, _mean(energy_j)),
-        **_beside("response", "_s", 1.0 / row["throughput_hz"],
-                  _mean(numbers(won, "response_median_s"))),
-        "flight_shaft_energy_j": _mean(numbers(won, "energy_propeller_j")).value,
-        "flight_hover_shaft_w": _mean(numbers(won, "hover_shaft_w")).value,
-        "flight_replans": _mean(numbers(won, "replans")).value,
-        "flight_alarms": _mean(numbers(won, "alarm_count")).value,
-    }  # fmt: skip
+        over = {name: arm.over(arms[name]) for name in (BASE, REFERENCE) if name in arms}
+        yield replace(
+            scheme, flown=arm.numbers(), over_none=over.get(BASE), over_aad=over.get(REFERENCE)
+        )
 
 
 def _mean(values: FloatArray) -> Interval:
     return interval(known(values))
-
-
-def _beside(name: str, unit: str, model: float, flight: Interval) -> dict[str, float]:
-    """The model's number, the flights' number with its interval, and the difference."""
-    of = "_ratio" if unit == "_ratio" else ""
-    return {
-        f"model_{name}{unit}": model,
-        f"flight_{name}{unit}": flight.value,
-        f"flight_{name}_low{unit}": flight.low,
-        f"flight_{name}_high{unit}": flight.high,
-        f"{name}{of}_difference_percent": 100.0 * (flight.value / model - 1.0),
-    }

@@ -6,7 +6,7 @@ import json
 import os
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,7 +22,11 @@ from mavfi_cli.cli.parameters import (
     STACK,
     WORLD,
 )
-from mavfi_cli.core.terminal import echo
+
+if TYPE_CHECKING:
+    from mavfi_cli.analysis.beside_model import FlightsReport
+    from mavfi_cli.vpm.model import ModelVehicle
+    from mavfi_cli.vpm.report import Choices, ModelReport
 
 _FLYING = ("worlds", "stack", "missions", "first_seed", "models", "train", "jobs", "quiet")
 
@@ -95,8 +99,7 @@ def vpm(
     range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
     """
     from mavfi_cli.campaigns.specification import require_named
-    from mavfi_cli.core.files import plain
-    from mavfi_cli.report.model import model_csv, model_lines
+    from mavfi_cli.report.model import model_csv, model_json, model_lines
     from mavfi_cli.vpm.model import ModelVehicle, schemes_with
     from mavfi_cli.vpm.report import report
 
@@ -114,20 +117,20 @@ def vpm(
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
     require_named("vehicle", [vehicle.name for vehicle in chosen])
     choices = _choices(options)
-    platform = choices.platform
-    known = _overheads(options["overheads"], None if platform is None else platform.name)
-    told = report(chosen, choices, schemes_with(known))
+    platform = None if choices.platform is None else choices.platform.name
+    overheads = _overheads(options["overheads"], platform)
+    model, flights = report(chosen, choices, schemes_with(overheads)), None
     if fly:
         out = out or Path("vpm")
-        told = _flown(chosen, known, choices, out, options)
-    files = [] if out is None else _save(told, out)
+        model, flights = _flown(chosen, overheads, choices, out, options)
+    files = [] if out is None else _save(model, flights, out)
     if as_json:
-        echo(json.dumps(plain(told), indent=2, sort_keys=True))
+        click.echo(json.dumps(model_json(model, flights), indent=2, sort_keys=True))
     elif as_csv:
-        echo(model_csv(told["flights"] if fly else told), nl=False)
+        click.echo(model_csv(flights or model), nl=False)
     else:
         written = ["", f"Files  {out}: {', '.join(files)}"] if files else []
-        echo("\n".join([*model_lines(told), *written]))
+        click.echo("\n".join([*model_lines(model, flights), *written]))
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
@@ -140,32 +143,34 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
         click.UsageError: the text is neither DETECTOR=PERCENT nor a path.
         RecordError: the path has no flights with a detector on the platform.
     """
-    found: dict[str, tuple[float, str]] = {}
+    overheads: dict[str, tuple[float, str]] = {}
     for text in texts:
         name, _, number = text.partition("=")
         if os.path.exists(text):  # false also of a text that is too long for a path
             from mavfi_cli.analysis.overhead import recorded_overheads
             from mavfi_cli.vpm.model import DETECTORS
 
-            known = recorded_overheads(Path(text), DETECTORS, platform)
-            found |= {name: (100.0 * each.share, each.told(text)) for name, each in known.items()}
+            measured = recorded_overheads(Path(text), DETECTORS, platform)
+            overheads |= {
+                name: (100.0 * own.share, own.told(text)) for name, own in measured.items()
+            }
             continue
         try:
-            found[name.strip()] = float(number), "--overhead"
+            overheads[name.strip()] = float(number), "--overhead"
         except ValueError:
             raise click.UsageError(
                 f"--overhead {text}: no such file or folder; for a percentage write aad=0.0062"
             ) from None
-    return found
+    return overheads
 
 
 def _flown(
-    vehicles: list[Any],
-    known: dict[str, tuple[float, str]],
-    choices: Any,
+    vehicles: list[ModelVehicle],
+    overheads: dict[str, tuple[float, str]],
+    choices: Choices,
     out: Path,
     options: dict[str, Any],
-) -> dict[str, Any]:
+) -> tuple[ModelReport, FlightsReport]:
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.studies.redundancy import WORLDS, RedundancyPlan, fly_and_report
@@ -176,10 +181,10 @@ def _flown(
         **{name: options[name] for name in same},
     )  # fmt: skip
     with missions_view(quiet=options["quiet"]) as view:
-        return fly_and_report(plan, known, Options(jobs=options["jobs"] or 0), view)
+        return fly_and_report(plan, overheads, Options(jobs=options["jobs"] or 0), view)
 
 
-def _choices(options: dict[str, Any]) -> Any:
+def _choices(options: dict[str, Any]) -> Choices:
     from mavfi_cli.spec.platform import load_platform
     from mavfi_cli.vpm.model import Board
     from mavfi_cli.vpm.report import Choices
@@ -195,22 +200,19 @@ def _choices(options: dict[str, Any]) -> Any:
     )
 
 
-def _save(told: dict[str, Any], out: Path) -> list[str]:
+def _save(model: ModelReport, flights: FlightsReport | None, out: Path) -> list[str]:
     from mavfi_cli.core.files import write_json, write_text, writing
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.model import PICTURES, model_csv
+    from mavfi_cli.report.model import MODEL_PICTURES, draw_flights, model_csv, model_json
 
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "vpm.json", told)
-    write_text(out / "vpm.csv", model_csv(told))
-    names = ["vpm.json", "vpm.csv"]
-    for name, draw in PICTURES.items():
-        if name == "flights.svg":
-            if "flights" not in told:
-                continue
-            write_text(out / "flights.csv", model_csv(told["flights"]))
-            names.append("flights.csv")
-        write_figure(draw(told), out / name)
-        names.append(name)
-    return names
+    write_json(out / "vpm.json", model_json(model, flights))
+    write_text(out / "vpm.csv", model_csv(model))
+    for name, draw in MODEL_PICTURES.items():
+        write_figure(draw(model), out / name)
+    if flights is None:
+        return ["vpm.json", "vpm.csv", *MODEL_PICTURES]
+    write_text(out / "flights.csv", model_csv(flights))
+    write_figure(draw_flights(flights), out / "flights.svg")
+    return ["vpm.json", "vpm.csv", *MODEL_PICTURES, "flights.csv", "flights.svg"]

@@ -133,16 +133,16 @@ def of_model() -> PaperTable:
     """The table of Fig. 15, of the performance model with the paper's overheads."""
     item = BY_NAME["fig15"]
     names = [column.title for column in item.columns]
-    told = report([ModelVehicle.load(each) for each in names], Choices(), schemes_with({}))
+    model = report([ModelVehicle.load(name) for name in names], Choices(), schemes_with({}))
     rows = {}
-    for of_vehicles in zip(*(one["schemes"] for one in told["vehicles"]), strict=True):
-        scheme, ratios = of_vehicles[0]["scheme"], [x["flight_time_ratio"] for x in of_vehicles]
+    for of_vehicles in zip(*(vehicle.schemes for vehicle in model.vehicles), strict=True):
+        scheme = of_vehicles[0].scheme
         cells = (
             PaperCell(
-                value=math.nan if ratio is None else float(ratio),
+                value=math.nan if row.ratios is None else row.ratios.flight_time_ratio,
                 paper=printed("fig15", "time_ratio", scheme, name),
             )
-            for name, ratio in zip(names, ratios, strict=True)
+            for name, row in zip(names, of_vehicles, strict=True)
         )
         rows[scheme] = PaperRow(labels=(scheme,), cells=tuple(cells))
     table = item.table([*rows.values()])

@@ -1,13 +1,24 @@
-"""The performance model and its flights as text, CSV and pictures; every number with its unit."""
+"""The performance model and its flights as text, CSV, JSON and pictures, with units."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from mavfi_cli.analysis.beside_model import (
+    FlightsReport,
+    FlownNumbers,
+    FlownScheme,
+    FlownVehicle,
+    MeasuredOverhead,
+    ModelAndFlights,
+)
+from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.columns import columns, csv_text, formed, wrapped
+from mavfi_cli.report.columns import columns, csv_text, wrapped
 from mavfi_cli.report.drawing import (
     INK,
     NOTE,
@@ -18,226 +29,264 @@ from mavfi_cli.report.drawing import (
     open_frame,
     whisker,
 )
-from mavfi_cli.vpm.report import RATIOS
+from mavfi_cli.vpm.model import Performance
+from mavfi_cli.vpm.report import (
+    CalibratedNumber,
+    ModelReport,
+    Ratios,
+    SchemeResult,
+    Sensitivity,
+    SensitivityPoint,
+    VehicleReport,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-def model_lines(told: Mapping[str, Any]) -> list[str]:
-    """The lines that are printed: the model's, and below them those of its flights, if any."""
-    lines = [
-        f"Model {told['model']}; knee: where velocity is "
-        f"{100 * told['knee_velocity_over_roof_ratio']:g} % of the roof",
-        f"Flights of {told['distance_m']:g} m at the safe velocity and hovering power; ratios "
-        f"are over {told['ratios_over']}",
-    ]
-    lines += [f"Note: {note}" for note in told["notes"]]
-    for one in told["vehicles"]:
-        lines += ["", *_vehicle(one, told["ratios_over"])]
-    return [*lines, *(_flight_lines(told["flights"]) if "flights" in told else [])]
+# Groups of fields, which a scheme that does not fly lacks. Columns of the first have no prefix.
+_GROUPS = ("performance", "ratios", "flown")
+_LACKED = (*_GROUPS, "over_none", "over_aad")
 
 
-def model_csv(told: Mapping[str, Any]) -> str:
+def model_json(model: ModelReport, flights: FlightsReport | None = None) -> Any:
+    """The model, and its flights as `flights` if there are any, as plain values."""
+    return plain(asdict(model) | ({} if flights is None else {"flights": asdict(flights)}))
+
+
+def model_csv(model: ModelReport | FlightsReport) -> str:
     """CSV text of the model or of its flights, one row per vehicle and scheme.
 
     The header names the units.
     """
-    distance = {"distance_m": told["distance_m"]} if "distance_m" in told else {}
+    distance = {"distance_m": model.distance_m} if isinstance(model, ModelReport) else {}
     return csv_text(
-        {"vehicle": one["vehicle"], "board": one["board"], **distance}
-        | {name: "; ".join(cell) if isinstance(cell, list) else cell for name, cell in row.items()
-           if name != "outcomes"}
-        for one in told["vehicles"]
-        for row in one["schemes"]
-    )  # fmt: skip
+        {"vehicle": vehicle.vehicle, "board": vehicle.board, **distance} | dict(_flat(asdict(row)))
+        for vehicle in model.vehicles
+        for row in vehicle.schemes
+    )
 
 
-def _vehicle(one: Mapping[str, Any], over: str) -> Iterator[str]:
-    title = f": {one['description']}" if one["description"] else ""
-    yield f"== {one['vehicle']}{title}; board {one['board']} =="
-    yield from (f"Note: {note}" for note in one["notes"])
-    flying = [row for row in one["schemes"] if row["problem"] is None]
-    yield from formed(
-        flying, ("scheme", "{scheme}"), ("boards", "{boards}"), ("compute", "{compute_kg:.3f} kg"),
-        ("mass", "{mass_kg:.3f} kg"), ("thrust/weight", "{thrust_to_weight:.2f} N/N"),
-        ("acceleration", "{acceleration_mps2:.2f} m/s²"), ("roof", "{roof_mps:.2f} m/s"),
-        ("knee", "{knee_hz:.1f} Hz"),
-    )  # fmt: skip
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Name and value of each cell; the name of a nested one begins with that of its group."""
+    for name, value in values.items():
+        if name == "outcomes" or (value is None and name in _LACKED):
+            continue
+        if isinstance(value, Mapping):
+            yield from _flat(value, prefix if name in _GROUPS else f"{prefix}{name}_")
+        else:
+            yield prefix + name, "; ".join(value) if isinstance(value, tuple) else value
+
+
+# Text: the model ----------------------------------------------------------------------------------
+
+
+def model_lines(model: ModelReport, flights: FlightsReport | None = None) -> list[str]:
+    """The lines that are printed: the model's, and below them those of its flights, if any."""
+    lines = [
+        f"Model {model.model}; knee: where velocity is "
+        f"{100 * model.knee_velocity_over_roof_ratio:g} % of the roof",
+        f"Flights of {model.distance_m:g} m at the safe velocity and hovering power; ratios "
+        f"are over {model.ratios_over}",
+    ]
+    lines += [f"Note: {note}" for note in model.notes]
+    for vehicle in model.vehicles:
+        lines += ["", *_vehicle_lines(vehicle, model.ratios_over)]
+    return [*lines, *(() if flights is None else _flight_lines(flights))]
+
+
+def _flying(vehicle: VehicleReport) -> list[tuple[SchemeResult, Performance, Ratios]]:
+    return [
+        (row, row.performance, row.ratios)
+        for row in vehicle.schemes
+        if row.performance is not None and row.ratios is not None
+    ]
+
+
+def _vehicle_lines(vehicle: VehicleReport, over: str) -> Iterator[str]:
+    title = f": {vehicle.description}" if vehicle.description else ""
+    yield f"== {vehicle.vehicle}{title}; board {vehicle.board} =="
+    yield from (f"Note: {note}" for note in vehicle.notes)
+    flying = _flying(vehicle)
+    yield from columns([
+        ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
+        *([row.scheme, f"{row.boards}", f"{row.compute_kg:.3f} kg", f"{row.mass_kg:.3f} kg",
+           f"{own.thrust_to_weight:.2f} N/N", f"{own.acceleration_mps2:.2f} m/s²",
+           f"{own.roof_mps:.2f} m/s", f"{own.knee_hz:.1f} Hz"] for row, own, _ in flying),
+    ])  # fmt: skip
     yield ""
-    yield from formed(
-        flying, ("scheme", "{scheme}"), ("overhead", "{overhead_percent:.4g} %"),
-        ("throughput", "{throughput_hz:.3f} Hz"), ("velocity", "{velocity_mps:.3f} m/s"),
-        ("bound by", "{bound}"), ("sensor ceiling", "{sensor_ceiling_mps:.2f} m/s"),
-        ("compute ceiling", "{compute_ceiling_mps:.2f} m/s"),
-    )  # fmt: skip
+    yield from columns([
+        ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
+         "compute ceiling"],
+        *([row.scheme, f"{row.overhead_percent:.4g} %", f"{own.throughput_hz:.3f} Hz",
+           f"{own.velocity_mps:.3f} m/s", own.bound, f"{own.sensor_ceiling_mps:.2f} m/s",
+           f"{own.compute_ceiling_mps:.2f} m/s"] for row, own, _ in flying),
+    ])  # fmt: skip
     yield ""
-    heads = ("velocity", "time", "energy", "missions")
-    ratios = ((head, f"x {{{name}:.4f}}") for head, name in zip(heads, RATIOS, strict=True))
-    yield from formed(
-        ({**row, "energy_kj": row["energy_j"] / 1000} for row in flying),
-        (f"over {over}", "{scheme}"), *ratios, ("flight time", "{flight_time_s:.1f} s"),
-        ("power", "{power_w:.1f} W"), ("energy", "{energy_kj:.2f} kJ"),
-        ("a charge", "{missions:.1f} missions"),
-    )  # fmt: skip
-    for row in one["schemes"]:
-        if row["problem"] is not None:
-            yield f"{row['scheme']}: {row['problem']}"
-    yield from _sensitivity(one["sensitivity"])
-    yield from _calibrations(one["calibrations"])
-    yield from _sources(one)
+    yield from columns([
+        [f"over {over}", "velocity", "time", "energy", "missions", "flight time", "power",
+         "energy", "a charge"],
+        *([row.scheme, f"x {ratios.velocity_ratio:.4f}", f"x {ratios.flight_time_ratio:.4f}",
+           f"x {ratios.energy_ratio:.4f}", f"x {ratios.missions_ratio:.4f}",
+           f"{own.flight_time_s:.1f} s", f"{own.power_w:.1f} W", f"{own.energy_j / 1000:.2f} kJ",
+           f"{own.missions:.1f} missions"] for row, own, ratios in flying),
+    ])  # fmt: skip
+    yield from (f"{row.scheme}: {row.problem}" for row in vehicle.schemes if row.problem)
+    yield from _sensitivity_lines(vehicle.sensitivity)
+    yield from _calibration_lines(vehicle.calibrations)
+    yield ""
+    yield from wrapped([
+        ["number", "value", "source"],
+        *([own.parameter, f"{own.value:.5g} {own.unit}", own.source]
+          for own in vehicle.parameters),
+        *([f"scheme {row.scheme}", f"{row.overhead_percent:.4g} %", row.source]
+          for row in vehicle.schemes),
+    ])  # fmt: skip
 
 
-def _sensitivity(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _sensitivity_lines(rows: Sequence[Sensitivity]) -> Iterator[str]:
     yield ""
     yield "Sensitivity: velocity with detection and recovery; flight time with TMR over it"
     for row in rows:
-        slopes = [row["velocity_elasticity_ratio"], row["tmr_time_elasticity_ratio"]]
-        told = ["-" if slope is None else f"{slope:+.3f} %" for slope in slopes]
-        yield (
-            f"  {row['parameter']} {row['value']:.4g} {row['unit']}; 1 % more: velocity {told[0]}, "
-            f"TMR's time ratio {told[1]}"
+        velocity, time = (
+            "-" if slope is None else f"{slope:+.3f} %"
+            for slope in (row.velocity_elasticity_ratio, row.tmr_time_elasticity_ratio)
         )
-        yield from columns(_point(point, row["unit"]) for point in row["points"])
+        yield (
+            f"  {row.parameter} {row.value:.4g} {row.unit}; 1 % more: velocity {velocity}, "
+            f"TMR's time ratio {time}"
+        )
+        yield from columns(_point_cells(point, row.unit) for point in row.points)
 
 
-def _point(point: Mapping[str, Any], unit: str) -> list[str]:
-    velocity, ratio = point["velocity_mps"], point["tmr_flight_time_ratio"]
+def _point_cells(point: SensitivityPoint, unit: str) -> list[str]:
+    velocity, ratio = point.velocity_mps, point.tmr_flight_time_ratio
     return [
-        f"    {point['value']:.4g} {unit}",
+        f"    {point.value:.4g} {unit}",
         "cannot lift it" if velocity is None else f"{velocity:.3f} m/s",
         "TMR cannot be lifted" if ratio is None else f"x {ratio:.4f}",
     ]
 
 
-def _calibrations(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _calibration_lines(rows: Sequence[CalibratedNumber]) -> Iterator[str]:
     if not rows:
         return
     yield ""
     yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
-    yield from formed(
-        ({**row, "board_g": 1000 * row["board_kg"]} for row in rows),
-        ("  board", "  {board}"), ("a copy", "{board_g:.0f} g"),
-        ("calibrated", "{parameter} = {value:.4g} {unit}"), ("TMR", "x {tmr_ratio:.4f}"),
-        ("paper's TMR", "x {published_tmr_ratio:g}"),
-        ("DMR, predicted", "x {predicted_dmr_ratio:.4f}"),
-    )  # fmt: skip
+    yield from columns([
+        ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
+        *([f"  {row.board}", f"{1000 * row.board_kg:.0f} g",
+           f"{row.parameter} = {row.value:.4g} {row.unit}", f"x {row.tmr_ratio:.4f}",
+           f"x {row.published_tmr_ratio:g}", f"x {row.predicted_dmr_ratio:.4f}"] for row in rows),
+    ])  # fmt: skip
 
 
-def _sources(one: Mapping[str, Any]) -> Iterator[str]:
-    yield ""
-    rows = [["number", "value", "source"]]
-    rows += [
-        [row["parameter"], f"{row['value']:.5g} {row['unit']}", row["source"]]
-        for row in one["parameters"]
-    ]
-    rows += [
-        [f"scheme {row['scheme']}", f"{row['overhead_percent']:.4g} %", row["source"]]
-        for row in one["schemes"]
-    ]
-    yield from wrapped(rows)
-
-
-# Beside flights -----------------------------------------------------------------------------------
+# Text: flights beside the model -------------------------------------------------------------------
 
 _MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
-_NUMBERS = (  # heading, name, unit in the key, format, factor
-    ("Mean velocity against the model's safe velocity", "velocity", "_mps", "{:.2f} m/s", 1.0),
-    ("Top velocity against it", "top_velocity", "_mps", "{:.2f} m/s", 1.0),
-    ("Flight time", "flight_time", "_s", "{:.1f} s", 1.0),
-    ("Energy of rotors and boards", "energy", "_j", "{:.2f} kJ", 1.0e-3),
-    ("Response time, median", "response", "_s", "{:.3f} s", 1.0),
+_NUMBERS = (  # heading, field of FlownNumbers, format of a number, unit, factor
+    ("Mean velocity against the model's safe velocity", "velocity_mps", ".2f", "m/s", 1.0),
+    ("Top velocity against it", "top_velocity_mps", ".2f", "m/s", 1.0),
+    ("Flight time", "flight_time_s", ".1f", "s", 1.0),
+    ("Energy of rotors and boards", "energy_j", ".2f", "kJ", 1.0e-3),
+    ("Response time, median", "response_s", ".3f", "s", 1.0),
 )
-_RATIOS = (("velocity", "Velocity"), ("flight_time", "Flight time"), ("energy", "Energy"))
+_RATIOS = (
+    ("velocity", "over_none.velocity_ratio"),
+    ("flight time", "over_none.flight_time_ratio"),
+    ("energy", "over_none.energy_ratio"),
+)
+_HEAD = ["scheme", "model", "flight", "", "flight against model"]
 
 
-def _flight_lines(flights: Mapping[str, Any]) -> list[str]:
+def _flight_lines(flights: FlightsReport) -> list[str]:
     lines = [
         "",
-        f"Flights in {', '.join(flights['worlds'])}: {flights['missions_each']} missions a scheme "
-        f"and world, seeds from {flights['first_seed']}, stack {flights['stack']}",
+        f"Flights in {', '.join(flights.worlds)}: {flights.missions_each} missions a scheme "
+        f"and world, seeds from {flights.first_seed}, stack {flights.stack}",
         "Numbers are of successful flights, (low to high) are 95 % intervals over missions",
-        f"Detectors: {flights['detectors']}",
+        f"Detectors: {flights.detectors}",
     ]
-    for one in flights["vehicles"]:
-        lines += ["", *_flown(one, flights)]
-    lines += ["", *_overheads(flights["overheads"]), "", "What the flights do not scale:"]
-    return [*lines, *wrapped(["", text] for text in flights["not_scaled"])]
+    for vehicle in flights.vehicles:
+        lines += ["", *_flown_lines(vehicle, flights)]
+    lines += ["", *_overhead_lines(flights.overheads), "", "What the flights do not scale:"]
+    return [*lines, *wrapped(["", text] for text in flights.not_scaled)]
 
 
-def _flown(one: Mapping[str, Any], flights: Mapping[str, Any]) -> Iterator[str]:
-    yield f"== {one['vehicle']} flown, board {one['board']} =="
-    rows = [row for row in one["schemes"] if row["problem"] is None]
-    ends = (", ".join(f"{count} {name}" for name, count in row["outcomes"].items()) for row in rows)
-    yield from formed(
-        ({**row, "ends": told} for row, told in zip(rows, ends, strict=True)),
-        ("scheme", "{scheme}"), ("mass", "{mass_kg:.3f} kg"), ("v-max", "{v_max_mps:.3f} m/s"),
-        ("a-max", "{a_max_mps2:.2f} m/s²"), ("safe, braking", "{braking_velocity_mps:.3f} m/s"),
-        ("success", "{success_percent:.0f} % ({success_low_percent:.0f} to "
-                    "{success_high_percent:.0f} %)"),
-        ("ends", "{ends}"),
-    )  # fmt: skip
-    for heading, name, key, form, factor in _NUMBERS:
-        yield from _beside(heading, rows, name, key, form, factor)
+def _flown(vehicle: FlownVehicle) -> list[tuple[FlownScheme, FlownNumbers]]:
+    return [(row, row.flown) for row in vehicle.schemes if row.flown is not None]
+
+
+def _flown_lines(vehicle: FlownVehicle, flights: FlightsReport) -> Iterator[str]:
+    yield f"== {vehicle.vehicle} flown, board {vehicle.board} =="
+    rows = _flown(vehicle)
+    yield from columns([
+        ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
+        *([row.scheme, f"{row.mass_kg:.3f} kg", f"{own.v_max_mps:.3f} m/s",
+           f"{own.a_max_mps2:.2f} m/s²", f"{own.braking_velocity_mps:.3f} m/s",
+           f"{100 * own.success.share:.0f} % ({100 * own.success.low:.0f} to "
+           f"{100 * own.success.high:.0f} %)",
+           ", ".join(f"{count} {name}" for name, count in own.outcomes.items())]
+          for row, own in rows),
+    ])  # fmt: skip
+    for heading, field, shape, unit, factor in _NUMBERS:
+        cells = [
+            [row.scheme, *_number_cells(getattr(own, field), shape, unit, factor)]
+            for row, own in rows
+        ]
+        yield from ["", f"{heading}:", *columns([_HEAD, *cells])]
     yield ""
     yield "Why flights take longer than the model says:"
-    yield from columns([["scheme", "path", "pace", "replans", "alarms"], *(_why(r) for r in rows)])
-    over, paper = flights["ratios_over"], flights["paper_ratios_over"]
-    for name, title, suffix in (
-        *((name, f"{title} over {over}", "") for name, title in _RATIOS),
-        ("flight_time", f"Flight time over {paper}, as the paper's Fig. 15", f"_over_{paper}"),
+    yield from columns([["scheme", "path", "pace", "replans", "alarms"],
+                        *([row.scheme, *_reasons(own)] for row, own in rows)])  # fmt: skip
+    over, paper = flights.ratios_over, flights.paper_ratios_over
+    for heading, field in (
+        *((f"{title.capitalize()} over {over}", field) for title, field in _RATIOS),
+        (f"Flight time over {paper}, as the paper's Fig. 15", "over_aad.flight_time_ratio"),
     ):
-        told = [row for row in rows if f"pairs{suffix}" in row]
-        yield from _beside(title, told, f"{name}{suffix}", "_ratio", "x {:.4f}", pairs=suffix)
-    for row in one["schemes"]:
+        ratio = attrgetter(field)
+        cells = [
+            [row.scheme, *_ratio_cells(ratio(row))]
+            for row, _ in rows
+            if getattr(row, field.partition(".")[0]) is not None
+        ]
+        yield from ["", f"{heading}:", *columns([_HEAD, *cells])]
+    for row in vehicle.schemes:
         yield from _remarks(row)
 
 
-def _beside(
-    heading: str,
-    rows: Sequence[Mapping[str, Any]],
-    name: str,
-    key: str,
-    form: str,
-    factor: float = 1.0,
-    pairs: str | None = None,
-) -> Iterator[str]:
-    """A number of the model beside that of its flights.
-
-    Args:
-        key: unit, as in the names of the row's fields.
-        pairs: suffix of the field that counts the pairs of a ratio; None of what is no ratio.
-    """
-    lines = [["scheme", "model", "flight", "", "flight against model"]]
-    for row in rows:
-        model, flight, low, high = (
-            factor * row[f"{which}{key}"]
-            for which in (f"model_{name}", f"flight_{name}", f"flight_{name}_low",
-                          f"flight_{name}_high")
-        )  # fmt: skip
-        if pairs is None:
-            number, _, unit = form.partition(" ")
-            ends = f"({number.format(low)} to {number.format(high)} {unit})"
-            ends, difference = _known(ends, low, ""), f"{name}_difference_percent"
-        else:
-            ends = _known(f"{form.format(low)} to {form.format(high)}, ", low, "")
-            ends = f"({ends}{row[f'pairs{pairs}']} pairs)"
-            difference = f"{name}_ratio_difference_percent"
-        told = (_known(form.format(each), each) for each in (model, flight))
-        lines.append([row["scheme"], *told, ends, _known(f"{row[difference]:+.1f} %", flight)])
-    yield from ["", f"{heading}:", *columns(lines)]
-
-
-def _why(row: Mapping[str, Any]) -> list[str]:
-    pace = row["model_velocity_mps"] / row["flight_velocity_mps"]
-    alarms = row["flight_alarms"]
+def _number_cells(number: ModelAndFlights, shape: str, unit: str, factor: float) -> list[str]:
+    model, flight, low, high = (
+        factor * value
+        for value in (number.model, number.flights.value, number.flights.low, number.flights.high)
+    )
     return [
-        row["scheme"],
-        _known(f"x {row['flight_path_ratio']:.3f} longer", row["flight_path_ratio"]),
+        _known(f"{model:{shape}} {unit}", model),
+        _known(f"{flight:{shape}} {unit}", flight),
+        _known(f"({low:{shape}} to {high:{shape}} {unit})", low, ""),
+        _known(f"{number.difference_percent:+.1f} %", flight),
+    ]
+
+
+def _ratio_cells(ratio: ModelAndFlights) -> list[str]:
+    flights = ratio.flights
+    ends = _known(f"x {flights.low:.4f} to x {flights.high:.4f}, ", flights.low, "")
+    return [
+        _known(f"x {ratio.model:.4f}", ratio.model),
+        _known(f"x {flights.value:.4f}", flights.value),
+        f"({ends}{flights.count} pairs)",
+        _known(f"{ratio.difference_percent:+.1f} %", flights.value),
+    ]
+
+
+def _reasons(own: FlownNumbers) -> list[str]:
+    path = own.path_ratio.flights.value
+    pace = own.velocity_mps.model / own.velocity_mps.flights.value
+    return [
+        _known(f"x {path:.3f} longer", path),
         _known(f"x {pace:.3f} slower", pace),
-        _known(f"{row['flight_replans']:.1f} a flight", row["flight_replans"]),
-        "no detector" if alarms != alarms else f"{alarms:.1f} a flight",
+        _known(f"{own.replans:.1f} a flight", own.replans),
+        _known(f"{own.alarms:.1f} a flight", own.alarms, "no detector"),
     ]
 
 
@@ -246,106 +295,102 @@ def _known(text: str, value: float, otherwise: str = "-") -> str:
     return otherwise if math.isnan(value) else text
 
 
-def _remarks(row: Mapping[str, Any]) -> Iterator[str]:
-    if row["problem"] is not None:
-        yield f"{row['scheme']}: not flown: {row['problem']}"
+def _remarks(row: FlownScheme) -> Iterator[str]:
+    own = row.flown
+    if own is None:
+        yield f"{row.scheme}: not flown: {row.problem}"
         return
-    if row["overhead_percent"]:
+    if row.overhead_percent:
         yield (
-            f"{row['scheme']}: an overhead of {row['overhead_percent']:.4g} % in its flights and "
+            f"{row.scheme}: an overhead of {row.overhead_percent:.4g} % in its flights and "
             "in the model beside them"
         )
-    if row["flight_alarms"] >= _MANY_ALARMS:
+    if own.alarms >= _MANY_ALARMS:
         yield (
-            f"{row['scheme']}: {row['flight_alarms']:.0f} alarms in a flight without a fault: its "
+            f"{row.scheme}: {own.alarms:.0f} alarms in a flight without a fault: its "
             "model was fitted to other flights; --train fits one to these"
         )
-    if row["cut"]:
-        yield f"{row['scheme']}: flown with {', '.join(row['cut'])}"
-    if row["errors"]:
-        many = len(row["errors"])
-        yield f"{row['scheme']}: {many} could not begin, the first: {row['errors'][0]}"
+    if own.cut:
+        yield f"{row.scheme}: flown with {', '.join(own.cut)}"
+    if own.errors:
+        yield f"{row.scheme}: {len(own.errors)} could not begin, the first: {own.errors[0]}"
 
 
-def _overheads(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _overhead_lines(rows: Sequence[MeasuredOverhead]) -> Iterator[str]:
     if not rows:
         yield "Overhead of detection and recovery: no flight with a detector"
         return
     yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
-    yield from formed(
-        rows, ("detector", "{detector}"), ("measured", "{measured_percent:.4g} %"),
-        ("of it checks", "{checks_percent:.4g} %"), ("paper", "{paper_percent:.4g} %"),
-        ("recomputations", "{alarms} in {flights} flights"),
-        ("checks of this host's kernel time", "{checks_of_host_kernels_percent:.4g} %"),
-    )  # fmt: skip
+    yield from columns([
+        ["detector", "measured", "of it checks", "paper", "recomputations",
+         "checks of this host's kernel time"],
+        *([row.detector, f"{row.measured_percent:.4g} %", f"{row.checks_percent:.4g} %",
+           f"{row.paper_percent:.4g} %", f"{row.alarms} in {row.flights} flights",
+           f"{row.checks_of_host_kernels_percent:.4g} %"] for row in rows),
+    ])  # fmt: skip
     yield f"({HOST_CHECKS})"
 
-
-# Pictures -----------------------------------------------------------------------------------------
 
 # Roofline: safe velocity against action throughput -----------------------------------------------
 
 _OF_COPIES = {1: "none", 2: "dmr", 3: "tmr"}
 _MOST_HZ = 1000.0
 _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
+_DASHED: Mapping[str, Any] = {"linestyle": (0, (5, 3))}
 
 
-def _draw_roofline(report: Mapping[str, Any]) -> Figure:
-    """Draw a figure with throughput in Hz and velocity in m/s on logarithmic axes."""
-    vehicles = report["vehicles"]
+def _draw_roofline(model: ModelReport) -> Figure:
+    """Draw throughput in Hz and velocity in m/s on logarithmic axes, a panel per vehicle."""
+    vehicles = model.vehicles
     figure = new_figure(max(6.4, 4.9 * len(vehicles)), 4.9)
     panels = figure.subplots(1, len(vehicles), squeeze=False, sharey=True)[0]
-    for axes, one in zip(panels, vehicles, strict=True):
-        _roofline_panel(axes, one, report["knee_velocity_over_roof_ratio"])
+    for axes, vehicle in zip(panels, vehicles, strict=True):
+        _roofline_panel(axes, vehicle, model.knee_velocity_over_roof_ratio)
     panels[0].set_ylabel("safe velocity, m/s")
-    panels[0].set_ylim(top=1.25 * max(row["roof_mps"] or 0.0 for one in vehicles
-                                      for row in one["schemes"]))  # fmt: skip
+    panels[0].set_ylim(
+        top=1.25 * max(own.roof_mps for vehicle in vehicles for _, own, _ in _flying(vehicle))
+    )
     handles: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     legend_above(figure, handles.values(), handles)
-    share = 100.0 * report["knee_velocity_over_roof_ratio"]
+    share = 100.0 * model.knee_velocity_over_roof_ratio
     figure.supxlabel(
-        f"action throughput, Hz\n{report['model']}; knee: {share:g} % of the roof", fontsize=9
+        f"action throughput, Hz\n{model.model}; knee: {share:g} % of the roof", fontsize=9
     )
     return figure
 
 
-def _roofline_panel(axes: Axes, one: Mapping[str, Any], share: float) -> None:
-    flying = {row["boards"]: row for row in reversed(one["schemes"]) if row["problem"] is None}
-    for copies in sorted(flying):
-        row, colour = flying[copies], SCHEMES[_OF_COPIES[copies]]
-        curve = one["curves"]["velocity_mps"][str(copies)]
+def _roofline_panel(axes: Axes, vehicle: VehicleReport, share: float) -> None:
+    flying = {row.boards: own for row, own, _ in reversed(_flying(vehicle))}
+    point: Mapping[str, Any] = {"markeredgecolor": INK, "linestyle": "none"}
+    for copies, own in sorted(flying.items()):
+        colour = SCHEMES[_OF_COPIES[copies]]
         axes.plot(
-            one["curves"]["throughput_hz"], curve, color=colour, linewidth=1.8,
-            label=_LABELS[copies],
+            vehicle.curves.throughput_hz, vehicle.curves.velocity_mps[copies], color=colour,
+            linewidth=1.8, label=_LABELS[copies],
         )  # fmt: skip
-        axes.axhline(row["roof_mps"], color=colour, linewidth=0.8, linestyle=(0, (5, 3)))
-        axes.plot(
-            row["knee_hz"], share * row["roof_mps"], marker="D", markersize=5,
-            color=colour, markeredgecolor=INK, linestyle="none", markeredgewidth=0.6,
-        )  # fmt: skip
-        axes.plot(
-            row["throughput_hz"], row["velocity_mps"], marker="o", markersize=7, color=colour,
-            markeredgecolor=INK, linestyle="none",
-        )  # fmt: skip
+        axes.axhline(own.roof_mps, color=colour, linewidth=0.8, **_DASHED)
+        axes.plot(own.knee_hz, share * own.roof_mps, "D", markersize=5, color=colour,
+                  markeredgewidth=0.6, **point)  # fmt: skip
+        axes.plot(own.throughput_hz, own.velocity_mps, "o", markersize=7, color=colour, **point)
     axes.plot([], [], "D", color="white", markeredgecolor=INK, markersize=5, label="knee")
     axes.plot([], [], "o", color="white", markeredgecolor=INK, markersize=7, label="flies here")
-    axes.plot([], [], color=NOTE, linewidth=0.8, linestyle=(0, (5, 3)), label="roof")
+    axes.plot([], [], color=NOTE, linewidth=0.8, label="roof", **_DASHED)
     axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="ceiling of one board")
-    _ceilings(axes, one, flying[1])
-    _log_axes(axes, one)
+    _ceilings(axes, vehicle, flying[1])
+    _log_axes(axes, vehicle, flying[1])
 
 
-def _ceilings(axes: Axes, one: Mapping[str, Any], row: Mapping[str, Any]) -> None:
-    sensor_hz = next(p["value"] for p in one["parameters"] if p["parameter"] == "sensor_hz")
-    label = [f"one board\nroof {row['roof_mps']:.2f} m/s, knee {row['knee_hz']:.1f} Hz"]
+def _ceilings(axes: Axes, vehicle: VehicleReport, own: Performance) -> None:
+    (sensor_hz,) = (row.value for row in vehicle.parameters if row.parameter == "sensor_hz")
+    label = [f"one board\nroof {own.roof_mps:.2f} m/s, knee {own.knee_hz:.1f} Hz"]
     for name, at_hz, ceiling in (
-        ("sensor", sensor_hz, row["sensor_ceiling_mps"]),
-        ("compute", row["compute_hz"], row["compute_ceiling_mps"]),
+        ("sensor", sensor_hz, own.sensor_ceiling_mps),
+        ("compute", own.compute_hz, own.compute_ceiling_mps),
     ):
-        if at_hz < row["knee_hz"]:
+        if at_hz < own.knee_hz:
             axes.hlines(ceiling, at_hz, _MOST_HZ, color=INK, linewidth=1.0, linestyle=":")
             label.append(f"{name} ceiling {ceiling:.2f} m/s at {at_hz:.3g} Hz")
     axes.text(
@@ -354,168 +399,165 @@ def _ceilings(axes: Axes, one: Mapping[str, Any], row: Mapping[str, Any]) -> Non
     )  # fmt: skip
 
 
-def _log_axes(axes: Axes, one: Mapping[str, Any]) -> None:
+def _log_axes(axes: Axes, vehicle: VehicleReport, own: Performance) -> None:
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlim(one["curves"]["throughput_hz"][0], _MOST_HZ)
+    axes.set_xlim(vehicle.curves.throughput_hz[0], _MOST_HZ)
     axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(color="#e6e9ee", linewidth=0.6)
-    tmr = next((row for row in one["schemes"] if row["boards"] == 3), None)
-    heavy = "; TMR cannot be lifted" if tmr is not None and tmr["problem"] else ""
-    bound = next(row["bound"] for row in one["schemes"] if row["boards"] == 1)
-    open_frame(axes, f"{one['vehicle']}, board {one['board']}: {bound} bound{heavy}")
+    heavy = any(row.boards == 3 and row.problem for row in vehicle.schemes)
+    title = f"{vehicle.vehicle}, board {vehicle.board}: {own.bound} bound"
+    open_frame(axes, title + ("; TMR cannot be lifted" if heavy else ""))
 
 
 # Cost of redundancy: flight time and energy over detection and recovery ---------------------------
 
-_QUANTITIES = (("flight_time_ratio", "flight time"), ("energy_ratio", "energy"))
+_COSTS = (("flight_time_ratio", "flight time"), ("energy_ratio", "energy"))
 _COST_WIDTH = 0.15
 
 
-def _draw_redundancy(report: Mapping[str, Any]) -> Figure:
-    """Draw a figure with a panel per vehicle, a bar per scheme and ratios to the reference."""
-    vehicles = report["vehicles"]
+def _draw_redundancy(model: ModelReport) -> Figure:
+    """Draw a panel per vehicle, a bar per scheme and ratios to the reference."""
+    vehicles = model.vehicles
     figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
     panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
-    for axes, one in zip(panels, vehicles, strict=True):
-        _cost_panel(axes, one)
+    for axes, vehicle in zip(panels, vehicles, strict=True):
+        _cost_panel(axes, vehicle)
     panels[0].set_ylabel("times that with detection (autoencoder)")
     handles, labels = panels[0].get_legend_handles_labels()
     legend_above(figure, handles, labels, ncols=len(labels))
-    figure.supxlabel(_cost_caption(report), fontsize=7.5, color=NOTE)
+    figure.supxlabel(_cost_caption(model), fontsize=7.5, color=NOTE)
     return figure
 
 
-def _cost_panel(axes: Axes, one: Mapping[str, Any]) -> None:
-    rows = one["schemes"]
-    highest = max(row[key] or 0.0 for row in rows for key, _ in _QUANTITIES)
+def _cost_panel(axes: Axes, vehicle: VehicleReport) -> None:
+    rows, highest = vehicle.schemes, 0.0
     for number, row in enumerate(rows):
-        places = [k + (number - (len(rows) - 1) / 2) * _COST_WIDTH for k in range(len(_QUANTITIES))]
-        heights = [row[key] for key, _ in _QUANTITIES]
-        axes.bar(
-            places, [height or 0.0 for height in heights], width=0.92 * _COST_WIDTH,
-            color=SCHEMES[row["scheme"]], label=row["title"],
+        heights = [getattr(row.ratios, field, None) for field, _ in _COSTS]  # None: too heavy
+        bars = axes.bar(
+            [_beside(place, number, len(rows), _COST_WIDTH) for place in range(len(_COSTS))],
+            [height or 0.0 for height in heights], width=0.92 * _COST_WIDTH,
+            color=SCHEMES[row.scheme], label=row.title,
         )  # fmt: skip
-        for place, height in zip(places, heights, strict=True):
-            told = "cannot be lifted" if height is None else f"{height:.2f}"
+        for bar, height in zip(bars, heights, strict=True):
+            text = "cannot be lifted" if height is None else f"{height:.2f}"
             look = {"va": "bottom", "fontsize": 7.5, "rotation": 90.0 if height is None else 0.0}
-            note_at(axes, told, (place, height or 0.0), 2, **look)
-    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))
-    axes.set_xticks(range(len(_QUANTITIES)), [title for _, title in _QUANTITIES])
+            note_at(axes, text, (bar.get_x() + bar.get_width() / 2, height or 0.0), 2, **look)
+            highest = max(highest, height or 0.0)
+    axes.axhline(1.0, color=INK, linewidth=0.7, **_DASHED)
+    axes.set_xticks(range(len(_COSTS)), [title for _, title in _COSTS])
     axes.set_ylim(0.0, 1.12 * highest)
-    open_frame(axes, f"{one['vehicle']}, board {one['board']}")
+    open_frame(axes, f"{vehicle.vehicle}, board {vehicle.board}")
 
 
-def _cost_caption(report: Mapping[str, Any]) -> str:
-    lines = [f"{report['model']}; flights of {report['distance_m']:g} m at the safe velocity"]
-    for one in report["vehicles"]:
-        if any(row["calibrated"] for row in one["parameters"]):
-            found = one["calibrations"][0]
+def _beside(place: float, number: int, count: int, width: float) -> float:
+    """Centre of one of several bars around a place."""
+    return place + (number - (count - 1) / 2) * width
+
+
+def _cost_caption(model: ModelReport) -> str:
+    lines = [f"{model.model}; flights of {model.distance_m:g} m at the safe velocity"]
+    for vehicle in model.vehicles:
+        if any(parameter.calibrated for parameter in vehicle.parameters):
+            own = vehicle.calibrations[0]
             lines.append(
-                f"{one['vehicle']}: {found['parameter']} = {found['value']:.4g} {found['unit']} is "
-                f"calibrated on the paper's TMR flight time x {found['published_tmr_ratio']:g}"
+                f"{vehicle.vehicle}: {own.parameter} = {own.value:.4g} {own.unit} is "
+                f"calibrated on the paper's TMR flight time x {own.published_tmr_ratio:g}"
             )
     return "\n".join(lines)
 
 
 # Model against flight: velocity, flight time and energy of every scheme ---------------------------
 
-_FLOWN_RATIOS = (("velocity", "velocity"), ("flight_time", "flight time"), ("energy", "energy"))
 _STEP = 0.17
 _UPRIGHT: Mapping[str, Any] = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
 
 
-def _draw_flights(report: Mapping[str, Any]) -> Figure:
-    """Draw a figure with a row per vehicle: velocities left, ratios to the reference right.
+def draw_flights(flights: FlightsReport) -> Figure:
+    """Draw a row per vehicle: velocities left, ratios to the reference right.
 
     A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
     """
-    flights = report["flights"]
-    vehicles = flights["vehicles"]
+    vehicles = flights.vehicles
     figure = new_figure(9.6, 1.0 + 3.1 * len(vehicles))
     panels = figure.subplots(
         len(vehicles), 2, squeeze=False, gridspec_kw={"width_ratios": (1.0, 1.7)}
     )
-    for (left, right), one in zip(panels, vehicles, strict=True):
-        _velocities(left, one)
-        _ratios(right, one, flights["ratios_over"])
+    for (left, right), vehicle in zip(panels, vehicles, strict=True):
+        _velocities(left, vehicle)
+        _ratio_panel(right, vehicle, flights.ratios_over)
+        for axes in (left, right):
+            axes.tick_params(labelsize=8)
+    first = panels[0][0]
     handles = [
-        panels[0][0].bar(0, 0, color=SCHEMES[row["scheme"]], label=row["title"])
-        for row in vehicles[0]["schemes"]
+        first.bar(0, 0, color=SCHEMES[row.scheme], label=row.title) for row in vehicles[0].schemes
     ]
-    handles += panels[0][0].plot([], [], "D", color="white", markeredgecolor=INK, markersize=5,
-                                 label="model")  # fmt: skip
-    handles += panels[0][0].plot([], [], "_", color=INK, markersize=9, label="top of a flight")
+    handles += first.plot([], [], "D", color="white", markeredgecolor=INK, markersize=5,
+                          label="model")  # fmt: skip
+    handles += first.plot([], [], "_", color=INK, markersize=9, label="top of a flight")
     legend_above(figure, handles=handles)
     figure.supxlabel(
-        f"bars: means of successful flights in {', '.join(flights['worlds'])}, "
-        f"{flights['missions_each']} missions each; whiskers: 95 % intervals over missions; "
+        f"bars: means of successful flights in {', '.join(flights.worlds)}, "
+        f"{flights.missions_each} missions each; whiskers: 95 % intervals over missions; "
         "ratios: over the same missions",
         fontsize=7.5, color=NOTE,
     )  # fmt: skip
     return figure
 
 
-def _velocities(axes: Axes, one: Mapping[str, Any]) -> None:
+def _velocities(axes: Axes, vehicle: FlownVehicle) -> None:
     highest = 0.0
-    for place, row in enumerate(one["schemes"]):
-        if row["problem"] is not None:
-            _not_flown(axes, place)
+    for place, row in enumerate(vehicle.schemes):
+        own = row.flown
+        _bar(axes, place, 0.7, row, None if own is None else own.velocity_mps)
+        if own is None:
             continue
-        _bar(axes, place, 0.7, row, "velocity", "_mps")
-        model, top = row["model_velocity_mps"], row["flight_top_velocity_mps"]
+        top = own.top_velocity_mps.flights.value
         axes.plot(place, top, "_", color=INK, markersize=12)
-        highest = max(highest, model, 0.0 if math.isnan(top) else top)
-        told = f"{row['success_percent']:.0f} % of {row['missions']} succeed"
-        note_at(axes, told, (place, 0.0), 3, **_UPRIGHT)
-    axes.set_xticks(range(len(one["schemes"])), [row["scheme"] for row in one["schemes"]])
+        highest = max(highest, own.velocity_mps.model, 0.0 if math.isnan(top) else top)
+        text = f"{100 * own.success.share:.0f} % of {own.success.total} succeed"
+        note_at(axes, text, (place, 0.0), 3, **_UPRIGHT)
+    axes.set_xticks(range(len(vehicle.schemes)), [row.scheme for row in vehicle.schemes])
     axes.set_ylim(0.0, 1.12 * highest or 1.0)
     axes.set_ylabel("mean velocity, m/s", fontsize=8.5)
-    axes.tick_params(labelsize=8)
-    open_frame(axes, f"{one['vehicle']}, board {one['board']}")
+    open_frame(axes, f"{vehicle.vehicle}, board {vehicle.board}")
 
 
-def _ratios(axes: Axes, one: Mapping[str, Any], reference: str) -> None:
-    rows = one["schemes"]
+def _ratio_panel(axes: Axes, vehicle: FlownVehicle, reference: str) -> None:
+    rows = vehicle.schemes
     for number, row in enumerate(rows):
-        for place, (name, _) in enumerate(_FLOWN_RATIOS):
-            at = place + (number - (len(rows) - 1) / 2) * _STEP
-            if f"model_{name}_ratio" in row:
-                _bar(axes, at, 0.9 * _STEP, row, name, "_ratio")
-            else:
-                _not_flown(axes, at)
-    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=(0, (5, 3)))
-    axes.set_xticks(range(len(_FLOWN_RATIOS)), [title for _, title in _FLOWN_RATIOS])
+        for place, (_, field) in enumerate(_RATIOS):
+            ratio = None if row.over_none is None else attrgetter(field)(row)
+            _bar(axes, _beside(place, number, len(rows), _STEP), 0.9 * _STEP, row, ratio)
+    axes.axhline(1.0, color=INK, linewidth=0.7, **_DASHED)
+    axes.set_xticks(range(len(_RATIOS)), [title for title, _ in _RATIOS])
     axes.set_ylabel(f"times that with {reference}", fontsize=8.5)
     axes.set_ylim(bottom=0.0)
-    axes.tick_params(labelsize=8)
-    open_frame(axes, f"{one['vehicle']}: ratios, model and flight")
+    open_frame(axes, f"{vehicle.vehicle}: ratios, model and flight")
 
 
 def _bar(
-    axes: Axes, place: float, width: float, row: Mapping[str, Any], name: str, unit: str
+    axes: Axes, place: float, width: float, row: FlownScheme, number: ModelAndFlights | None
 ) -> None:
-    flight, low, high = (row[f"flight_{name}{end}{unit}"] for end in ("", "_low", "_high"))
-    if not math.isnan(flight):
-        axes.bar(place, flight, width=width, color=SCHEMES[row["scheme"]])
-        whisker(axes, place, flight, (low, high), ecolor=NOTE, elinewidth=1.0, capsize=2.0)
-    axes.plot(
-        place, row[f"model_{name}{unit}"], "D", color="white", markeredgecolor=INK, markersize=5
-    )
+    """Draw a number of the flights as a bar and of the model as a diamond; None: not flown."""
+    if number is None:
+        note_at(axes, "not flown", (place, 0.0), 3, **{**_UPRIGHT, "color": NOTE})
+        return
+    flights = number.flights
+    if not math.isnan(flights.value):
+        axes.bar(place, flights.value, width=width, color=SCHEMES[row.scheme])
+        ends = (flights.low, flights.high)
+        whisker(axes, place, flights.value, ends, ecolor=NOTE, elinewidth=1.0, capsize=2.0)
+    axes.plot(place, number.model, "D", color="white", markeredgecolor=INK, markersize=5)
 
 
-def _not_flown(axes: Axes, place: float) -> None:
-    note_at(axes, "not flown", (place, 0.0), 3, **{**_UPRIGHT, "color": NOTE})
-
-
-PICTURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
+MODEL_PICTURES: Mapping[str, Callable[[ModelReport], Figure]] = {
     "roofline.svg": _draw_roofline,
     "redundancy.svg": _draw_redundancy,
-    "flights.svg": _draw_flights,
 }
-"""By the names of their files; the last shows flights."""
+"""Of the model, by the names of their files."""

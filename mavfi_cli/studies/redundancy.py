@@ -12,7 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.beside_model import BASE, FlightSetup, Key, side_by_side
+from mavfi_cli.analysis.beside_model import (
+    BASE,
+    FlightSetup,
+    FlightsReport,
+    Key,
+    MeasuredOverhead,
+    side_by_side,
+)
 from mavfi_cli.analysis.flights import chosen, flown
 from mavfi_cli.analysis.overhead import TIMES, ComputeOverhead
 from mavfi_cli.campaigns.begin import check_names
@@ -40,7 +47,7 @@ from mavfi_cli.vpm.model import (
     safe_velocity_mps,
     schemes_with,
 )
-from mavfi_cli.vpm.report import CHAINS, Choices, report
+from mavfi_cli.vpm.report import CHAINS, Choices, ModelReport, report
 
 FLOWN, TRAINING, FLIGHTS = "flown", "training", "flights"  # folders
 PLATFORM = "x86"  # platform whose latencies are scaled by default
@@ -63,7 +70,7 @@ class FlightPlan:
     @classmethod
     def of(
         cls,
-        setting: ModelInputs,
+        inputs: ModelInputs,
         scheme: Scheme,
         platform: PlatformProfile,
         chain_s: float,
@@ -84,14 +91,14 @@ class FlightPlan:
             ConfigError: the model's numbers are not valid for a mission.
             ModelError: the folder lacks the detector's model.
         """
-        flown, boards_w = setting.performance(scheme), scheme.copies * setting.board.power_w
-        velocity, cut_v = _within("v_max_mps", flown["velocity_mps"], "velocity", "m/s")
-        accel, cut_a = _within("a_max_mps2", flown["acceleration_mps2"], "acceleration", "m/s²")
-        range_m, cut_r = _within("map_range_m", setting.range_m, "sensing range", "m")
-        rate_hz, cut_f = _within("camera_rate_hz", setting.vehicle.sensor_hz, "sensor rate", "Hz")
-        stem = folder_name(f"{setting.vehicle.name}-{scheme.name}")
-        vehicle = _file(folder, stem, _vehicle(setting, scheme, accel))
-        factor = setting.compute_s * (1.0 + scheme.overhead) / chain_s
+        performance, boards_w = inputs.performance(scheme), scheme.copies * inputs.board.power_w
+        velocity, cut_v = _within("v_max_mps", performance.velocity_mps, "velocity", "m/s")
+        accel, cut_a = _within("a_max_mps2", performance.acceleration_mps2, "acceleration", "m/s²")
+        range_m, cut_r = _within("map_range_m", inputs.range_m, "sensing range", "m")
+        rate_hz, cut_f = _within("camera_rate_hz", inputs.vehicle.sensor_hz, "sensor rate", "Hz")
+        stem = folder_name(f"{inputs.vehicle.name}-{scheme.name}")
+        vehicle = _file(folder, stem, _vehicle(inputs, scheme, accel))
+        factor = inputs.compute_s * (1.0 + scheme.overhead) / chain_s
         board = _file(folder, folder_name(f"{stem}-{platform.name}"), _platform(platform, factor))
         watched = scheme.name in DETECTORS
         mission = MissionConfig(
@@ -104,7 +111,7 @@ class FlightPlan:
             camera_rate_hz=rate_hz,
             detector=DetectorConfig.with_model(scheme.name, models) if watched else None,
         )
-        response_s = setting.response_s(scheme.overhead)
+        response_s = inputs.response_s(scheme.overhead)
         return cls(
             mission=mission,
             files=dict((vehicle, board)),
@@ -112,9 +119,9 @@ class FlightPlan:
                 v_max_mps=velocity,
                 a_max_mps2=accel,
                 braking_velocity_mps=safe_velocity_mps(
-                    BRAKE_SHARE * accel, response_s, setting.range_m
+                    BRAKE_SHARE * accel, response_s, inputs.range_m
                 ),
-                rotors_w=flown["power_w"] - boards_w,
+                rotors_w=performance.power_w - boards_w,
                 boards_w=boards_w,
                 cut=tuple(filter(None, (cut_v, cut_a, cut_r, cut_f))),
             ),
@@ -128,16 +135,16 @@ class FlightPlan:
             write_text(path, text)
 
 
-def _vehicle(setting: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
+def _vehicle(inputs: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
     """The simulated equivalent of the model's vehicle, with a scheme's boards and heat sinks."""
-    vehicle, board, boards = setting.vehicle, setting.board, scheme.copies
+    vehicle, board, boards = inputs.vehicle, inputs.board, scheme.copies
     return {
         "name": f"{vehicle.name}-{scheme.name}",
         "description": f"{vehicle.name} of the performance model with {boards} x {board.name}",
         "base": vehicle.stand_in,
         "mass_kg": vehicle.mass_kg,
-        "extra_payload_kg": setting.carried_kg(boards),
-        "rotor_pull_n": setting.pull_n,
+        "extra_payload_kg": inputs.carried_kg(boards),
+        "rotor_pull_n": inputs.pull_n,
         "acceleration_mps2": acceleration_mps2,
         "hover_power_w": vehicle.hover_power_w,
         "battery_wh": vehicle.battery_wh,
@@ -160,8 +167,8 @@ def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
     """The nearest value that a mission allows, and a message if it differs."""
     low, high = LIMITS[key]
     taken = min(max(wanted, low), high)
-    told = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
-    return taken, "" if taken == wanted else told
+    change = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
+    return taken, "" if taken == wanted else change
 
 
 def _file(folder: Path, stem: str, values: Mapping[str, Any]) -> tuple[Path, str]:
@@ -208,7 +215,7 @@ class RedundancyPlan:
             )
 
     @property
-    def models_told(self) -> str:
+    def origin_of_models(self) -> str:
         """Origin of the detectors' models."""
         if self.train:
             return (
@@ -219,7 +226,7 @@ class RedundancyPlan:
             return f"of {self.models}"
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
-    def list_of(self, flown: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
+    def missions_of(self, plans: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
         """The list mission by mission, so that pairs are complete if it is cut off."""
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
@@ -230,7 +237,7 @@ class RedundancyPlan:
             )
             for seed in seeds
             for world in self.worlds
-            for (vehicle, scheme), plan in flown.items()
+            for (vehicle, scheme), plan in plans.items()
         ]
 
 
@@ -244,24 +251,24 @@ def _plans_of(
     """Each scheme's plan or the reason for its absence; the first one has one bare board."""
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
-    setting, models = plan.choices.inputs(vehicle), plan.models
+    inputs, models = plan.choices.inputs(vehicle), plan.models
     folder = plan.folder.absolute() / FLOWN
     refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
     for scheme in schemes:
         bare, key = scheme.name == BASE, (vehicle.name, scheme.name)
         try:
-            each = FlightPlan.of(setting, scheme, platform, chain_s, folder, models, plan.stack)
-            each.write()
-            first = replace(each.mission, world=plan.worlds[0], seed=plan.first_seed)
+            planned = FlightPlan.of(inputs, scheme, platform, chain_s, folder, models, plan.stack)
+            planned.write()
+            first = replace(planned.mission, world=plan.worlds[0], seed=plan.first_seed)
             check_names(first, start=scheme.copies not in refused)
             refused.setdefault(scheme.copies, None)
         except (CannotLift, VehicleProcessError) as error:
             if bare:
                 raise
             refused[scheme.copies] = str(error)
-        yield key, refused[scheme.copies] or each
+        yield key, refused[scheme.copies] or planned
         if bare and plan.train:
-            models = fitted(plan, vehicle.name, each, options, spectator)
+            models = fitted(plan, vehicle.name, planned, options, spectator)
 
 
 def fitted(
@@ -290,8 +297,8 @@ def fly_and_report(
     overheads: Mapping[str, tuple[float, str]],
     options: Options,
     spectator: Spectator,
-) -> dict[str, Any]:
-    """The model's report, with the flights of all rows in `flights`.
+) -> tuple[ModelReport, FlightsReport]:
+    """The model's report, and that of the flights of all its rows.
 
     The flights and the model beside them use the given overheads, or else the paper's. The model's
     own rows use the given overheads, or else those measured in the flights.
@@ -306,35 +313,25 @@ def fly_and_report(
         check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack))
     schemes = schemes_with(overheads)
     plans = {
-        key: each
+        key: planned
         for vehicle in plan.vehicles
-        for key, each in _plans_of(plan, vehicle, schemes.values(), options, spectator)
+        for key, planned in _plans_of(plan, vehicle, schemes.values(), options, spectator)
     }
-    missions = plan.list_of({k: each for k, each in plans.items() if isinstance(each, FlightPlan)})
+    missions = plan.missions_of({k: p for k, p in plans.items() if isinstance(p, FlightPlan)})
     table = fly(missions, plan.folder / FLIGHTS, Keep.NONE, options, spectator)
-    over = flown(table)
-    watched = [
-        chosen(over, label_group=group, label_arm=name)["number"].to_pylist()
-        for group, name in plans
-        if name in DETECTORS
-    ]
+    watched = chosen(flown(table), label_arm=DETECTORS)["number"].to_pylist()
     with Ledger(plan.folder / FLIGHTS) as ledger:
-        measured = ComputeOverhead.of(
-            each.result for numbers in watched for each in ledger.results(numbers)
-        )
-    found = {name: (100.0 * each.share, each.told("--fly")) for name, each in measured.items()}
-    told = report(plan.vehicles, plan.choices, schemes_with({**found, **overheads}))
-    told["flights"] = {
-        "worlds": list(plan.worlds),
-        "missions_each": plan.missions,
-        "first_seed": plan.first_seed,
-        "stack": plan.stack,
-        "detectors": plan.models_told,
-        **side_by_side(
-            report(plan.vehicles, plan.choices, schemes),
-            {key: each if isinstance(each, str) else each.setup for key, each in plans.items()},
-            table,
-            measured,
-        ),
-    }
-    return told
+        measured = ComputeOverhead.of(mission.result for mission in ledger.results(watched))
+    sources = {name: (100.0 * own.share, own.told("--fly")) for name, own in measured.items()}
+    setups = {key: p.setup if isinstance(p, FlightPlan) else p for key, p in plans.items()}
+    flights = FlightsReport(
+        worlds=plan.worlds,
+        missions_each=plan.missions,
+        first_seed=plan.first_seed,
+        stack=plan.stack,
+        detectors=plan.origin_of_models,
+        overheads=tuple(map(MeasuredOverhead.of, measured.values())),
+        vehicles=side_by_side(report(plan.vehicles, plan.choices, schemes), setups, table),
+    )
+    model = report(plan.vehicles, plan.choices, schemes_with({**sources, **overheads}))
+    return model, flights

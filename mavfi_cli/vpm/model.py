@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,9 @@ class _Calibration:
 
     def __post_init__(self) -> None:
         if self.parameter not in CALIBRATED:
-            raise ValueError(f"parameter: must be {' or '.join(CALIBRATED)}, is {self.parameter}")
+            raise ValueError(f"parameter: must be {' or '.join(CALIBRATED)}, got {self.parameter}")
         if self.tmr_time_ratio <= 1.0:
-            raise ValueError(f"tmr_time_ratio: must be above 1, is {self.tmr_time_ratio:g}")
+            raise ValueError(f"tmr_time_ratio: must be above 1, got {self.tmr_time_ratio:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,13 +70,13 @@ class ModelVehicle:
         ):  # fmt: skip
             value = getattr(self, key)
             if value is not None and value <= 0.0:
-                raise ValueError(f"{key}: must be above zero, is {value:g}")
+                raise ValueError(f"{key}: must be above 0, got {value:g}")
             if value is not None and not SMALLEST <= value <= LARGEST:
                 least = value < SMALLEST
                 limit = f"at least {SMALLEST:g}" if least else f"at most {LARGEST:g}"
-                raise ValueError(f"{key}: must be {limit}, is {value:g}")
+                raise ValueError(f"{key}: must be {limit}, got {value:g}")
         if not 0.0 <= self.tilt_deg < 90.0:
-            raise ValueError(f"tilt_deg: must be within 0 and 90, is {self.tilt_deg:g}")
+            raise ValueError(f"tilt_deg: must be within 0 and 90, got {self.tilt_deg:g}")
         free = self.calibration.parameter if self.calibration else ""
         if free and getattr(self, free) is not None:
             raise ValueError(f"{free}: has a value, so it cannot be calibrated")
@@ -135,10 +135,10 @@ class Board:
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
         """The board of a platform; a platform on the ground has neither mass nor power."""
-        told = f"platform {platform.name}"
-        sources = {key: f"{told}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
+        name = f"platform {platform.name}"
+        sources = {key: f"{name}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:
-            sources = dict.fromkeys(HARDWARE, f"{told} stays on the ground")
+            sources = dict.fromkeys(HARDWARE, f"{name} stays on the ground")
         return cls(
             name=platform.name,
             description=platform.description,
@@ -191,7 +191,7 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme
             raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent <= LARGEST:
             raise ConfigError(
-                f"{name} must be within 0 and {LARGEST:g} %, is {percent:g} %", key="overhead"
+                f"{name} must be within 0 and {LARGEST:g} %, got {percent:g} %", key="overhead"
             )
         schemes[name] = replace(schemes[name], overhead=percent / 100.0, source=source)
     return schemes
@@ -256,6 +256,26 @@ _J_PER_WH = 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Performance:
+    """Performance with a scheme, for hovering power and a straight path."""
+
+    thrust_to_weight: float
+    acceleration_mps2: float
+    throughput_hz: float  # actions per second, the inverse of the response time
+    compute_hz: float  # rate of the computer alone
+    knee_hz: float  # throughput at KNEE_SHARE of the roof
+    roof_mps: float
+    sensor_ceiling_mps: float
+    compute_ceiling_mps: float
+    velocity_mps: float  # safe velocity
+    flight_time_s: float
+    power_w: float  # rotors and boards
+    energy_j: float
+    missions: float  # for each battery charge, not rounded
+    bound: str  # what limits the velocity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModelInputs:
     """The model's inputs for one vehicle with its computer."""
 
@@ -299,14 +319,8 @@ class ModelInputs:
             f"compute are {own_kg + compute_kg:.3f} kg"
         )
 
-    def performance(self, scheme: Scheme) -> dict[str, Any]:
-        """Performance with a scheme, for hovering power and a straight path.
-
-        Returns:
-            Numbers by name and unit. `throughput_hz`: actions a second, the inverse of the response
-            time. `compute_hz`: rate of the computer alone. `power_w`: rotors and boards.
-            `missions`: missions for each battery charge, not rounded. `bound`: what limits the
-            velocity.
+    def performance(self, scheme: Scheme) -> Performance:
+        """Performance with a scheme.
 
         Raises:
             CannotLift: the rotors do not lift this many boards.
@@ -321,21 +335,19 @@ class ModelInputs:
         power_w = rotors_w + copies * self.board.power_w
         time_s = self.distance_m / velocity
         slower = "sensor" if 1.0 / vehicle.sensor_hz > compute_s else "compute"
-        return {
-            "mass_kg": mass_kg,
-            "compute_kg": self.carried_kg(copies),
-            "thrust_to_weight": self.pull_n / (mass_kg * GRAVITY_MPS2),
-            "acceleration_mps2": accel,
-            "throughput_hz": 1.0 / response_s,
-            "compute_hz": 1.0 / compute_s,
-            "knee_hz": knee,
-            "roof_mps": roof_mps(accel, self.range_m),
-            "sensor_ceiling_mps": safe_velocity_mps(accel, 1.0 / vehicle.sensor_hz, self.range_m),
-            "compute_ceiling_mps": safe_velocity_mps(accel, compute_s, self.range_m),
-            "velocity_mps": velocity,
-            "flight_time_s": time_s,
-            "power_w": power_w,
-            "energy_j": power_w * time_s,
-            "missions": vehicle.battery_wh * _J_PER_WH / (power_w * time_s),
-            "bound": "body dynamics" if 1.0 / response_s >= knee else slower,
-        }
+        return Performance(
+            thrust_to_weight=self.pull_n / (mass_kg * GRAVITY_MPS2),
+            acceleration_mps2=accel,
+            throughput_hz=1.0 / response_s,
+            compute_hz=1.0 / compute_s,
+            knee_hz=knee,
+            roof_mps=roof_mps(accel, self.range_m),
+            sensor_ceiling_mps=safe_velocity_mps(accel, 1.0 / vehicle.sensor_hz, self.range_m),
+            compute_ceiling_mps=safe_velocity_mps(accel, compute_s, self.range_m),
+            velocity_mps=velocity,
+            flight_time_s=time_s,
+            power_w=power_w,
+            energy_j=power_w * time_s,
+            missions=vehicle.battery_wh * _J_PER_WH / (power_w * time_s),
+            bound="body dynamics" if 1.0 / response_s >= knee else slower,
+        )

@@ -1,4 +1,4 @@
-"""The whole report as plain data, to be printed, drawn, or written as JSON or CSV."""
+"""The performance model's numbers for vehicles and schemes, and where they come from."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from mavfi_cli.vpm.model import (
     Board,
     ModelInputs,
     ModelVehicle,
+    Performance,
     Scheme,
     safe_velocity_mps,
 )
@@ -32,16 +32,15 @@ CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "serial": (sum, "sum"),
     "pipelined": (max, "slowest"),
 }
+MODEL = "F-1, IEEE CAL 19(1), equations 1 to 3"
 OTHER_BOARD = "tx2"  # calibrations are repeated with this heavier board
-RATIOS = {
-    "velocity_ratio": "velocity_mps",
-    "flight_time_ratio": "flight_time_s",
-    "energy_ratio": "energy_j",
-    "missions_ratio": "missions",
-}
 _CURVE_HZ = np.array([10.0**exponent for exponent in np.linspace(-1.0, 3.0, 161).tolist()])
 _COMMAND = "command line"
-_FREE_UNITS = {"rotor_pull_n": "N", "response_s": "s"}  # units of what a calibration sets
+_UNITS = {
+    "mass_kg": "kg", "rotor_pull_n": "N", "tilt_deg": "deg", "range_m": "m", "sensor_hz": "Hz",
+    "response_s": "s", "hover_power_w": "W", "battery_wh": "Wh",
+}  # fmt: skip
+_BOARD_UNITS = {"mass_kg": "kg", "power_w": "W", "heatsink_kgpw": "kg/W"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,135 +60,268 @@ class Choices:
         Raises:
             ConfigError: neither the vehicle nor the choices give a needed value.
         """
-        return _setting(vehicle, self)[0]
+        return _inputs(vehicle, self)[0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelParameter:
+    """A number that enters the model."""
+
+    parameter: str
+    value: float
+    unit: str
+    source: str
+    calibrated: bool = False  # a published ratio determines it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ratios:
+    """A scheme over the scheme REFERENCE."""
+
+    velocity_ratio: float
+    flight_time_ratio: float
+    energy_ratio: float
+    missions_ratio: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemeResult:
+    """A vehicle with a scheme; if it is too heavy, `problem` gives the numbers."""
+
+    scheme: str
+    title: str
+    boards: int
+    overhead_percent: float
+    source: str
+    mass_kg: float
+    compute_kg: float
+    performance: Performance | None = None
+    ratios: Ratios | None = None
+    problem: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensitivityPoint:
+    """The answers at one value of a parameter; None if the vehicle cannot fly."""
+
+    value: float
+    velocity_mps: float | None  # with the scheme REFERENCE
+    tmr_flight_time_ratio: float | None  # over the scheme REFERENCE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensitivity:
+    """The answers as one parameter varies.
+
+    An elasticity is d ln(answer) / d ln(parameter) at `value`: the change of the answer in per cent
+    for one per cent of the parameter.
+    """
+
+    parameter: str
+    unit: str
+    value: float
+    velocity_elasticity_ratio: float | None
+    tmr_time_elasticity_ratio: float | None
+    points: tuple[SensitivityPoint, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibratedNumber:
+    """The free number that gives a vehicle its published ratio of flight times.
+
+    Attributes:
+        tmr_ratio, predicted_dmr_ratio: over the scheme REFERENCE; the second is not fitted.
+    """
+
+    board: str
+    board_kg: float
+    parameter: str
+    value: float
+    unit: str
+    published_tmr_ratio: float
+    tmr_ratio: float
+    predicted_dmr_ratio: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Safe velocity against action throughput, (n,), by the numbers of boards that can fly."""
+
+    throughput_hz: list[float]
+    velocity_mps: dict[int, list[float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleReport:
+    """The model's numbers for one vehicle; the first calibration is the one in use."""
+
+    vehicle: str
+    description: str
+    board: str
+    notes: tuple[str, ...]
+    parameters: tuple[ModelParameter, ...]
+    schemes: tuple[SchemeResult, ...]
+    sensitivity: tuple[Sensitivity, ...]
+    calibrations: tuple[CalibratedNumber, ...]
+    curves: Curves
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelReport:
+    """The model's numbers; names of numbers but counts and ratios end in the unit."""
+
+    model: str = MODEL
+    knee_velocity_over_roof_ratio: float = KNEE_SHARE
+    distance_m: float
+    ratios_over: str = REFERENCE
+    notes: tuple[str, ...]
+    vehicles: tuple[VehicleReport, ...]
 
 
 def report(
     vehicles: Sequence[ModelVehicle], choices: Choices, schemes: Mapping[str, Scheme]
-) -> dict[str, Any]:
-    """Compute the model's answer for each vehicle; keys of numbers but ratios name the unit.
+) -> ModelReport:
+    """Compute the model's numbers for each vehicle.
 
     Raises:
         CannotLift: a vehicle does not lift even one board.
         ConfigError: neither the vehicle nor the choices give a needed value.
     """
-    return {
-        "model": "F-1, IEEE CAL 19(1), equations 1 to 3",
-        "knee_velocity_over_roof_ratio": KNEE_SHARE,
-        "distance_m": choices.distance_m,
-        "ratios_over": REFERENCE,
-        "notes": _unlike_sources(schemes),
-        "vehicles": [_one(vehicle, choices, schemes) for vehicle in vehicles],
-    }
+    return ModelReport(
+        distance_m=choices.distance_m,
+        notes=_unlike_sources(schemes),
+        vehicles=tuple(_vehicle(vehicle, choices, schemes) for vehicle in vehicles),
+    )
 
 
-def _unlike_sources(schemes: Mapping[str, Scheme]) -> list[str]:
+def _unlike_sources(schemes: Mapping[str, Scheme]) -> tuple[str, ...]:
     """A note if one detector's overhead is from the paper and another's is not."""
     detectors = [schemes[name] for name in DETECTORS]
     papers = [scheme.name for scheme in detectors if scheme.source == TABLE_V]
     others = [scheme.name for scheme in detectors if scheme.source != TABLE_V]
     if not papers or not others:
-        return []
-    return [
+        return ()
+    return (
         f"the overhead of {' and '.join(papers)} is the paper's and that of {' and '.join(others)} "
-        "is not: different sources, so these rows are not to be ranked"
-    ]
+        "is not: different sources, so these rows are not to be ranked",
+    )
 
 
-def _one(vehicle: ModelVehicle, choices: Choices, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
-    setting, parameters, found = _setting(vehicle, choices)
-    reference = setting.performance(schemes[REFERENCE])
-    calibrations = [found] if found else []
-    if found and found["board"] != OTHER_BOARD:
-        calibrations.append(_calibrate(vehicle, Board.load(OTHER_BOARD)))
-    return {
-        "vehicle": vehicle.name,
-        "description": vehicle.description,
-        "board": setting.board.name,
-        "notes": _notes(vehicle, choices, setting, found),
-        "parameters": parameters,
-        "schemes": [_row(setting, scheme, reference) for scheme in schemes.values()],
-        "sensitivity": _sensitivity(setting, schemes),
-        "calibrations": calibrations,
-        "curves": _curves(setting, schemes),
-    }
+def _vehicle(
+    vehicle: ModelVehicle, choices: Choices, schemes: Mapping[str, Scheme]
+) -> VehicleReport:
+    inputs, parameters, calibration = _inputs(vehicle, choices)
+    calibrations = [] if calibration is None else [calibration]
+    if calibration is not None and calibration.board != OTHER_BOARD:
+        calibrations.append(_calibrated(vehicle, Board.load(OTHER_BOARD)))
+    reference = inputs.performance(schemes[REFERENCE])
+    return VehicleReport(
+        vehicle=vehicle.name,
+        description=vehicle.description,
+        board=inputs.board.name,
+        notes=tuple(_notes(vehicle, choices, inputs, calibration)),
+        parameters=parameters,
+        schemes=tuple(_scheme(inputs, scheme, reference) for scheme in schemes.values()),
+        sensitivity=tuple(_sensitivities(inputs, schemes)),
+        calibrations=tuple(calibrations),
+        curves=_curves(inputs, schemes),
+    )
 
 
-def _setting(
+def _inputs(
     vehicle: ModelVehicle, choices: Choices
-) -> tuple[ModelInputs, list[dict[str, Any]], dict[str, Any]]:
-    """Collect the model's inputs, list them with their sources, and add the calibration or {}."""
-    full, sources, free = vehicle, dict(vehicle.sources), ""
-    found: dict[str, Any] = {}
+) -> tuple[ModelInputs, tuple[ModelParameter, ...], CalibratedNumber | None]:
+    """Return the model's inputs, the same with their sources, and the calibration if there is one.
+
+    The response time is the first of: the command line's, the platform's, the vehicle's own.
+    """
+    full, sources, free, calibration = vehicle, dict(vehicle.sources), "", None
     if vehicle.calibration is not None:
-        found = _calibrate(vehicle)
-        free = found["parameter"]
-        full = replace(vehicle, calibration=None, **{free: found["value"]})
+        calibration = _calibrated(vehicle)
+        free = calibration.parameter
+        full = _with_number(vehicle, free, calibration.value)
         sources[free] = (
-            f"calibrated: TMR takes {found['published_tmr_ratio']:g} times the flight time of "
-            f"detection and recovery, with board {found['board']} ({vehicle.calibration.source})"
+            f"calibrated: TMR takes {calibration.published_tmr_ratio:g} times the flight time of "
+            f"detection and recovery, with board {calibration.board} ({vehicle.calibration.source})"
         )
-    board = _board(vehicle, choices)
+    board, platform = _board(vehicle, choices), choices.platform
     compute_s, given = full.response_s, ""
     if choices.response_s is not None:
         compute_s, given = choices.response_s, _COMMAND
-    elif choices.platform is not None:
-        kernels = choices.platform.kernels
-        if choices.platform.measured_factor is not None:
+    elif platform is not None:
+        if platform.measured_factor is not None:
             raise ConfigError(
-                f"{choices.platform.name} has latencies only while it flies: mavfi fly --realtime",
+                f"{platform.name} has latencies only while it flies: mavfi fly --realtime",
                 key="platform",
             )
         combined, how = CHAINS[choices.chain]
-        compute_s = combined([each.latency_s for each in kernels.values()])
+        compute_s = combined([kernel.latency_s for kernel in platform.kernels.values()])
         if compute_s < SMALLEST:
-            raise ConfigError(f"no kernel of platform {choices.platform.name!r} takes any time")
-        given = f"platform {choices.platform.name}: {how} of {', '.join(kernels)}"
+            raise ConfigError(f"no kernel of platform {platform.name!r} takes any time")
+        given = f"platform {platform.name}: {how} of {', '.join(platform.kernels)}"
     if given:
         sources["response_s"], free = given, "" if free == "response_s" else free
     if compute_s is None:
-        raise ConfigError(f"vehicle {vehicle.name!r} has none: give --platform or --response",
-                          key="response_s")  # fmt: skip
+        raise ConfigError(f"vehicle {vehicle.name!r} defines no response time: give --platform or "
+                          "--response", key="response_s")  # fmt: skip
     if choices.range_m is not None:
         sources["range_m"] = _COMMAND
-    assert full.rotor_pull_n is not None
-    setting = ModelInputs(
-        vehicle=replace(full, response_s=compute_s, range_m=choices.range_m or full.range_m),
-        board=board,
-        pull_n=full.rotor_pull_n,
-        range_m=choices.range_m or full.range_m,
-        compute_s=compute_s,
-        distance_m=choices.distance_m,
+    range_m = choices.range_m or full.range_m
+    inputs = _with_board(
+        replace(full, response_s=compute_s, range_m=range_m), board, choices.distance_m
     )
-    return setting, _parameters(setting, sources, free), found
+    return inputs, _parameters(inputs, sources, free), calibration
+
+
+def _with_number(vehicle: ModelVehicle, parameter: str, value: float) -> ModelVehicle:
+    """The vehicle with a value for the number that is to be calibrated."""
+    if parameter == "response_s":
+        return replace(vehicle, calibration=None, response_s=value)
+    return replace(vehicle, calibration=None, rotor_pull_n=value)
+
+
+def _with_board(vehicle: ModelVehicle, board: Board, distance_m: float) -> ModelInputs:
+    """The inputs for a vehicle that has all numbers."""
+    assert vehicle.rotor_pull_n is not None
+    assert vehicle.response_s is not None
+    return ModelInputs(
+        vehicle=vehicle, board=board, pull_n=vehicle.rotor_pull_n, range_m=vehicle.range_m,
+        compute_s=vehicle.response_s, distance_m=distance_m,
+    )  # fmt: skip
 
 
 def _notes(
-    vehicle: ModelVehicle, choices: Choices, setting: ModelInputs, found: Mapping[str, Any]
+    vehicle: ModelVehicle,
+    choices: Choices,
+    inputs: ModelInputs,
+    calibration: CalibratedNumber | None,
 ) -> list[str]:
     """Name what did not change with the computer, although a user may think so."""
-    notes, board = [], setting.board
+    notes, board = [], inputs.board
     own_time = choices.platform is None and choices.response_s is None
-    fitted_time = found.get("parameter") == "response_s"
+    calibrated_time = calibration is not None and calibration.parameter == "response_s"
     if own_time and board.name != vehicle.board:
         source = vehicle.sources.get("response_s", "not given")
-        if fitted_time:
-            source = f"calibrated with board {found['board']}"
+        if calibration is not None and calibrated_time:
+            source = f"calibrated with board {calibration.board}"
         notes.append(
             f"the board is {board.name}, and the response time is still the vehicle's own "
             f"({source}): give --response or --platform"
         )
-    if found and (own_time or not fitted_time) and board.name != found["board"]:
-        told = "{parameter} = {value:.4g} {unit} is calibrated with board {board}".format(**found)
+    in_use = own_time or not calibrated_time
+    if calibration is not None and in_use and board.name != calibration.board:
         if board.total_kg <= 0.0:
             other = f"board {board.name} has no mass, so nothing can be calibrated with it"
         else:
             try:
-                value = _calibrate(vehicle, board)["value"]
-                other = f"with board {board.name} it would be {value:.4g} {found['unit']}"
+                value = _calibrated(vehicle, board).value
+                other = f"with board {board.name} it would be {value:.4g} {calibration.unit}"
             except ConfigError as error:
                 other = f"it cannot be with board {board.name}: {error}"
-        notes.append(f"{told}; {other}")
+        notes.append(
+            f"{calibration.parameter} = {calibration.value:.4g} {calibration.unit} is calibrated "
+            f"with board {calibration.board}; {other}"
+        )
     return notes
 
 
@@ -199,67 +331,70 @@ def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
     if choices.platform is not None:
         return Board.of_platform(choices.platform)
     if not vehicle.board:
-        raise ConfigError(f"vehicle {vehicle.name!r} has none: give --platform or --board",
+        raise ConfigError(f"vehicle {vehicle.name!r} defines no board: give --platform or --board",
                           key="board")  # fmt: skip
     return Board.load(vehicle.board)
 
 
-def _parameters(setting: ModelInputs, sources: dict[str, str], free: str) -> list[dict[str, Any]]:
-    units = {
-        "mass_kg": "kg", "rotor_pull_n": "N", "tilt_deg": "deg", "range_m": "m",
-        "sensor_hz": "Hz", "response_s": "s", "hover_power_w": "W", "battery_wh": "Wh",
-    }  # fmt: skip
-    sources.setdefault("tilt_deg", "CAL20: its Table 1 is reproduced with 0 degrees")
-    rows = [
-        {
-            "parameter": key, "value": getattr(setting.vehicle, key), "unit": unit,
-            "source": sources.get(key, "not given"), "calibrated": key == free,
-        }
-        for key, unit in units.items()
-    ]  # fmt: skip
-    for key, unit in (("mass_kg", "kg"), ("power_w", "W"), ("heatsink_kgpw", "kg/W")):
-        told = setting.board.sources.get(key, "not given")
-        rows.append({"parameter": f"board.{key}", "value": getattr(setting.board, key),
-                     "unit": unit, "source": told, "calibrated": False})  # fmt: skip
-    return rows
+def _parameters(
+    inputs: ModelInputs, sources: Mapping[str, str], calibrated: str
+) -> tuple[ModelParameter, ...]:
+    sources = {"tilt_deg": "CAL20: its Table 1 is reproduced with 0 degrees", **sources}
+    own = (
+        ModelParameter(
+            parameter=key, value=getattr(inputs.vehicle, key), unit=unit,
+            source=sources.get(key, "not given"), calibrated=key == calibrated,
+        )
+        for key, unit in _UNITS.items()
+    )  # fmt: skip
+    boards = (
+        ModelParameter(
+            parameter=f"board.{key}", value=getattr(inputs.board, key), unit=unit,
+            source=inputs.board.sources.get(key, "not given"),
+        )
+        for key, unit in _BOARD_UNITS.items()
+    )  # fmt: skip
+    return (*own, *boards)
 
 
-def _row(setting: ModelInputs, scheme: Scheme, reference: Mapping[str, Any]) -> dict[str, Any]:
-    told = {
-        "scheme": scheme.name, "title": scheme.title, "boards": scheme.copies,
-        "overhead_percent": 100.0 * scheme.overhead, "source": scheme.source,
-    }  # fmt: skip
+def _scheme(inputs: ModelInputs, scheme: Scheme, reference: Performance) -> SchemeResult:
+    result = SchemeResult(
+        scheme=scheme.name, title=scheme.title, boards=scheme.copies,
+        overhead_percent=100.0 * scheme.overhead, source=scheme.source,
+        mass_kg=inputs.mass_kg(scheme.copies), compute_kg=inputs.carried_kg(scheme.copies),
+    )  # fmt: skip
     try:
-        flown = setting.performance(scheme)
+        performance = inputs.performance(scheme)
     except CannotLift as error:
-        weights = {"mass_kg": setting.mass_kg(scheme.copies),
-                   "compute_kg": setting.carried_kg(scheme.copies)}  # fmt: skip
-        nothing = dict.fromkeys([*reference, *RATIOS])
-        return {**told, **nothing, **weights, "problem": str(error)}
-    ratios = {ratio: flown[of] / reference[of] for ratio, of in RATIOS.items()}
-    return {**told, **flown, **ratios, "problem": None}
+        return replace(result, problem=str(error))
+    ratios = Ratios(
+        velocity_ratio=performance.velocity_mps / reference.velocity_mps,
+        flight_time_ratio=performance.flight_time_s / reference.flight_time_s,
+        energy_ratio=performance.energy_j / reference.energy_j,
+        missions_ratio=performance.missions / reference.missions,
+    )
+    return replace(result, performance=performance, ratios=ratios)
 
 
-def _curves(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> dict[str, Any]:
-    """Safe velocity against action throughput for the numbers of boards that can fly."""
+def _curves(inputs: ModelInputs, schemes: Mapping[str, Scheme]) -> Curves:
     copies = sorted({scheme.copies for scheme in schemes.values()})
-    flying = [(n, setting.acceleration_mps2(n)) for n in copies]
-    return {
-        "throughput_hz": _CURVE_HZ.tolist(),
-        "velocity_mps": {
-            str(n): safe_velocity_mps(accel, 1.0 / _CURVE_HZ, setting.range_m).tolist()
+    flying = [(n, inputs.acceleration_mps2(n)) for n in copies]
+    return Curves(
+        throughput_hz=_CURVE_HZ.tolist(),
+        velocity_mps={
+            n: safe_velocity_mps(accel, 1.0 / _CURVE_HZ, inputs.range_m).tolist()
             for n, accel in flying
             if accel > 0.0
         },
-    }
+    )
 
+
+# Sensitivity --------------------------------------------------------------------------------------
 
 FACTORS = (0.5, 0.8, 1.25, 2.0)
 _STEP = 1.001  # factor of the numerical derivative
-
-
-# name -> unit, and field of the inputs
-_PARAMETERS = {
+# name -> unit, and field of the inputs; power also changes the mass of the heat sink
+_VARIED = {
     "sensing range": ("m", "range_m"),
     "response time": ("s", "compute_s"),
     "board mass": ("kg", "board.mass_kg"),
@@ -267,56 +402,56 @@ _PARAMETERS = {
 }
 
 
-def _scaled(setting: ModelInputs, field: str, factor: float) -> ModelInputs:
-    value = factor * attrgetter(field)(setting)
+def _scaled(inputs: ModelInputs, field: str, factor: float) -> ModelInputs:
+    value = factor * attrgetter(field)(inputs)
     if field.startswith("board."):
-        return replace(
-            setting, board=replace(setting.board, **{field.removeprefix("board."): value})
-        )
-    return replace(setting, **{field: value})
+        return replace(inputs, board=replace(inputs.board, **{field.removeprefix("board."): value}))
+    return replace(inputs, **{field: value})
 
 
-def _sensitivity(setting: ModelInputs, schemes: Mapping[str, Scheme]) -> list[dict[str, Any]]:
-    """One row for each parameter: the answer at each factor, and its elasticity at factor 1.
-
-    An elasticity is d ln(answer) / d ln(parameter): the change of the answer in per cent for one
-    per cent of the parameter. The answers are the safe velocity with the reference scheme, and
-    the flight time with TMR over that with the reference. They are None if the vehicle cannot
-    fly. Power also changes the mass of the heat sink.
-    """
+def _sensitivities(inputs: ModelInputs, schemes: Mapping[str, Scheme]) -> list[Sensitivity]:
     rows = []
-    for name, (unit, field) in _PARAMETERS.items():
-        middle = attrgetter(field)(setting)
+    for name, (unit, field) in _VARIED.items():
+        middle = attrgetter(field)(inputs)
         if middle == 0.0:
             continue
-        factors = (1.0 / _STEP, _STEP, *FACTORS)
-        below, above, *others = (_answers(_scaled(setting, field, f), schemes) for f in factors)
-        slopes = [
-            None if low is None or high is None else math.log(high / low) / (2 * math.log(_STEP))
-            for low, high in zip(below, above, strict=True)
-        ]
+        below, above, *points = (
+            _point(_scaled(inputs, field, factor), factor * middle, schemes)
+            for factor in (1.0 / _STEP, _STEP, *FACTORS)
+        )
         rows.append(
-            {
-                "parameter": name,
-                "unit": unit,
-                "value": middle,
-                "velocity_elasticity_ratio": slopes[0],
-                "tmr_time_elasticity_ratio": slopes[1],
-                "points": [
-                    {"value": f * middle, "velocity_mps": fast, "tmr_flight_time_ratio": ratio}
-                    for f, (fast, ratio) in zip(FACTORS, others, strict=True)
-                ],
-            }
+            Sensitivity(
+                parameter=name,
+                unit=unit,
+                value=middle,
+                velocity_elasticity_ratio=_elasticity(below.velocity_mps, above.velocity_mps),
+                tmr_time_elasticity_ratio=_elasticity(
+                    below.tmr_flight_time_ratio, above.tmr_flight_time_ratio
+                ),
+                points=tuple(points),
+            )
         )
     return rows
 
 
-def _answers(
-    setting: ModelInputs, schemes: Mapping[str, Scheme]
-) -> tuple[float | None, float | None]:
-    fast = setting.velocity_mps(schemes[REFERENCE])
-    slow = setting.velocity_mps(schemes["tmr"])
-    return fast, None if fast is None or slow is None else fast / slow
+def _point(inputs: ModelInputs, value: float, schemes: Mapping[str, Scheme]) -> SensitivityPoint:
+    return SensitivityPoint(
+        value=value,
+        velocity_mps=inputs.velocity_mps(schemes[REFERENCE]),
+        tmr_flight_time_ratio=_time_ratio(inputs, schemes, "tmr"),
+    )
+
+
+def _elasticity(below: float | None, above: float | None) -> float | None:
+    if below is None or above is None:
+        return None
+    return math.log(above / below) / (2 * math.log(_STEP))
+
+
+def _time_ratio(inputs: ModelInputs, schemes: Mapping[str, Scheme], scheme: str) -> float | None:
+    """Flight time of a scheme over that of REFERENCE; None if either cannot fly."""
+    fast, slow = (inputs.velocity_mps(schemes[name]) for name in (REFERENCE, scheme))
+    return None if fast is None or slow is None else fast / slow
 
 
 # Calibration: the one free number of a vehicle from one published ratio of flight times --------
@@ -325,7 +460,7 @@ _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
 _STEPS = 200  # halvings of the interval; far below a float's resolution
 
 
-def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> dict[str, Any]:
+def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> CalibratedNumber:
     """Find the vehicle's free number that gives its published ratio.
 
     The ratio falls as the free number grows, so bisection finds it.
@@ -333,55 +468,43 @@ def _calibrate(vehicle: ModelVehicle, board: Board | None = None) -> dict[str, A
     Args:
         board: the board of the redundant computers; None: the calibration's own.
 
-    Returns:
-        The free `parameter` with its `value`, and ratios of flight times with TMR and with DMR, of
-        which the last is predicted and not fitted, over that with detection and recovery.
-
     Raises:
-        ConfigError: no value gives the ratio; says which ratios can be reached.
+        ConfigError: no value gives the ratio; the message names the ratios that can be reached.
         UnknownName: the calibration's board does not exist.
     """
-    plan = vehicle.calibration
-    assert plan is not None
-    board = board or Board.load(plan.board)
+    calibration = vehicle.calibration
+    assert calibration is not None
+    board = board or Board.load(calibration.board)
+    parameter, wanted = calibration.parameter, calibration.tmr_time_ratio
 
-    def ratio(value: float, scheme: str) -> float:
-        """Flight time of a scheme over the reference's; infinite if one of them cannot fly."""
-        free: dict[str, Any] = {plan.parameter: value}
-        full = replace(vehicle, calibration=None, **free)
-        assert full.rotor_pull_n is not None  # the vehicle has the number that is not calibrated
-        assert full.response_s is not None
-        setting = ModelInputs(
-            vehicle=full, board=board, pull_n=full.rotor_pull_n, range_m=full.range_m,
-            compute_s=full.response_s, distance_m=1.0,
-        )  # fmt: skip
-        fast, slow = (setting.velocity_mps(SCHEMES[name]) for name in (REFERENCE, scheme))
-        return math.inf if fast is None or slow is None else fast / slow
+    def ratio(value: float, scheme: str = "tmr") -> float:
+        """Flight time of a scheme over REFERENCE's; infinite if one of them cannot fly."""
+        inputs = _with_board(_with_number(vehicle, parameter, value), board, 1.0)
+        found = _time_ratio(inputs, SCHEMES, scheme)
+        return math.inf if found is None else found
 
     low = 1.0 / vehicle.sensor_hz
-    if plan.parameter == "rotor_pull_n":
+    if parameter == "rotor_pull_n":
         three_kg = vehicle.mass_kg + SCHEMES["tmr"].copies * board.total_kg
         low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
     value = low * _SPAN
-    least, most = ratio(value, "tmr"), ratio(low, "tmr")
-    if not least <= plan.tmr_time_ratio <= most:
+    least, most = ratio(value), ratio(low)
+    if not least <= wanted <= most:
         raise ConfigError(
-            f"no {plan.parameter} gives {vehicle.name!r} a ratio of {plan.tmr_time_ratio:g}; "
-            f"it can be {least:.3f} to {most:.3f}",
+            f"no {parameter} gives {vehicle.name!r} a ratio of {wanted:g}; it can be {least:.3f} "
+            f"to {most:.3f}",
             key="calibration.tmr_time_ratio",
         )
     for _ in range(_STEPS):
         middle = 0.5 * (low + value)
-        low, value = (
-            (middle, value) if ratio(middle, "tmr") > plan.tmr_time_ratio else (low, middle)
-        )
-    return {
-        "board": board.name,
-        "board_kg": board.total_kg,
-        "parameter": plan.parameter,
-        "value": value,
-        "unit": _FREE_UNITS[plan.parameter],
-        "published_tmr_ratio": plan.tmr_time_ratio,
-        "tmr_ratio": ratio(value, "tmr"),
-        "predicted_dmr_ratio": ratio(value, "dmr"),
-    }
+        low, value = (middle, value) if ratio(middle) > wanted else (low, middle)
+    return CalibratedNumber(
+        board=board.name,
+        board_kg=board.total_kg,
+        parameter=parameter,
+        value=value,
+        unit=_UNITS[parameter],
+        published_tmr_ratio=wanted,
+        tmr_ratio=ratio(value),
+        predicted_dmr_ratio=ratio(value, "dmr"),
+    )

@@ -7,12 +7,16 @@ import re
 import pyarrow as pa
 import pytest
 
-from mavfi_cli.analysis.beside_model import side_by_side
+from mavfi_cli.analysis.beside_model import (
+    FlightsReport,
+    MeasuredOverhead,
+    ModelAndFlights,
+    side_by_side,
+)
 from mavfi_cli.analysis.overhead import ComputeOverhead
-from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import measures_of
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.report.model import PICTURES, model_csv, model_lines
+from mavfi_cli.report.model import draw_flights, model_csv, model_json, model_lines
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.studies.redundancy import FlightPlan
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
@@ -25,7 +29,7 @@ STRAIGHT_M = 40.0 - 1.0
 def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
     """What a flight as the model has it records; or a slower one, or one of a longer path."""
     hover_w = HOVER_SHAFT_W * plan.rotors_w
-    velocity = row["velocity_mps"] / slower
+    velocity = row.performance.velocity_mps / slower
     time_s = longer * STRAIGHT_M / velocity
     return {
         "outcome": outcome,
@@ -37,9 +41,9 @@ def flight(row, plan, *, slower=1.0, longer=1.0, alarms=3, outcome="success"):
             "distance_m": longer * STRAIGHT_M, "energy_propeller_j": hover_w * time_s,
         },
         "referee": {"physics": {"hover_shaft_w": hover_w}},
-        "response_time_s": {"median": 1.0 / row["throughput_hz"]},
+        "response_time_s": {"median": 1.0 / row.performance.throughput_hz},
         "pilot": {"replans": 2},
-        "detection": {"alarm_count": alarms} if row["scheme"] in ("gad", "aad") else None,
+        "detection": {"alarm_count": alarms} if row.scheme in ("gad", "aad") else None,
     }  # fmt: skip
 
 
@@ -73,7 +77,7 @@ def spark(tmp_path):
     chain_s = sum(kernel.latency_s for kernel in x86.kernels.values())
     told = report([vehicle], Choices(), SCHEMES)
     setting = Choices().inputs(vehicle)
-    rows = {row["scheme"]: row for row in told["vehicles"][0]["schemes"]}
+    rows = {row.scheme: row for row in told.vehicles[0].schemes}
     plans = {
         ("spark", name): FlightPlan.of(setting, scheme, x86, chain_s, tmp_path).setup
         for name, scheme in SCHEMES.items()
@@ -90,67 +94,74 @@ def spark(tmp_path):
             detector="aad", flights=3, detection_s=0.01, recompute_s=0.0, compute_s=10.0,
             host_compute_s=0.2, alarms=9, platforms=("x86",),
         )  # fmt: skip
-        compared = side_by_side(told, asked, flights_of(flown), {"aad": overhead})
-        flights = {"worlds": ["w"], "missions_each": count, "first_seed": 1, "detectors": "mine",
-                   "stack": "mavbench", **compared}  # fmt: skip
-        return {**told, "flights": flights}
+        return told, FlightsReport(
+            worlds=("w",), missions_each=count, first_seed=1, detectors="mine", stack="mavbench",
+            overheads=(MeasuredOverhead.of(overhead),),
+            vehicles=side_by_side(told, asked, flights_of(flown)),
+        )  # fmt: skip
 
     return beside
 
 
 def rows_of(told):
-    return {row["scheme"]: row for row in told["flights"]["vehicles"][0]["schemes"]}
+    return {row.scheme: row for row in told[1].vehicles[0].schemes}
+
+
+def compared(group):
+    """Each number of the model that stands beside one of the flights."""
+    return [value for value in (getattr(group, name) for name in group.__slots__)
+            if isinstance(value, ModelAndFlights)]  # fmt: skip
 
 
 def test_flights_as_the_model_has_them_do_not_differ(spark):
     for row in rows_of(spark()).values():
-        differences = [key for key in row if key.endswith("_difference_percent")]
-        assert len(differences) == 10
-        for key in differences:
-            assert row[key] == pytest.approx(0.0, abs=1e-9), key
-        assert row["success_percent"] == 100.0
+        pairs = [*compared(row.flown), *compared(row.over_none), *compared(row.over_aad)]
+        assert len(pairs) == 12
+        for pair in pairs:
+            assert pair.difference_percent == pytest.approx(0.0, abs=1e-9)
+        assert row.flown.success.share == 1.0
 
 
 def test_tmr_takes_as_much_longer_as_the_paper_says(spark):
-    tmr = rows_of(spark())["tmr"]
-    assert tmr["flight_flight_time_over_aad_ratio"] == pytest.approx(1.91, rel=1e-3)
-    assert tmr["model_flight_time_over_aad_ratio"] == pytest.approx(1.91, rel=1e-3)
+    ratio = rows_of(spark())["tmr"].over_aad.flight_time_ratio
+    assert ratio.flights.value == pytest.approx(1.91, rel=1e-3)
+    assert ratio.model == pytest.approx(1.91, rel=1e-3)
 
 
 def test_by_how_much_a_flight_differs(spark):
     told = rows_of(spark({"tmr": {"slower": 1.25, "longer": 1.1}}))
-    tmr, none = told["tmr"], told["none"]
-    assert tmr["velocity_difference_percent"] == pytest.approx(-20.0)
-    assert tmr["path_ratio_difference_percent"] == pytest.approx(10.0)
-    assert tmr["flight_time_difference_percent"] == pytest.approx(37.5)
-    assert tmr["energy_difference_percent"] == pytest.approx(37.5)
-    assert none["flight_time_difference_percent"] == pytest.approx(0.0, abs=1e-9)
-    ratio = tmr["flight_flight_time_ratio"] / tmr["model_flight_time_ratio"]
-    assert ratio == pytest.approx(1.375)
-    assert tmr["flight_time_ratio_difference_percent"] == pytest.approx(37.5)
-    assert tmr["flight_velocity_ratio"] / tmr["model_velocity_ratio"] == pytest.approx(0.8)
+    tmr, ratios = told["tmr"].flown, told["tmr"].over_none
+    assert tmr.velocity_mps.difference_percent == pytest.approx(-20.0)
+    assert tmr.path_ratio.difference_percent == pytest.approx(10.0)
+    assert tmr.flight_time_s.difference_percent == pytest.approx(37.5)
+    assert tmr.energy_j.difference_percent == pytest.approx(37.5)
+    assert told["none"].flown.flight_time_s.difference_percent == pytest.approx(0.0, abs=1e-9)
+    time, velocity = ratios.flight_time_ratio, ratios.velocity_ratio
+    assert time.flights.value / time.model == pytest.approx(1.375)
+    assert time.difference_percent == pytest.approx(37.5)
+    assert velocity.flights.value / velocity.model == pytest.approx(0.8)
 
 
 def test_only_successes_count(spark):
     row = rows_of(spark({"dmr": {"outcome": "collision"}}))["dmr"]
-    assert row["success_percent"] == 0.0
-    assert row["outcomes"] == {"collision": 3}
-    assert math.isnan(row["flight_velocity_mps"])
-    assert row["pairs"] == 0
+    assert row.flown.success.share == 0.0
+    assert row.flown.outcomes == {"collision": 3}
+    assert math.isnan(row.flown.velocity_mps.flights.value)
+    assert row.over_none.pairs == 0
 
 
 def test_a_scheme_that_is_not_flown_says_why(spark):
     told = spark(refused=("tmr",))
-    assert rows_of(told)["tmr"]["problem"] == "too heavy to fly"
-    lines = model_lines(told)
+    assert rows_of(told)["tmr"].problem == "too heavy to fly"
+    lines = model_lines(*told)
     assert "tmr: not flown: too heavy to fly" in lines
-    rows = model_csv(told["flights"]).splitlines()
+    rows = model_csv(told[1]).splitlines()
     assert len(rows) == 6
     assert "too heavy to fly" in rows[3]
 
 
 def test_the_table_tells_overheads_side_by_side(spark):
-    text = "\n".join(model_lines(spark()))
+    text = "\n".join(model_lines(*spark()))
     assert "aad       0.1 %     0.1 %         0.0062 %  9 in 3 flights  5 %" in text
     assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
     assert "no detector" in text
@@ -159,7 +170,7 @@ def test_the_table_tells_overheads_side_by_side(spark):
 
 
 def test_what_has_no_number_has_none_in_the_table(spark):
-    lines = model_lines(spark({"dmr": {"outcome": "collision"}}, count=1))
+    lines = model_lines(*spark({"dmr": {"outcome": "collision"}}, count=1))
     lines = lines[next(n for n, line in enumerate(lines) if line.startswith("Flights in")) :]
     text = "\n".join(lines)
     assert "nan" not in text
@@ -169,26 +180,27 @@ def test_what_has_no_number_has_none_in_the_table(spark):
 
 
 def test_a_detector_that_does_not_know_these_flights(spark):
-    text = "\n".join(model_lines(spark({"aad": {"alarms": 683}})))
+    text = "\n".join(model_lines(*spark({"aad": {"alarms": 683}})))
     assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
 
 
 def test_the_picture(spark, tmp_path):
     told = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1)
-    write_figure(PICTURES["flights.svg"](told), tmp_path / "a.svg")
-    write_figure(PICTURES["flights.svg"](told), tmp_path / "b.svg")
+    write_figure(draw_flights(told[1]), tmp_path / "a.svg")
+    write_figure(draw_flights(told[1]), tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
-    left, right = PICTURES["flights.svg"](spark()).axes
+    left, right = draw_flights(spark()[1]).axes
     diamonds = [y for line in left.lines if line.get_marker() == "D" for y in line.get_ydata()]
-    drawn = [row["model_velocity_mps"] for row in rows_of(spark()).values()]
+    drawn = [row.flown.velocity_mps.model for row in rows_of(spark()).values()]
     assert diamonds == pytest.approx(drawn)
+    highest = rows_of(spark())["tmr"].over_none.energy_ratio
     heights = [bar.get_height() for bar in right.patches]
     assert len(heights) == 15
-    assert max(heights) == pytest.approx(rows_of(spark())["tmr"]["flight_energy_ratio"])
-    words = [text.get_text() for text in PICTURES["flights.svg"](told).axes[0].texts]
+    assert max(heights) == pytest.approx(highest.flights.value)
+    words = [text.get_text() for text in draw_flights(told[1]).axes[0].texts]
     assert "not flown" in words
     assert "0 % of 1 succeed" in words
 
 
 def test_it_is_json(spark):
-    assert json.dumps(plain(spark({"dmr": {"outcome": "collision"}})["flights"]))
+    assert json.dumps(model_json(*spark({"dmr": {"outcome": "collision"}})))

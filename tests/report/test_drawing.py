@@ -64,7 +64,7 @@ def test_a_detector_looks_the_same_in_every_picture(evaluated):
         DETECTORS["gad"], DETECTORS["aad"],
     }  # fmt: skip
     told = report([ModelVehicle.load("spark")], Choices(), SCHEMES)
-    (axes,) = model.PICTURES["redundancy.svg"](told).axes
+    (axes,) = model.MODEL_PICTURES["redundancy.svg"](told).axes
     named = {
         container.get_label(): to_hex(container.patches[0].get_facecolor())
         for container in axes.containers

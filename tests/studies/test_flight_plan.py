@@ -34,17 +34,18 @@ def files_of(plan):
 def test_mass_pull_and_velocity_are_the_model_s(plan, scheme):
     planned, setting = plan("spark", scheme)
     flown = setting.performance(SCHEMES[scheme])
+    mass_kg = setting.mass_kg(SCHEMES[scheme].copies)
     vehicle, _ = files_of(planned)
     assert vehicle["base"] == "spark"
-    assert vehicle["mass_kg"] + vehicle["extra_payload_kg"] == pytest.approx(flown["mass_kg"])
+    assert vehicle["mass_kg"] + vehicle["extra_payload_kg"] == pytest.approx(mass_kg)
     assert vehicle["rotor_pull_n"] == setting.pull_n
-    assert planned.mission.v_max_mps == flown["velocity_mps"]
-    assert planned.mission.a_max_mps2 == pytest.approx(min(flown["acceleration_mps2"], 8.0))
+    assert planned.mission.v_max_mps == flown.velocity_mps
+    assert planned.mission.a_max_mps2 == pytest.approx(min(flown.acceleration_mps2, 8.0))
     assert planned.mission.map_range_m == 7.0
     assert planned.mission.camera_rate_hz == 30.0
     assert planned.mission.detector is None
     assert planned.setup.boards_w == 10.0 * SCHEMES[scheme].copies
-    assert planned.setup.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, flown["mass_kg"]))
+    assert planned.setup.rotors_w == pytest.approx(hover_power_w(63.0, 0.3, mass_kg))
     assert vehicle["avionics_w"] == planned.setup.boards_w
 
 
@@ -108,7 +109,9 @@ def test_the_list_grows_pair_by_pair(plan, tmp_path):
         vehicles=(), choices=Choices(), worlds=("sparse", "dense"), missions=2, first_seed=5,
         folder=tmp_path,
     )  # fmt: skip
-    missions = ask.list_of({("spark", name): plan("spark", name)[0] for name in ("none", "tmr")})
+    missions = ask.missions_of(
+        {("spark", name): plan("spark", name)[0] for name in ("none", "tmr")}
+    )
     assert [(m.config.seed, m.config.world, m.labels["arm"]) for m in missions] == [
         (5, "sparse", "none"), (5, "sparse", "tmr"), (5, "dense", "none"), (5, "dense", "tmr"),
         (6, "sparse", "none"), (6, "sparse", "tmr"), (6, "dense", "none"), (6, "dense", "tmr"),

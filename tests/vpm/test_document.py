@@ -24,9 +24,9 @@ def test_the_example_files_load_and_are_used(tmp_path):
     half = load_platform(str(tmp_path / "platform.toml"))
     (one,) = report(
         [ModelVehicle.load(str(tmp_path / "vehicle.toml"))], Choices(platform=half), SCHEMES
-    )["vehicles"]
-    assert one["board"] == "half-tx2"
-    assert one["schemes"][0]["compute_kg"] == pytest.approx(0.1 + 0.0054 * 20.0)
+    ).vehicles
+    assert one.board == "half-tx2"
+    assert one.schemes[0].compute_kg == pytest.approx(0.1 + 0.0054 * 20.0)
 
 
 def test_the_table_of_calibrations():
@@ -35,8 +35,8 @@ def test_the_table_of_calibrations():
                       text, re.M)  # fmt: skip
     assert [row[0] for row in rows] == ["airsim", "spark"]
     for name, value, unit, tmr, dmr in rows:
-        (one,) = report([ModelVehicle.load(name)], Choices(), SCHEMES)["vehicles"]
-        found = one["calibrations"][0]
-        assert (f"{found['value']:.3g}", found["unit"]) == (value, unit)
-        assert f"{found['tmr_ratio']:.2f}" == tmr
-        assert f"{found['predicted_dmr_ratio']:.3f}" == dmr
+        (one,) = report([ModelVehicle.load(name)], Choices(), SCHEMES).vehicles
+        found = one.calibrations[0]
+        assert (f"{found.value:.3g}", found.unit) == (value, unit)
+        assert f"{found.tmr_ratio:.2f}" == tmr
+        assert f"{found.predicted_dmr_ratio:.3f}" == dmr
