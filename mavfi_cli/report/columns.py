@@ -24,12 +24,6 @@ def columns(rows: Iterable[Sequence[str]], labels: int | None = None) -> list[st
     return _aligned(_padded(rows), labels)
 
 
-def formed(rows: Iterable[Mapping[str, Any]], *cells: tuple[str, str]) -> list[str]:
-    """Align the formats of a row's cells, each below its heading."""
-    told = ([form.format_map(row) for _, form in cells] for row in rows)
-    return columns([[heading for heading, _ in cells], *told])
-
-
 def blocks(rows: Iterable[Sequence[str]], labels: int, width: int = WIDTH) -> list[str]:
     """Split the columns into several tables, each at most `width` characters wide.
 
