@@ -133,5 +133,5 @@ def margin(missions: int) -> float:
     contradicted: the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to half a
     point.
     """
-    high = wilson(0, missions, confidence_z=z_of(1.0 - LEVEL / _FAMILY)).high
+    high = wilson(0, missions, confidence=1.0 - LEVEL / _FAMILY).high
     return math.ceil(high / _STEP) * _STEP
