@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.summary import summarise
+from mavfi_cli.analysis.summary import groups, summarise
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.campaigns.progress import Progress, Spectator
@@ -138,7 +138,7 @@ def _missing(folder: Path) -> None:
 
 def _summarise(folder: Path) -> None:
     with Ledger(folder) as ledger:
-        assert len(summarise(ledger)["cells"]) == CELLS
+        assert len(summarise(ledger, groups(ledger)).cells) == CELLS
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,10 @@ import numpy as np
 
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical
+from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical
 from mavfi_cli.core.errors import ConfigError, RecordError, lack_of
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import Share, cross_layer, rate
+from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer, rate
 
 KERNELS = "kernels.json"
 
@@ -55,36 +55,51 @@ def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 
 
-def failures(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingFailures:
+    """Missions of a setting that its faults fail.
+
+    Attributes:
+        name: phrase for the setting.
+        failure: share of injected faults that fail a mission whose golden flight succeeds.
+        kernel: the only kernel that its faults strike at instruction level; None if there are
+            several.
+        layers: SDC of the isolated kernel beside it; None without runs of the isolated kernel.
+        per_hour: failures per flight hour with the ends of the interval; None unless requested.
+    """
+
+    labels: Labels
+    name: str
+    failure: Share
+    kernel: str | None
+    layers: CrossLayer | None
+    per_hour: tuple[float, float, float] | None
+
+
+def setting_failures(
     ledger: Ledger,
-    found: Sequence[Group],
+    groups: Sequence[Group],
     kernels: Path | None = None,
     upsets_per_hour: float | None = None,
     confidence: float = 0.95,
-) -> list[dict[str, Any]]:
+) -> list[SettingFailures]:
     """Failures of every setting with faults that has golden flights.
 
     Args:
+        kernels: folder of a summary of isolated kernels; None for no layers.
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
-
-    Returns:
-        Plain values. `name`: phrase for the setting. `failure`: share of injected faults that fail
-        a mission whose golden flight succeeds. `kernel`: the only kernel that its faults strike at
-        instruction level; None if there are several. `layers`: SDC of the isolated kernel beside
-        it; None without runs of the isolated kernel. `per_hour`: failures per flight hour with
-        interval; None unless requested.
 
     Raises:
         RecordError: the folder does not exist or cannot be read.
         ConfigError: the kernels were attacked with other faults; a negative rate.
     """
     alone = None if kernels is None else kernel_summary(kernels / KERNELS)
-    silent = {each["kernel"]: each["outcomes"]["sdc"] for each in alone["kernels"]} if alone else {}
-    succeeds = [each.codes("pair")[each.counted & each.succeeded]
-                for each in found if each.golden and not each.watched]  # fmt: skip
+    silent = {part["kernel"]: part["outcomes"]["sdc"] for part in alone["kernels"]} if alone else {}
+    succeeds = [group.codes("pair")[group.counted & group.succeeded]
+                for group in groups if group.golden and not group.watched]  # fmt: skip
     golden = np.concatenate([np.zeros(0, dtype=np.int64), *succeeds])
     rows = []
-    for group in found:
+    for group in groups:
         places = group.among("injected", _STRUCK) & np.isin(group.codes("pair"), golden)
         struck = int(places.sum())
         if group.golden or not struck:
@@ -92,22 +107,21 @@ def failures(
         failed = struck - int(group.succeeded[places].sum())
         failure = rate(failed, struck, confidence)
         numbers = group.codes("number")[places].tolist()
-        configs = [each.mission.config for each in ledger.results(numbers)] if alone else []
+        configs = list(ledger.configs(numbers)) if alone else []
         kernel, layers = _kernel(configs), None
         if kernels is not None and alone is not None and kernel in silent:
             _require_same_faults(configs[0], alone["plan"], kernels / KERNELS)
             sdc = silent[kernel]
             layers = cross_layer(sdc["count"], sdc["of"], failed, struck, confidence)
-        hourly = None if upsets_per_hour is None else failure.per_hour(upsets_per_hour)
         rows.append(
-            {
-                "labels": group.labels,
-                "name": group.name,
-                "failure": asdict(failure),
-                "kernel": kernel,
-                "layers": layers,
-                "per_hour": hourly,
-            }
+            SettingFailures(
+                labels=group.labels,
+                name=group.name,
+                failure=failure,
+                kernel=kernel,
+                layers=layers,
+                per_hour=None if upsets_per_hour is None else failure.per_hour(upsets_per_hour),
+            )
         )
     return rows
 

@@ -18,13 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from mavfi_cli.campaigns.ledger import (
-    METADATA,
-    ExportedLedger,
-    Ledger,
-    stored_export,
-    stored_provenance,
-)
+from mavfi_cli.campaigns.ledger import METADATA, Ledger, stored_export, stored_provenance
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     MissionResult,
@@ -33,7 +27,6 @@ from mavfi_cli.campaigns.missions import (
     canonical,
     changes_of,
 )
-from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.mission.measures import (
@@ -81,8 +74,8 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     Args:
         among: numbers of the missions to choose from; None means all.
     """
-    if isinstance(ledger, ExportedLedger):
-        table = _updated(ledger.table, ledger.folder)
+    if ledger.export is not None:
+        table = _updated(ledger.export, ledger.folder)
         return table if among is None else chosen(table, number=(*among,))
     labels = sorted({name for cell in ledger.cells() for name in cell})
     rows = [_row(entry, labels) for entry in ledger.results(among)]
@@ -183,7 +176,7 @@ def exported(ledger: Ledger) -> pa.Table:
     The metadata of the table hold its provenance.
     """
     whole = flights(ledger)
-    if isinstance(ledger, ExportedLedger):
+    if ledger.export is not None:
         return whole
     labels = [name for name in whole.column_names if name.startswith("label_")]
     mine = _typed(whole.select([*EXPORTED[:2], *labels, *EXPORTED[2:]]))
@@ -287,36 +280,19 @@ def changed(
 _COMPARED = frozenset(measures_of({})) | {"outcome"}
 
 
-def mission_of(campaign: Path, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
-    """One mission by its number, and the measures that it had.
-
-    Args:
-        campaign: its folder, or an exported .parquet file.
+def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
+    """One mission by its number, and its row of `flights`.
 
     Raises:
-        RecordError: there is no campaign, or it cannot be read.
+        RecordError: the campaign cannot be read.
         ConfigError: no such mission has flown.
     """
-    with ExportedLedger(campaign) if campaign.is_file() else Ledger(campaign) as ledger:
-        if isinstance(ledger, ExportedLedger):
-            for row in chosen(flights(ledger), number=number).to_pylist():
-                if row["outcome"] is not None:
-                    return _config(row, campaign), row
-        else:
-            for entry in ledger.results([number]):
-                if entry.outcome is not None:
-                    row = {**measures_of(entry.result), "outcome": entry.outcome}
-                    return entry.mission.config, row
-        problem = f"has no mission {number} that has flown ({number_span(ledger)})"
-    raise ConfigError(problem, path=campaign)
-
-
-def _config(row: Mapping[str, Any], export: Path) -> MissionConfig:
-    try:
-        return structure(json.loads(row["changes"]), MissionConfig)
-    except (TypeError, ValueError, ConfigError) as error:
-        problem = f"the changes of mission {row['number']} cannot be used ({error})"
-        raise RecordError(f"{export}: {problem}") from None
+    for row in flights(ledger, [number]).to_pylist():
+        if row["outcome"] is not None:
+            (config,) = ledger.configs([number])
+            return config, row
+    problem = f"has no mission {number} that has flown ({number_span(ledger)})"
+    raise ConfigError(problem, path=ledger.folder)
 
 
 def number_span(ledger: Ledger) -> str:

@@ -11,18 +11,20 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from mavfi_cli.analysis.summary import RESAMPLES, Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
+from mavfi_cli.campaigns.missions import Labels
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost
 from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.shares import Interval
 
 MEASURED = "measured"  # first word of the source of a measured overhead
 TIMES = " x "  # separates a platform's name from its latency factor in a file name
@@ -35,53 +37,75 @@ _LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
 # Relative to flight time ----------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightOverhead:
+    """The overhead of a detector in a setting. Shares are relative to flight time: 0.01 is 1 %.
+
+    Attributes:
+        labels: of the setting, with the detector.
+        flights: with checks.
+        checks_per_s: checks per second of flight.
+        check_host_s: mean time of a check on the host that flew.
+        detection_host_share: all checks, time of the host that flew.
+        recomputations: number in all flights, by stage.
+        recovery_share: simulated latency of recomputations, by stage.
+        recovery_share_in_all: sum over the stages.
+        share_in_all: detection and recovery, host time and simulated time added up as the paper
+            does.
+    """
+
+    labels: Labels
+    flights: int
+    checks_per_s: Interval
+    check_host_s: Interval
+    detection_host_share: Interval
+    recomputations: Mapping[str, float]
+    recovery_share: Mapping[str, Interval]
+    recovery_share_in_all: Interval
+    share_in_all: Interval
+
+    @classmethod
+    def of(cls, labels: Labels, costs: Sequence[DetectionCost], confidence: float) -> Self:
+        """Average the costs of one detector over its flights; at least one."""
+
+        def mean(values: Iterable[float]) -> Interval:
+            return interval([*values], confidence=confidence, resamples=RESAMPLES)
+
+        return cls(
+            labels={**labels, "detector": costs[0].detector},
+            flights=len(costs),
+            checks_per_s=mean(cost.checks / cost.flight_s for cost in costs),
+            check_host_s=mean(cost.check_host_s for cost in costs),
+            detection_host_share=mean(cost.detection_share for cost in costs),
+            recomputations={
+                stage: math.fsum(cost.recomputations[stage] for cost in costs) for stage in _STAGES
+            },
+            recovery_share={
+                stage: mean(cost.recovery_s[stage] / cost.flight_s for cost in costs)
+                for stage in _STAGES
+            },
+            recovery_share_in_all=mean(cost.recovery_share for cost in costs),
+            share_in_all=mean(cost.detection_share + cost.recovery_share for cost in costs),
+        )
+
+
 def flight_overheads(
-    ledger: Ledger, found: Sequence[Group], confidence: float = 0.95
-) -> list[dict[str, Any]]:
+    ledger: Ledger, groups: Sequence[Group], confidence: float = 0.95
+) -> list[FlightOverhead]:
     """Overheads of every setting with a detector; one row for each detector of a setting.
 
-    Returns:
-        Plain values; shares are relative to flight time, and 0.01 is one per cent. `labels`:
-        labels of the setting and the detector. `flights`: flights with checks. `checks_per_s`:
-        checks per second of flight. `check_host_s`: mean time of a check on the host that flew.
-        `detection_host_share`: all checks, time of the host that flew. `recomputations`: number in
-        all flights, by stage. `recovery_share`: simulated latency of recomputations, by stage;
-        `recovery_share_in_all`: sum over the stages. `share_in_all`: detection and recovery, host
-        time and simulated time added up as the paper does.
+    Raises:
+        RecordError: the campaign was opened from an export, which has no records of flights.
     """
     rows = []
-    for group in found:
-        flown: dict[str, list[DetectionCost]] = {}
-        for each in ledger.results(group.codes("number")[group.counted].tolist()):
-            cost = DetectionCost.of(each.result)
+    for group in groups:
+        costs: dict[str, list[DetectionCost]] = {}
+        for mission in ledger.results(group.codes("number")[group.counted].tolist()):
+            cost = DetectionCost.of(mission.result)
             if cost is not None:
-                flown.setdefault(cost.detector, []).append(cost)
-        rows += [_of_setting(group.labels, flown[name], confidence) for name in sorted(flown)]
+                costs.setdefault(cost.detector, []).append(cost)
+        rows += [FlightOverhead.of(group.labels, costs[name], confidence) for name in sorted(costs)]
     return rows
-
-
-def _of_setting(
-    labels: Mapping[str, Any], costs: Sequence[DetectionCost], confidence: float
-) -> dict[str, Any]:
-    def mean(values: Iterable[float]) -> dict[str, Any]:
-        return asdict(interval([*values], confidence=confidence, resamples=RESAMPLES))
-
-    return {
-        "labels": {**labels, "detector": costs[0].detector},
-        "flights": len(costs),
-        "checks_per_s": mean(cost.checks / cost.flight_s for cost in costs),
-        "check_host_s": mean(cost.check_host_s for cost in costs),
-        "detection_host_share": mean(cost.detection_share for cost in costs),
-        "recomputations": {
-            stage: math.fsum(cost.recomputations[stage] for cost in costs) for stage in _STAGES
-        },
-        "recovery_share": {
-            stage: mean(cost.recovery_s[stage] / cost.flight_s for cost in costs)
-            for stage in _STAGES
-        },
-        "recovery_share_in_all": mean(cost.recovery_share for cost in costs),
-        "share_in_all": mean(cost.detection_share + cost.recovery_share for cost in costs),
-    }
 
 
 # Relative to kernel time -------------------------------------------------------------------------
@@ -163,8 +187,8 @@ class ComputeOverhead:
             for detector, costs in counted.items()
         }
 
-    def told(self, where: str) -> str:
-        """The source of the number, for the table."""
+    def describe(self, where: str) -> str:
+        """Name the source of the overhead: flights, their place and platforms, and its parts."""
         again = self.share - self.checks_share
         left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
         return (

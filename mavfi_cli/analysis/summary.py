@@ -6,9 +6,8 @@ Reads the short rows of the ledger, because a campaign may have a million missio
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,12 +16,12 @@ import pyarrow.compute as pc
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers
 from mavfi_cli.analysis.pairs import partners
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import COUNTED, Injected, canonical, label_text
+from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import Interval, Share, rate
 
 RESAMPLES = 1999
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
@@ -31,6 +30,103 @@ TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
 INACTIVE = frozenset(each.value for each in Injected) - COUNTED
 _WHOLE = ("cell", "number")
 _WORDS = ("outcome", "injected", "pair")
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingSummary:
+    """Counts and means of one setting.
+
+    Attributes:
+        name: its labels in one phrase.
+        planned, errors: missions on the list; those of them that could not begin.
+        outcomes, injected: number of flown missions by outcome, and by what became of the fault.
+        success: over golden missions and faults that struck.
+        inactive: over faults that were not injected or not activated.
+        every: over all flown missions, as the paper counts.
+        metrics: means over the successful missions of `success`, by METRICS.
+    """
+
+    labels: Labels
+    name: str
+    planned: int
+    errors: int
+    outcomes: Mapping[str, int]
+    injected: Mapping[str, int]
+    success: Share
+    inactive: Share
+    every: Share
+    metrics: Mapping[str, Interval]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Two settings over the missions that both flew.
+
+    Attributes:
+        first, second: labels of the reference and of the other setting.
+        name: phrase for the other setting.
+        corrected_p: p-value of `success`, corrected by Holm over all comparisons of this kind.
+        differences: second minus first over the pairs in which both succeeded, by METRICS.
+        over_own: largest flight time over that of the golden flight of the same mission, both
+            successful.
+        over_mean: longest of the same flights over the mean of the same golden ones, as in the
+            paper. Both include what protection recovers, if the second setting is protected.
+    """
+
+    first: Labels
+    second: Labels
+    name: str
+    success: McNemar
+    corrected_p: float
+    differences: Mapping[str, Interval]
+    over_own: Mapping[str, float]
+    over_mean: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quality:
+    """A metric of a setting over its successful missions.
+
+    Attributes:
+        least, median, most: of the flights; NaN where there are none.
+        difference: from the golden flights of the same missions; None for golden settings.
+    """
+
+    labels: Labels
+    name: str
+    metric: str
+    mean: Interval
+    least: float
+    median: float
+    most: float
+    difference: Interval | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignSummary:
+    """A campaign by setting.
+
+    Attributes:
+        missions, over, missing: on the list; with a result; without one.
+        confidence: of all intervals.
+        faults: each setting with faults against the golden one.
+        protection: each protected setting against the unprotected one with the same faults.
+    """
+
+    name: str
+    missions: int
+    over: int
+    confidence: float
+    cells: Sequence[SettingSummary]
+    faults: Sequence[Comparison]
+    protection: Sequence[Comparison]
+    missing: int
+
+
+# Groups of missions -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)  # no slots: cached properties need a dict
@@ -47,7 +143,7 @@ class Group:
             of what the labels say but for the treatment, which is the fault.
     """
 
-    labels: Mapping[str, Any]
+    labels: Labels
     lacked: Sequence[str]
     planned: int
     errors: int
@@ -123,7 +219,7 @@ class Group:
         return here[here >= 0], there[here >= 0]
 
 
-def untreated(labels: Mapping[str, Any]) -> str:
+def untreated(labels: Labels) -> str:
     """The labels that protected and unprotected flights with the same faults share, as text."""
     return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
 
@@ -154,7 +250,7 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     ]
 
 
-def _short_rows(ledger: Ledger, labels: Sequence[Mapping[str, Any]]) -> pa.Table:
+def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
     kinds = dict.fromkeys(_WHOLE, pa.int64()) | dict.fromkeys(_WORDS, pa.string())
     schema = pa.schema(kinds | dict.fromkeys(METRICS, pa.float64()))
     portions = [
@@ -242,42 +338,29 @@ class _Match:
         return found
 
 
-def _against_golden(groups: Sequence[Group], confidence: float) -> list[dict[str, Any]]:
-    """Compare each setting with faults with the golden setting that shares most pairs.
-
-    Returns:
-        Plain values, over the missions that both flew. `first`, `second`: labels of the golden
-        setting and of the other; `name`: phrase for the other. `corrected_p`: corrected by Holm
-        over all comparisons of this kind. `differences`: second minus first, over the pairs in
-        which both succeeded. `over_own`: the largest flight time over that of the golden flight of
-        the same mission, both successful. `over_mean`: the longest of the same flights over the
-        mean of the same golden ones, as in the paper.
-    """
-    found = []
+def _against_golden(groups: Sequence[Group], confidence: float) -> list[Comparison]:
+    """Compare each setting with faults with the golden setting that shares most pairs."""
+    matches = []
     for group in groups:
         golden = _golden_for(group, groups)
         if golden is not None:
-            found.append(_Match(golden, group, golden, *golden.matched(group)))
-    return _compared(found, confidence)
+            matches.append(_Match(golden, group, golden, *golden.matched(group)))
+    return _compared(matches, confidence)
 
 
-def _protection(groups: Sequence[Group], confidence: float) -> list[dict[str, Any]]:
-    """Compare each protected setting with the unprotected one that has the same faults.
-
-    Returns:
-        As `_against_golden`; the worst cases include what protection recovers.
-    """
+def _protection(groups: Sequence[Group], confidence: float) -> list[Comparison]:
+    """Compare each protected setting with the unprotected one that has the same faults."""
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
     }
-    found = []
+    matches = []
     for group in groups:
         if not group.watched:
             continue
         faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
         if faulty is not None and golden is not None:
-            found.append(_Match(faulty, group, golden, *faulty.matched(group)))
-    return _compared(found, confidence)
+            matches.append(_Match(faulty, group, golden, *faulty.matched(group)))
+    return _compared(matches, confidence)
 
 
 def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
@@ -285,114 +368,81 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
     if group.golden:
         return None
     shared = [
-        (np.intersect1d(group.pairs, each.pairs, assume_unique=True).size, -index)
-        for index, each in enumerate(groups)
-        if each.golden and not each.watched
+        (np.intersect1d(group.pairs, other.pairs, assume_unique=True).size, -index)
+        for index, other in enumerate(groups)
+        if other.golden and not other.watched
     ]
     most = max(shared, default=(0, 0))
     return groups[-most[1]] if most[0] else None
 
 
-def _compared(matches: Sequence[_Match], confidence: float) -> list[dict[str, Any]]:
-    matches = [each for each in matches if len(each.at_second)]
-    tests = [McNemar.of(*each.success) for each in matches]
+def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
+    matches = [match for match in matches if len(match.at_second)]
+    tests = [McNemar.of(*match.success) for match in matches]
     corrected = holm([test.p_value for test in tests])
     rows = []
-    for each, test, p_value in zip(matches, tests, corrected, strict=True):
-        over_own, over_mean = each.worst()
+    for match, test, p_value in zip(matches, tests, corrected, strict=True):
+        over_own, over_mean = match.worst()
         rows.append(
-            {
-                "first": each.first.labels,
-                "second": each.second.labels,
-                "name": each.second.name,
-                "success": asdict(test),
-                "corrected_p": p_value,
-                "differences": {
-                    name: asdict(
-                        interval(each.differences(name), confidence=confidence, resamples=RESAMPLES)
-                    )
-                    for name in METRICS
+            Comparison(
+                first=match.first.labels,
+                second=match.second.labels,
+                name=match.second.name,
+                success=test,
+                corrected_p=p_value,
+                differences={
+                    name: _interval(match.differences(name), confidence) for name in METRICS
                 },
-                "over_own": over_own,
-                "over_mean": over_mean,
-            }
+                over_own=over_own,
+                over_mean=over_mean,
+            )
         )
     return rows
 
 
-def summarise(ledger: Ledger, by: Sequence[str] = (), confidence: float = 0.95) -> dict[str, Any]:
-    """Summarise the flown missions of a ledger.
+def _interval(values: FloatArray, confidence: float) -> Interval:
+    return interval(values, confidence=confidence, resamples=RESAMPLES)
 
-    Args:
-        by: labels by which settings are grouped; empty means all.
 
-    Returns:
-        Plain values. `cells`: one row per setting. `faults`: each setting with faults against the
-        golden one, as of `_against_golden`. `protection`: each protected setting against the
-        unprotected one, as of `_protection`.
-
-    Raises:
-        UnknownName: no setting has such a label.
-    """
-    found = groups(ledger, by)
+def summarise(
+    ledger: Ledger, settings: Sequence[Group], confidence: float = 0.95
+) -> CampaignSummary:
+    """Summarise the flown missions of a ledger by its settings; see `groups`."""
     missions, over = ledger.planned(), ledger.over()
-    return {
-        "name": ledger.meta("name") or ledger.folder.name,
-        "missions": missions,
-        "over": over,
-        "confidence": confidence,
-        "cells": [_cell(group, confidence) for group in found],
-        "faults": _against_golden(found, confidence),
-        "protection": _protection(found, confidence),
-        "missing": missions - over,
-    }
+    return CampaignSummary(
+        name=ledger.meta("name") or ledger.folder.name,
+        missions=missions,
+        over=over,
+        confidence=confidence,
+        cells=[_setting(group, confidence) for group in settings],
+        faults=_against_golden(settings, confidence),
+        protection=_protection(settings, confidence),
+        missing=missions - over,
+    )
 
 
-def _cell(group: Group, confidence: float) -> dict[str, Any]:
-    """One setting.
-
-    Returns:
-        `name`: its labels in one phrase. `planned`: missions on the list; `errors`: that could not
-        begin. `outcomes`: how the flown ones ended. `injected`: what became of the faults.
-        `success`: over golden missions and faults that struck; faults that were not injected or
-        not activated are in `inactive` only. `every`: success over all flown missions, as the
-        paper counts. `metrics`: of the successful ones among those of `success`, means with
-        bootstrap intervals.
-    """
-
-    def success(fates: frozenset[str]) -> dict[str, Any]:
+def _setting(group: Group, confidence: float) -> SettingSummary:
+    def success(fates: frozenset[str]) -> Share:
         chosen = group.succeeded[group.among("injected", fates)]
-        return asdict(rate(int(chosen.sum()), len(chosen), confidence))
+        return rate(int(chosen.sum()), len(chosen), confidence)
 
-    return {
-        "labels": group.labels,
-        "name": group.name,
-        "planned": group.planned,
-        "errors": group.errors,
-        "outcomes": group.counts("outcome"),
-        "injected": group.counts("injected"),
-        "success": success(COUNTED),
-        "inactive": success(INACTIVE),
-        "every": success(COUNTED | INACTIVE),
-        "metrics": {name: _mean(group, name, confidence) for name in METRICS},
-    }
-
-
-def _mean(group: Group, metric: str, confidence: float) -> dict[str, Any]:
-    values = group.successes(metric)
-    return asdict(interval(values, confidence=confidence, resamples=RESAMPLES))
+    return SettingSummary(
+        labels=group.labels,
+        name=group.name,
+        planned=group.planned,
+        errors=group.errors,
+        outcomes=group.counts("outcome"),
+        injected=group.counts("injected"),
+        success=success(COUNTED),
+        inactive=success(INACTIVE),
+        every=success(COUNTED | INACTIVE),
+        metrics={name: _interval(group.successes(name), confidence) for name in METRICS},
+    )
 
 
-def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """Every metric of every setting over its successful missions, metric by metric.
-
-    Returns:
-        Plain values. `name`: of the setting in one phrase. `mean`: with its bootstrap interval.
-        `least`, `median`, `most`: of the flights; not a number where there are none. `difference`:
-        to the golden flights of the same missions, with its bootstrap interval; None of golden
-        settings.
-    """
-    beside = {each["name"]: each["differences"] for each in _against_golden(groups, confidence)}
+def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality]:
+    """Every metric of every setting over its successful missions, metric by metric."""
+    golden = {row.name: row.differences for row in _against_golden(groups, confidence)}
     rows = []
     for metric in METRICS:
         for group in groups:
@@ -400,15 +450,15 @@ def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[dict[st
             ends = np.quantile(values, (0.0, 0.5, 1.0)) if len(values) else np.full(3, np.nan)
             least, middle, most = ends.tolist()
             rows.append(
-                {
-                    "labels": group.labels,
-                    "name": group.name,
-                    "metric": metric,
-                    "mean": _mean(group, metric, confidence),
-                    "least": least,
-                    "median": middle,
-                    "most": most,
-                    "difference": beside.get(group.name, {}).get(metric),
-                }
+                Quality(
+                    labels=group.labels,
+                    name=group.name,
+                    metric=metric,
+                    mean=_interval(values, confidence),
+                    least=least,
+                    median=middle,
+                    most=most,
+                    difference=golden.get(group.name, {}).get(metric),
+                )
             )
     return rows

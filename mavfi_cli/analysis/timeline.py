@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
+import pyarrow as pa
+
+from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.companion.pipeline import SAME_TICK_S
 from mavfi_cli.core.types import Invocation, Outcome, Reaction
 from mavfi_cli.mission.run_folder import Run
@@ -23,79 +26,105 @@ _MARGIN_S = 0.05
 _SAME_S = 1e-9
 
 
-def timelines(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Timelines of the platforms that answered, one row each, over the same time."""
-    alone = {name: _timeline_of(run) for name, run in runs.items()}
-    longest_s = max((row["shown_s"][1] for row in alone.values() if row), default=LEAST_S)
-    return [
-        {"platform": name, **row}
-        for name, run in runs.items()
-        if (row := _timeline_of(run, longest_s)) is not None
-    ]
+Span = tuple[float, float]  # begin and end, s from the frame's stamp
 
 
-def _timeline_of(run: Run, least_s: float = LEAST_S + _MARGIN_S) -> dict[str, Any] | None:
-    """The second of a flight after a typical depth frame; longer if the answer takes longer.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timeline:
+    """A second of a flight after a typical depth frame. Times in s count from the frame's stamp.
 
-    If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the
-    timeline ends with the first setpoint of the new plan. Times in s count from the frame's stamp.
-    `chain_s` holds the invocations that led to the setpoints, `lanes_s` all that ran in the window.
+    Attributes:
+        platform: its name.
+        frame_stamp_s: simulated time of the frame.
+        response_s: first setpoint that depends on the frame.
+        answer: what the pilot did.
+        plan_setpoint_s: first setpoint of the new plan; None without one.
+        shown_s: the window.
+        chain_s: the invocations that led to the setpoints, by kernel.
+        lanes_s: all invocations in the window, by kernel.
+        setpoints_s: all setpoints in the window.
+    """
+
+    platform: str
+    frame_stamp_s: float
+    response_s: float
+    answer: str
+    plan_setpoint_s: float | None
+    shown_s: Span
+    chain_s: Mapping[str, Span]
+    lanes_s: Mapping[str, Sequence[Span]]
+    setpoints_s: Sequence[float]
+
+
+def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
+    """Timelines of the platforms that answered, over the same time.
 
     Args:
-        run: run with time table and trace.
-        least_s: least duration after the frame.
-
-    Returns:
-        Plain values; None if no frame was answered.
+        runs: with time table and trace, by platform.
 
     Raises:
-        RecordError: the time table cannot be read.
+        RecordError: a time table cannot be read.
+    """
+    alone = [_timeline_of(name, run) for name, run in runs.items()]
+    longest_s = max((line.shown_s[1] for line in alone if line), default=LEAST_S)
+    return [line for name, run in runs.items() if (line := _timeline_of(name, run, longest_s))]
+
+
+def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) -> Timeline | None:
+    """The timeline of a flight, at least `least_s` long; None if no frame was answered.
+
+    If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the
+    timeline ends with the first setpoint of the new plan.
     """
     ran, reactions = run.folder.read_timetable()
-    told = {e["stamp_s"]: e["text"] for e in run.record.events if e["kind"] in _ANSWERS}
+    answers = {
+        event["stamp_s"]: event["text"] for event in run.record.events if event["kind"] in _ANSWERS
+    }
     stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
-    reaction = _typical(reactions, told)
+    reaction = _typical(reactions, answers)
     if reaction is None:
         return None
     zero_s, answer_s = reaction.frame_stamp_s, reaction.setpoint_stamp_s
     chain = _chain_of(ran, reaction)
-    plan = _planned(ran, answer_s) if answer_s in told else None
+    plan = _planned(ran, answer_s) if answer_s in answers else None
     plan_setpoint_s = None if plan is None else _answered(ran, stamps, plan.end_s)
     last_s = max(answer_s, plan_setpoint_s or 0.0) + _MARGIN_S
-    shown = (zero_s - _MARGIN_S, max(last_s, zero_s + least_s))
-    return {
-        "frame_stamp_s": zero_s,
-        "response_s": answer_s - zero_s,
-        "answer": told.get(answer_s, "knows of the frame"),
-        "plan_setpoint_s": None if plan_setpoint_s is None else plan_setpoint_s - zero_s,
-        "shown_s": [shown[0] - zero_s, shown[1] - zero_s],
-        "chain_s": {
-            each.node: [each.start_s - zero_s, each.end_s - zero_s]
-            for each in (*chain, *(() if plan is None else (plan,)))
-        },
-        "lanes_s": {
+    begin_s, end_s = zero_s - _MARGIN_S, max(last_s, zero_s + least_s)
+
+    def span(invocation: Invocation) -> Span:
+        return invocation.start_s - zero_s, invocation.end_s - zero_s
+
+    return Timeline(
+        platform=platform,
+        frame_stamp_s=zero_s,
+        response_s=answer_s - zero_s,
+        answer=answers.get(answer_s, "knows of the frame"),
+        plan_setpoint_s=None if plan_setpoint_s is None else plan_setpoint_s - zero_s,
+        shown_s=(begin_s - zero_s, end_s - zero_s),
+        chain_s={each.node: span(each) for each in (*chain, *(() if plan is None else (plan,)))},
+        lanes_s={
             kernel: [
-                [each.start_s - zero_s, each.end_s - zero_s]
+                span(each)
                 for each in ran
-                if each.node == kernel and each.end_s >= shown[0] and each.start_s <= shown[1]
+                if each.node == kernel and each.end_s >= begin_s and each.start_s <= end_s
             ]
             for kernel in KERNELS
         },
-        "setpoints_s": [s - zero_s for s in stamps if shown[0] <= s <= shown[1]],
-    }
+        setpoints_s=[stamp - zero_s for stamp in stamps if begin_s <= stamp <= end_s],
+    )
 
 
-def _typical(reactions: Sequence[Reaction], told: Collection[float]) -> Reaction | None:
+def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> Reaction | None:
     """The reaction whose time is nearest the median of the flight's; the first of equals.
 
     Args:
-        told: stamps of setpoints; reactions that end in one of them are preferred.
+        answers: stamps of setpoints; reactions that end in one of them are preferred.
     """
     if not reactions:
         return None
     times_s = {each: each.setpoint_stamp_s - each.frame_stamp_s for each in reactions}
     median_s = statistics.median(times_s.values())
-    chosen = [each for each in reactions if each.setpoint_stamp_s in told] or reactions
+    chosen = [each for each in reactions if each.setpoint_stamp_s in answers] or reactions
     return min(chosen, key=lambda each: (abs(times_s[each] - median_s), each.frame_stamp_s))
 
 
@@ -137,20 +166,22 @@ def _answered(
     return None
 
 
-def timeline_seed(flown: Sequence[Mapping[str, Any]], platforms: Sequence[str]) -> int | None:
+def timeline_seed(flights: pa.Table, platforms: Sequence[str]) -> int | None:
     """Seed of the first mission that succeeds and replans on all platforms.
 
     Without one, the first that succeeds on all platforms; else None.
 
     Args:
-        flown: golden and other flights, with the columns of `platforms.SCHEMA`.
+        flights: golden and other flights, with the columns of `platforms.SCHEMA`.
     """
+    golden = chosen(flights, target="", outcome=Outcome.SUCCESS.value)
+    columns = (golden[name].to_pylist() for name in ("seed", "platform", "replans"))
+    flown = list(zip(*columns, strict=True))
     for least in (1, 0):
         by_seed: dict[int, set[str]] = {}
-        for row in flown:
-            won = not row["target"] and row["outcome"] == Outcome.SUCCESS.value
-            if won and (row["replans"] or 0) >= least:
-                by_seed.setdefault(row["seed"], set()).add(row["platform"])
+        for seed, platform, replans in flown:
+            if (replans or 0) >= least:
+                by_seed.setdefault(seed, set()).add(platform)
         complete = [seed for seed, names in by_seed.items() if len(names) == len(platforms)]
         if complete:
             return min(complete)

@@ -5,22 +5,106 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Sequence
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
 
+from mavfi_cli.analysis.flights import flights, number_span
 from mavfi_cli.analysis.summary import TREATMENT, untreated
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import COUNTED, Injected, MissionResult, ResultState
+from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.run_folder import RESULT
 
 _KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnFlight:
+    """One flight of a picture.
+
+    Attributes:
+        number: of its mission.
+        name: of its setting, no longer than the flights beside it require.
+        flight_time_s: None if the flight has none.
+        path: its run folder.
+    """
+
+    number: int
+    name: str
+    outcome: str
+    flight_time_s: float | None
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """The flights of one fault.
+
+    Attributes:
+        title: the fault in words; empty without one.
+        flights: golden ones first, protected ones last.
+    """
+
+    title: str
+    flights: Sequence[DrawnFlight]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionPicture:
+    """The flights that share world, start and noise, panel by panel.
+
+    Attributes:
+        panels: one for each fault; at least one.
+        absent: what is not in the picture, and why, a line each.
+    """
+
+    panels: Sequence[Panel]
+    absent: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Flown:
+    number: int
+    labels: Labels
+    injected: str | None
+    detector: str | None
+    outcome: str
+    flight_time_s: float | None
+    path: Path | None
+
+    @property
+    def golden(self) -> bool:
+        return self.injected == Injected.GOLDEN.value
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether its process ended before it wrote the trace."""
+        return self.path is not None and self.path.is_dir() and not (self.path / RESULT).is_file()
+
+    @property
+    def setting(self) -> str:
+        """The name in the specification, else a description."""
+        named = self.labels.get("setting")
+        if named is not None:
+            return str(named)
+        kind = "golden" if self.golden else "fault"
+        return kind if self.detector is None else f"{kind}, {self.detector}"
+
+    @property
+    def treatment(self) -> list[str]:
+        """The rest of its treatment, which distinguishes settings of one name."""
+        values = (self.labels.get(name) for name in TREATMENT[1:])
+        return [
+            "no detector" if value == "none" else str(value)
+            for value in values
+            if value is not None
+        ]
+
+
 def pair(
     ledger: Ledger, number: int | None = None, among: Collection[int] | None = None
-) -> dict[str, Any]:
-    """The flights that share world, start and noise with a mission, panel by panel.
+) -> MissionPicture:
+    """Find the flights that share world, start and noise with a mission.
 
     Args:
         number: number of the mission. None selects the pair in which a fault prolongs a flight
@@ -28,52 +112,51 @@ def pair(
             run folders; the first pair of the list if no fault does.
         among: numbers of the missions to choose from and to draw; None means all.
 
-    Returns:
-        `panels`: a row a fault with its `title`, the fault in words, empty of golden flights; and
-        its `flights`, golden ones first, protected ones last: `number` of the mission, `name` of
-        its setting, as short as tells it from the others beside it, `outcome`, `flight_time_s`, and
-        the `path` of its run folder. `absent`: what is not in the picture, and why, a line each.
-
     Raises:
         ConfigError: the list has no such mission.
         RecordError: its pair is not flown, or not all of its run folders were kept.
     """
-    chosen = range(ledger.planned()) if among is None else among
+    listed = {row[0]: row for row in ledger.rows()}
+    chosen = listed.keys() if among is None else among
     number = _most_prolonged(ledger, chosen) if number is None else number
-    if not 0 <= number < ledger.planned():
-        last = ledger.planned() - 1
-        raise ConfigError(f"no mission {number}: the list has 0 to {last}", path=ledger.folder)
-    pairs = [(each, name) for each, _, name, _ in ledger.rows()]
-    mine = [each for each, name in pairs if name == pairs[number][1] and each in chosen]
-    over = list(ledger.results(mine))
-    flown = [each for each in over if each.state is ResultState.FLOWN]
+    if number not in listed:
+        problem = f"no mission {number}: the list has {number_span(ledger)}"
+        raise ConfigError(problem, path=ledger.folder)
+    pairs = {other: pair for other, _, pair, _ in listed.values()}
+    mine = [other for other in pairs if pairs[other] == pairs[number] and other in chosen]
+    over = flights(ledger, mine).to_pylist()
+    flown = [
+        _Flown(
+            number=row["number"],
+            labels=json.loads(listed[row["number"]][1]),
+            path=None if row["path"] is None else Path(row["path"]),
+            **{name: row[name] for name in ("injected", "detector", "outcome", "flight_time_s")},
+        )
+        for row in over
+        if row["state"] == ResultState.FLOWN.value
+    ]
     if not flown:
         raise RecordError(f"{ledger.folder}: nothing of mission {number}'s pair is flown")
-    lost = [each.number for each in flown if each.path is None]
+    lost = [flight.number for flight in flown if flight.path is None]
     if lost:
-        raise RecordError(f"{ledger.folder}: no run folder of {_told(lost)} was kept; {_KEPT}")
-    whole = [each for each in flown if not _cut_off(each)]
+        raise RecordError(f"{ledger.folder}: no run folder of {_missions(lost)} was kept; {_KEPT}")
+    whole = [flight for flight in flown if not flight.cut_off]
     if not whole:
-        raise RecordError(f"{ledger.folder}: {_told(mine)} left no record to draw")
-    missing = sorted(set(mine) - {each.number for each in over})
-    errors = [each for each in over if each.state is ResultState.ERROR]
-    return {
-        "panels": _panels(whole),
-        "absent": [
-            *(f"mission {each.number} could not begin: {each.reason}" for each in errors),
-            *(f"mission {each.number}: {each.outcome}, cut off before its record"
-              for each in flown if _cut_off(each)),
-            *([f"{_told(missing)} not flown yet"] if missing else []),
+        raise RecordError(f"{ledger.folder}: {_missions(mine)} left no record to draw")
+    missing = sorted(set(mine) - {row["number"] for row in over})
+    return MissionPicture(
+        panels=_panels(ledger, whole),
+        absent=[
+            *(f"mission {row['number']} could not begin: {row['reason']}"
+              for row in over if row["state"] == ResultState.ERROR.value),
+            *(f"mission {flight.number}: {flight.outcome}, cut off before its record"
+              for flight in flown if flight.cut_off),
+            *([f"{_missions(missing)} not flown yet"] if missing else []),
         ],
-    }  # fmt: skip
+    )  # fmt: skip
 
 
-def _cut_off(each: MissionResult) -> bool:
-    """Whether its process ended before it wrote the trace."""
-    return each.path is not None and each.path.is_dir() and not (each.path / RESULT).is_file()
-
-
-def _told(numbers: Sequence[int]) -> str:
+def _missions(numbers: Sequence[int]) -> str:
     return f"mission{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
@@ -103,56 +186,38 @@ def _most_prolonged(ledger: Ledger, among: Collection[int]) -> int:
     return first[max(complete, key=lambda name: (increase.get(name, 0.0), -first[name]))]
 
 
-def _panels(flown: Sequence[MissionResult]) -> list[dict[str, Any]]:
-    golden = [each for each in flown if each.injected is Injected.GOLDEN]
-    struck: dict[str, list[MissionResult]] = {}
-    for each in flown:
-        if each.injected is not Injected.GOLDEN:
-            struck.setdefault(untreated(each.mission.labels), []).append(each)
+def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[Panel]:
+    golden = [flight for flight in flown if flight.golden]
+    struck: dict[str, list[_Flown]] = {}
+    for flight in flown:
+        if not flight.golden:
+            struck.setdefault(untreated(flight.labels), []).append(flight)
     panels = []
     for those in struck.values():
-        config = those[0].mission.config
-        asked = config.fault or config.instruction
-        panels.append(_panel("" if asked is None else asked.words(), golden + those))
+        (config,) = ledger.configs([those[0].number])
+        fault = config.fault or config.instruction
+        panels.append(_panel("" if fault is None else fault.words(), golden + those))
     return panels or [_panel("", golden)]
 
 
-def _panel(title: str, flown: Sequence[MissionResult]) -> dict[str, Any]:
-    def order(each: MissionResult) -> tuple[bool, bool, int]:
-        watched = each.mission.config.detector is not None
-        return watched, each.injected is not Injected.GOLDEN, each.number
-
-    ordered = sorted(flown, key=order)
-    short = [_setting(each) for each in ordered]
-    often = Counter(short)
-    return {
-        "title": title,
-        "flights": [
-            {
-                "number": each.number,
-                "name": name if often[name] == 1 else ", ".join([name, *_treatment(each)]),
-                "outcome": each.outcome,
-                "flight_time_s": fields_of(each.result)["flight_time_s"],
-                "path": each.path,
-            }
-            for name, each in zip(short, ordered, strict=True)
-            if each.path is not None
+def _panel(title: str, flown: Sequence[_Flown]) -> Panel:
+    ordered = sorted(
+        flown, key=lambda flight: (flight.detector is not None, not flight.golden, flight.number)
+    )
+    often = Counter(flight.setting for flight in ordered)
+    return Panel(
+        title=title,
+        flights=[
+            DrawnFlight(
+                number=flight.number,
+                name=", ".join(
+                    [flight.setting, *(flight.treatment if often[flight.setting] > 1 else [])]
+                ),
+                outcome=flight.outcome,
+                flight_time_s=flight.flight_time_s,
+                path=flight.path,
+            )
+            for flight in ordered
+            if flight.path is not None
         ],
-    }
-
-
-def _setting(each: MissionResult) -> str:
-    """The name in the specification, else a description."""
-    named = each.mission.labels.get("setting")
-    if named is not None:
-        return str(named)
-    watched = each.mission.config.detector
-    told = "golden" if each.injected is Injected.GOLDEN else "fault"
-    return told if watched is None else f"{told}, {watched.name}"
-
-
-def _treatment(each: MissionResult) -> list[str]:
-    """The rest of its treatment, to tell settings of one name apart."""
-    labels = each.mission.labels
-    told = [str(labels[name]) for name in TREATMENT[1:] if labels.get(name) is not None]
-    return ["no detector" if name == "none" else name for name in told]
+    )

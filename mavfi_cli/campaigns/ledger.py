@@ -89,7 +89,13 @@ class Ledger:
     """One campaign's missions and results.
 
     A context manager that closes it. Any number may read while one writes.
+
+    Attributes:
+        export: the table of flights if it was opened from an export, which has no records; else
+            None.
     """
+
+    export: pa.Table | None = None
 
     def __init__(self, folder: Path, *, writing: bool = False, memory: bool = False) -> None:
         """Open the ledger of a folder; a writer creates it if there is none.
@@ -405,6 +411,25 @@ class Ledger:
                     )
                 yield found
 
+    def configs(self, numbers: Sequence[int]) -> Iterator[MissionConfig]:
+        """Configurations of these missions, in the order of the list.
+
+        Raises:
+            RecordError: an export has changes that make no mission.
+        """
+        rows = self._rows(
+            "SELECT number, changes FROM missions "
+            "WHERE number IN (SELECT value FROM json_each(?)) ORDER BY number",
+            json.dumps(list(numbers)),
+        )
+        for number, changes in rows:
+            try:
+                config = structure(_object(changes), MissionConfig)
+            except (TypeError, ValueError, ConfigError) as error:
+                problem = f"the changes of mission {number} cannot be used ({error})"
+                raise RecordError(f"{self.folder}: {problem}") from None
+            yield config
+
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
         """Columns of every flown mission, in the order of the list and in portions.
 
@@ -482,13 +507,13 @@ class ExportedLedger(Ledger):
     """
 
     def __init__(self, path: Path) -> None:
-        self.table = stored_export(path)
+        self.export = table = stored_export(path)
         super().__init__(path, memory=True)
-        origin = stored_provenance(self.table)
-        labels = [name for name in self.table.column_names if name.startswith(_LABEL)]
+        origin = stored_provenance(table)
+        labels = [name for name in table.column_names if name.startswith(_LABEL)]
         cells: dict[str, int] = {}
         missions = []
-        rows = self.table.to_pylist()
+        rows = table.to_pylist()
         for row in rows:
             own = {name.removeprefix(_LABEL): row[name] for name in labels if row[name] is not None}
             try:

@@ -18,6 +18,7 @@ from mavfi_cli.mission.measures import FlightRecord, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
+Labels = Mapping[str, Label]  # of a setting, by name
 _FIRST = ("setting", "world")  # labels that come before the others
 
 
@@ -33,7 +34,7 @@ class PlannedMission:
     """
 
     config: MissionConfig
-    labels: Mapping[str, Label] = field(default_factory=dict)
+    labels: Labels = field(default_factory=dict)
     pair: str = ""
 
     def __post_init__(self) -> None:
@@ -98,7 +99,7 @@ def kind_of(changes: Mapping[str, Any], apart: Collection[str]) -> str:
     return canonical(kind)
 
 
-def label_text(labels: Mapping[str, Any]) -> str:
+def label_text(labels: Labels) -> str:
     """A setting in one phrase; the same whatever the order of its labels."""
     told = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
     return " ".join(told) or "all missions"
@@ -116,7 +117,7 @@ def ordered(names: Iterable[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def naming(labels: Mapping[str, Label]) -> Iterator[None]:
+def naming(labels: Labels) -> Iterator[None]:
     """Make a known error inside name the setting that it concerns.
 
     Raises:

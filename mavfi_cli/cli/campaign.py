@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from mavfi_cli.cli.grouped import (
     GroupedOption,
     GroupOfCommands,
     given_options,
+    names_in,
     refuse_given,
 )
 from mavfi_cli.cli.parameters import (
@@ -33,6 +34,7 @@ from mavfi_cli.cli.parameters import (
 from mavfi_cli.core.output_paths import OutFile
 from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
+from mavfi_cli.report.table import FORMATS
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
@@ -47,8 +49,8 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
                   "Quote a value that contains a comma, or write all values as a TOML list. The "
                   "change becomes part of the folder name.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
-# Options of `status` with which it prints everything.
-_FULL = {"full", "by", "confidence", "quality", "overhead", "failures"}
+# Options of `status` that imply --full.
+_FULL = {"by", "confidence", "quality", "overhead", "failures"}
 _OPEN_CLUSTER = (
     "warning: {} has no TLS: any user who can connect to it, and that is every user of its host, "
     "can run programs as you there, on the workers and here (docs/how-to/cluster.md)"
@@ -152,7 +154,9 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
               help="Print all settings and comparisons instead of one screen. --by, --confidence, "
                    "--quality, --overhead and --failures imply it.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the whole summary as JSON.")
-def status(what: str, by: str | None, confidence: float, as_json: bool, **options: Any) -> None:
+def status(
+    what: str, by: str | None, confidence: float, as_json: bool, full: bool, **parts: Any
+) -> None:
     """Show what is flown, the time left and one table, also while the campaign runs.
 
     The table is the paper's if the campaign is a preset of the paper, else that of the settings.
@@ -160,12 +164,11 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
     """
     from mavfi_cli.campaigns.begin import opened
 
-    if not options["failures"] and (options["kernels"] or options["upsets"] is not None):
+    if not parts["failures"] and (parts["kernels"] or parts["upsets"] is not None):
         raise click.UsageError("--kernels and --upsets go with --failures")
-    full = bool(given_options().keys() & _FULL)
+    full = full or bool(given_options().keys() & _FULL)
     with opened(what) as ledger:
-        names = [name for name in (by or "").split(",") if name]
-        _show(ledger, names, confidence, as_json=as_json, more=options, full=full)
+        _show(ledger, names_in(by or ""), confidence, as_json=as_json, full=full, **parts)
 
 
 @campaign.command()
@@ -173,7 +176,7 @@ def status(what: str, by: str | None, confidence: float, as_json: bool, **option
 @click.option("--item", type=ITEM, metavar="ITEM",
               help="Figure or table of the paper, such as fig12 of table4; needed in the folder "
                    "of `mavfi reproduce`  [that of the preset].")  # fmt: skip
-@click.option("--format", "form", type=click.Choice(["text", "markdown", "latex", "csv"]),
+@click.option("--format", "form", type=click.Choice([*FORMATS]),
               default="text", show_default=True, help="Format of the table.")  # fmt: skip
 @click.option("--output", metavar="FILE", type=OutFile(PICTURES),
               help="Draw the figure into this .svg, .pdf or .png file.")  # fmt: skip
@@ -188,11 +191,10 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
     from mavfi_cli.paper.figures import draw
     from mavfi_cli.paper.status import shown
     from mavfi_cli.report.drawing import write_figure
-    from mavfi_cli.report.paper import FORMATS
 
     with opened(what) as ledger:
         table, flights = shown(ledger, item)
-        echo(FORMATS[form](table), nl=False)
+        echo(table.formatted(form), nl=False)
         if output is not None:
             write_figure(draw(table, flights, columns), output)
             note(f"figure: {output}")
@@ -236,6 +238,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 
     Reads the kept run folders of all settings of the pair. Each fault has a panel.
     """
+    from dataclasses import asdict
+
     from mavfi_cli.analysis.trajectories import pair
     from mavfi_cli.campaigns.begin import opened
     from mavfi_cli.core.files import plain
@@ -247,10 +251,10 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         flown = Trajectories.of(chosen)
         write_figure(flown.draw(), output)
     if as_json:
-        told = {**chosen, "picture": output}
+        told = {**asdict(chosen), "picture": output}
         echo(json.dumps(plain(told), indent=2, default=str))
     else:
-        absent = [f"not in the picture: {text}" for text in chosen["absent"]]
+        absent = [f"not in the picture: {text}" for text in chosen.absent]
         echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
 
 
@@ -362,50 +366,21 @@ def _show(
     confidence: float = 0.95,
     *,
     as_json: bool,
-    more: Mapping[str, Any] | None = None,
     full: bool = False,
+    **parts: Any,
 ) -> None:
-    from mavfi_cli.campaigns.begin import stopped, stored_spec
     from mavfi_cli.core.files import plain
     from mavfi_cli.paper.status import progress_lines, short, shown
-    from mavfi_cli.report.campaign import campaign_lines
+    from mavfi_cli.report.campaign import CampaignReport, state_lines
 
     if as_json:
-        told = _summary(ledger, by, confidence, more or {})
-        echo(json.dumps(plain(told), indent=2))
+        report = CampaignReport.of(ledger, by, confidence, **parts)
+        echo(json.dumps(plain(report.as_dict()), indent=2))
         return
-    lines, spec = progress_lines(ledger), stored_spec(ledger)
-    if spec is not None and spec.fixed_world is not None:
-        lines.append(spec.fixed_world.told())
-    lines += [f"known well enough, so not flown on: {text}" for text in stopped(ledger)]
+    lines = [*progress_lines(ledger), *state_lines(ledger)]
     if full:
-        lines += campaign_lines(_summary(ledger, by, confidence, more or {}))
+        lines += CampaignReport.of(ledger, by, confidence, **parts).lines()
     else:
         table, _ = shown(ledger)
-        lines += ["", short(table).text().rstrip()]
+        lines += ["", short(table).formatted("text").rstrip()]
     echo("\n".join(lines))
-
-
-def _summary(
-    ledger: Ledger, by: Sequence[str], confidence: float, asked: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The summary with the results of --quality, --overhead and --failures, as plain values."""
-    from dataclasses import asdict
-
-    from mavfi_cli.analysis.failures import failures
-    from mavfi_cli.analysis.overhead import flight_overheads
-    from mavfi_cli.analysis.summary import groups, qualities, summarise
-    from mavfi_cli.campaigns.begin import stopped, stored_spec
-
-    spec = stored_spec(ledger)
-    told = {**summarise(ledger, by, confidence), "stopped": stopped(ledger)}
-    if spec is not None and spec.fixed_world is not None:
-        told["fixed_world"] = asdict(spec.fixed_world)
-    found = groups(ledger, by) if any(map(asked.get, ("quality", "overhead", "failures"))) else []
-    if asked.get("quality"):
-        told["quality"] = qualities(found, confidence)
-    if asked.get("overhead"):
-        told["overhead"] = flight_overheads(ledger, found, confidence)
-    if asked.get("failures"):
-        told["failures"] = failures(ledger, found, asked["kernels"], asked["upsets"], confidence)
-    return told

@@ -14,7 +14,7 @@ import click
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import PLATFORM, STACK
 from mavfi_cli.core.terminal import echo
-from mavfi_cli.report.columns import WIDTH, columns
+from mavfi_cli.report.table import WIDTH, Table
 
 if TYPE_CHECKING:
     from mavfi_cli.spec.platform import PlatformProfile
@@ -248,4 +248,4 @@ def states(as_json: bool) -> None:
     if as_json:
         echo(json.dumps(rows, indent=2))
         return
-    echo("\n".join(columns([[*rows[0]], *([*row.values()] for row in rows)])))
+    echo("\n".join(Table.of_records(rows).lines()))

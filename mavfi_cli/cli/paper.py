@@ -67,7 +67,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
         return
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
-        echo(table.text() if len(plan.items) == 1 else one_line, nl=False)
+        echo(table.formatted("text") if len(plan.items) == 1 else one_line, nl=False)
     if any(item.preset for item in plan.items):
         echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
         echo(f"The page            mavfi report {plan.out} -o report.html")

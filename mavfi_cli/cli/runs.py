@@ -156,10 +156,12 @@ def _repeat_mission(
     campaign: Path, number: int, out: Path, *, with_fault: bool, firmware: str | None
 ) -> _Comparison:
     from mavfi_cli.analysis.flights import differing, mission_of
+    from mavfi_cli.campaigns.begin import opened
     from mavfi_cli.mission.run import fly_to_end
     from mavfi_cli.report.summary import outcome_line
 
-    config, row = mission_of(campaign, number)
+    with opened(campaign) as ledger:
+        config, row = mission_of(ledger, number)
     config.require_firmware(firmware)
     config = config if with_fault else config.golden
     note(f"flying mission {number}: {config.world}, seed {config.seed}")

@@ -152,7 +152,7 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
 
             measured = recorded_overheads(Path(text), DETECTORS, platform)
             overheads |= {
-                name: (100.0 * own.share, own.told(text)) for name, own in measured.items()
+                name: (100.0 * own.share, own.describe(text)) for name, own in measured.items()
             }
             continue
         try:

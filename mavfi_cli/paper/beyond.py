@@ -65,8 +65,8 @@ def _flow(
         "fates": fates,
         "lost": flights.share(),
         "harmed": flights.share("harmed"),
-        "silent": layers and Share(**layers["corruption"]),
-        "given_silent": layers and layers["failure_given_corruption"],
+        "silent": layers and layers.corruption,
+        "given_silent": layers and layers.failure_given_corruption,
     }
 
 

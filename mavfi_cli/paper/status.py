@@ -13,7 +13,7 @@ from mavfi_cli.analysis.failures import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import groups
-from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
+from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import PRESETS
 from mavfi_cli.core.errors import RecordError, UnknownName
@@ -28,8 +28,8 @@ from mavfi_cli.paper.items import (
     printed,
 )
 from mavfi_cli.paper.layouts import of_flights
-from mavfi_cli.report.campaign import SettingColumns
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.report.setting_table import SettingColumns
 from mavfi_cli.stats.shares import rate
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
@@ -176,7 +176,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
         labels=settings.heads,
         columns=(PaperColumn(title="success, %", ends=0), *(PaperColumn(title=x) for x in _MEANS)),
         rows=tuple(rows),
-        notes=(*settings.told(), about),
+        notes=(*settings.notes, about),
     )
 
 
@@ -220,7 +220,7 @@ def progress_lines(ledger: Ledger) -> list[str]:
     planned, over = ledger.planned(), ledger.over()
     errors = sum(ledger.errors_by_cell().values())
     name = ledger.meta("name") or ledger.folder.name
-    if isinstance(ledger, ExportedLedger):
+    if ledger.export is not None:
         lines = [f"{name}: {over} missions in an export"]
     else:
         lines = [f"{name}: {over} of {planned} missions"]

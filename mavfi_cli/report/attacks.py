@@ -14,8 +14,8 @@ from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
-from mavfi_cli.report.columns import blocks, csv_text
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
+from mavfi_cli.report.table import WIDTH, Table
 from mavfi_cli.stats.shares import Cluster, clustered_share, unseen_share
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ def _kernel_table(summary: Mapping[str, Any]) -> str:
         [each["title"], str(each["runs"]), *(_cell(each["outcomes"][o.value]) for o in _SHOWN)]
         for each in summary["kernels"]
     ]
-    lines = blocks([head, *rows], labels=1)
+    lines = Table([head, *rows], labels=1).lines(WIDTH)
     lines.append("")
     lines.append(
         f"sampling: {summary['sampling']}; one fault a run; share of injected runs, "
@@ -340,7 +340,7 @@ def save_runs(
         told = {"summary": summary, "golden": golden, "runs": list(runs.records)}
         columns = PROGRAM_COLUMNS
     rows = (_cells(entry, columns) for runs in campaign for entry in runs.records)
-    write_text(folder / "kernels.csv", csv_text(rows, columns))
+    write_text(folder / "kernels.csv", Table.of_records(rows, columns).csv())
     write_json(folder / KERNELS, told)
     if "kernels" not in summary:
         return KERNELS, "kernels.csv"

@@ -6,21 +6,36 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.summary import INACTIVE, METRICS
-from mavfi_cli.campaigns.missions import label_text, label_value, ordered
+from mavfi_cli.analysis.failures import SettingFailures, setting_failures
+from mavfi_cli.analysis.overhead import FlightOverhead, flight_overheads
+from mavfi_cli.analysis.summary import (
+    INACTIVE,
+    METRICS,
+    CampaignSummary,
+    Comparison,
+    Quality,
+    SettingSummary,
+    groups,
+    qualities,
+    summarise,
+)
+from mavfi_cli.campaigns.begin import stopped, stored_spec
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import label_text
+from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.columns import blocks, number, percent, spread
-from mavfi_cli.stats.paired import McNemar
+from mavfi_cli.report.setting_table import SettingColumns, SettingRow
+from mavfi_cli.report.table import number, percent, rate, spread
+from mavfi_cli.stats.shares import Interval
 
-Row = Mapping[str, Any]
 _STAGES = tuple(stage.value for stage in Stage)
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),
@@ -30,121 +45,105 @@ _TITLES = {
 }
 
 
-def campaign_lines(told: Row) -> list[str]:
-    """The parts that the plain values of a campaign have.
-
-    Args:
-        told: `analysis.summary.summarise`, and any of `quality` of `qualities`, `overhead` of
-            `flight_overheads`, `failures` of `failures`.
-    """
-    confidence, lines = told.get("confidence", 0.95), []
-    if "cells" in told:
-        lines += _summary(told)
-    if "quality" in told:
-        lines += _quality(told["quality"], confidence)
-    if "overhead" in told:
-        lines += _overhead(told["overhead"], confidence)
-    if "failures" in told:
-        lines += ["", "injected faults that fail missions which succeed without:"]
-        if not told["failures"]:
-            lines.append("  none: no setting has struck missions and golden flights of them")
-        for each in told["failures"]:
-            lines += [f"  {each['name']}", *(f"    {part}" for part in _parts(each))]
-    return lines
-
-
-# Settings as rows: a column per distinguishing label; common labels are printed once ------------
-
-
-@dataclass(frozen=True, slots=True)
-class SettingColumns:
-    """Columns and common labels of some settings.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignReport:
+    """All that `mavfi campaign status` reports of a campaign.
 
     Attributes:
-        keys: the labels that have a column, in order.
-        common: other labels, which have one value in all settings that have them.
+        stopped: settings that the stopping rule has ended early.
+        fixed_world: None without one.
+        quality, overhead, failures: None unless requested.
     """
 
-    keys: tuple[str, ...]
-    common: Mapping[str, Any]
+    summary: CampaignSummary
+    stopped: Sequence[str] = ()
+    fixed_world: FixedWorld | None = None
+    quality: Sequence[Quality] | None = None
+    overhead: Sequence[FlightOverhead] | None = None
+    failures: Sequence[SettingFailures] | None = None
 
     @classmethod
-    def of(cls, settings: Sequence[Mapping[str, Any]]) -> SettingColumns:
-        """The columns of settings, from their labels. They differ without the common ones.
-
-        A single setting has no columns, because its name is enough.
-        """
-        if len(settings) == 1:
-            return cls((), {})
-        keys = ordered({key for labels in settings for key in labels})
-        common: dict[str, Any] = {}
-        for key in reversed(keys):
-            values = {label_value(labels[key]): labels[key] for labels in settings if key in labels}
-            left = [each for each in keys if each not in common and each != key]
-            apart = {tuple(_cells(labels, left)) for labels in settings}
-            if len(values) == 1 and len(apart) == len(settings):
-                (common[key],) = values.values()
-        return cls(tuple(key for key in keys if key not in common), common)
-
-    @property
-    def heads(self) -> tuple[str, ...]:
-        """Headings of the labels' columns."""
-        return self.keys or ("setting",)
-
-    def told(self) -> list[str]:
-        """The line of common labels above a table; no line if there are none."""
-        return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
-
-    def table(
-        self, head: Sequence[str], rows: Sequence[tuple[Mapping[str, Any], str, Sequence[str]]]
-    ) -> list[str]:
-        """One line per setting, in several tables if the screen is too narrow.
+    def of(
+        cls,
+        ledger: Ledger,
+        by: Sequence[str] = (),
+        confidence: float = 0.95,
+        *,
+        quality: bool = False,
+        overhead: bool = False,
+        failures: bool = False,
+        kernels: Path | None = None,
+        upsets: float | None = None,
+    ) -> Self:
+        """Analyse a campaign.
 
         Args:
-            head: head of the cells.
-            rows: labels, name and cells of each setting.
+            by: labels by which settings are grouped; empty means all.
+            confidence: of all intervals.
+            quality, overhead, failures: parts to add.
+            kernels, upsets: as `analysis.failures.failures` takes them.
+
+        Raises:
+            UnknownName: no setting has such a label.
+            MavfiError: as `flight_overheads` and `failures`.
         """
-        labels = [self.cells(labels, name) for labels, name, _ in rows]
-        heads = list(self.heads)
-        told = [[*own, *cells] for own, (_, _, cells) in zip(labels, rows, strict=True)]
-        return blocks([[*heads, *head], *told], len(heads))
+        spec, found = stored_spec(ledger), groups(ledger, by)
+        return cls(
+            summary=summarise(ledger, found, confidence),
+            stopped=stopped(ledger),
+            fixed_world=None if spec is None else spec.fixed_world,
+            quality=qualities(found, confidence) if quality else None,
+            overhead=flight_overheads(ledger, found, confidence) if overhead else None,
+            failures=setting_failures(ledger, found, kernels, upsets, confidence)
+            if failures
+            else None,
+        )
 
-    def cells(self, labels: Mapping[str, Any], name: str) -> list[str]:
-        """The cells of a setting's labels; the first empty one has the rest of its name."""
-        if not self.keys:
-            return [name]
-        cells = _cells(labels, self.keys)
-        beyond = name.removeprefix(label_text(labels)).strip()
-        if beyond and "" in cells:
-            cells[cells.index("")] = beyond
-        return cells
+    def as_dict(self) -> dict[str, Any]:
+        """Return the keys of `--json`: those of the summary, and of the parts that there are."""
+        parts = {name: part for name, part in asdict(self).items() if part is not None}
+        return {**parts.pop("summary"), **parts}
+
+    def lines(self) -> list[str]:
+        """Return the tables, without the stopped settings and the fixed world."""
+        confidence, lines = self.summary.confidence, _summary_lines(self.summary)
+        if self.quality:
+            lines += quality_lines(self.quality, confidence)
+        if self.overhead is not None:
+            lines += overhead_lines(self.overhead, confidence)
+        if self.failures is not None:
+            lines += failure_lines(self.failures)
+        return lines
 
 
-def _cells(labels: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
-    return [label_value(labels[key]) if key in labels else "" for key in keys]
+def state_lines(ledger: Ledger) -> list[str]:
+    """Name the fixed world and the settings that the stopping rule has ended early."""
+    spec = stored_spec(ledger)
+    world = [] if spec is None or spec.fixed_world is None else [spec.fixed_world.told()]
+    return [*world, *(f"known well enough, so not flown on: {name}" for name in stopped(ledger))]
 
 
 # Settings and comparisons ---------------------------------------------------------------------
 
 
-def _summary(summary: Row) -> list[str]:
-    settings = SettingColumns.of([cell["labels"] for cell in summary["cells"]])
-    fates = [(cell["labels"], cell["name"], _fate_cells(cell)) for cell in summary["cells"]]
-    means = [(cell["labels"], cell["name"], _mean_cells(cell)) for cell in summary["cells"]]
-    otherwise = ["ended otherwise"] if any(cells[-1] for _, _, cells in fates) else []
-    head = ["over", "success", _sure(summary["confidence"]), "of all", "inactive", *otherwise]
+def _summary_lines(summary: CampaignSummary) -> list[str]:
+    settings = SettingColumns.of([setting.labels for setting in summary.cells])
+    fates = [SettingRow(row.labels, row.name, _fate_cells(row)) for row in summary.cells]
+    means = [SettingRow(row.labels, row.name, _mean_cells(row)) for row in summary.cells]
+    otherwise = ["ended otherwise"] if any(row.cells[-1] for row in fates) else []
+    head = ["over", "success", _sure(summary.confidence), "of all", "inactive", *otherwise]
     lines = [
-        *settings.told(),
-        *settings.table(head, fates),
+        *settings.notes,
+        *settings.lines(head, fates),
         "",
-        *settings.table(["mean time", "mean distance", "mean energy", "mean replans"], means),
+        *settings.lines(["mean time", "mean distance", "mean energy", "mean replans"], means),
     ]
     for title, comparisons in (
-        ("against the golden flights of the same missions:", summary["faults"]),
-        ("against the same faults without protection:", summary["protection"]),
+        ("against the golden flights of the same missions:", summary.faults),
+        ("against the same faults without protection:", summary.protection),
     ):
         if comparisons:
-            lines += ["", title, *_comparison_table(settings, comparisons)]
+            lines += ["", title, *_comparison_lines(settings, comparisons)]
     return lines
 
 
@@ -152,160 +151,167 @@ def _sure(confidence: float) -> str:
     return f"{100 * confidence:g} % interval"
 
 
-def _fate_cells(cell: Row) -> list[str]:
-    over = sum(cell["outcomes"].values()) + cell["errors"]
-    share = cell["success"]
-    ends = f"{100 * share['low']:.1f} to {100 * share['high']:.1f} %" if share["total"] else "-"
-    told = [f"{name} {count}" for name, count in cell["outcomes"].items() if name != "success"]
-    told += [f"{name.replace('_', ' ')} {count}"
-             for name, count in cell["injected"].items() if name in INACTIVE]  # fmt: skip
-    told += [f"could not begin {cell['errors']}"] if cell["errors"] else []
-    return [f"{over}/{cell['planned']}", f"{share['count']}/{share['total']}", ends,
-            percent(cell["every"]["share"]), str(cell["inactive"]["total"]),
-            ", ".join(told)]  # fmt: skip
+def _fate_cells(setting: SettingSummary) -> list[str]:
+    over = sum(setting.outcomes.values()) + setting.errors
+    share = setting.success
+    ends = f"{100 * share.low:.1f} to {100 * share.high:.1f} %" if share.total else "-"
+    other = [f"{name} {count}" for name, count in setting.outcomes.items() if name != "success"]
+    other += [f"{name.replace('_', ' ')} {count}"
+              for name, count in setting.injected.items() if name in INACTIVE]  # fmt: skip
+    other += [f"could not begin {setting.errors}"] if setting.errors else []
+    return [f"{over}/{setting.planned}", f"{share.count}/{share.total}", ends,
+            percent(setting.every.share), str(setting.inactive.total),
+            ", ".join(other)]  # fmt: skip
 
 
-def _mean_cells(cell: Row) -> list[str]:
+def _mean_cells(setting: SettingSummary) -> list[str]:
     units = zip(METRICS, (1.0, 1.0, 1e-3, 1.0), (" s", " m", " kJ", ""), strict=True)
-    means = cell["metrics"]
-    return [number(means[name]["value"], ".1f", scale, unit) for name, scale, unit in units]
+    means = setting.metrics
+    return [number(means[name].value, ".1f", scale, unit) for name, scale, unit in units]
 
 
-def _comparison_table(settings: SettingColumns, found: Sequence[Row]) -> list[str]:
+def _comparison_lines(settings: SettingColumns, comparisons: Sequence[Comparison]) -> list[str]:
     head = ["pairs", "success, points", "p", "time, s", "worst over own golden",
             "worst over mean golden"]  # fmt: skip
-    cells = [_comparison_cells(each) for each in found]
+    cells = [_comparison_cells(row) for row in comparisons]
     used = [place for place, column in enumerate(zip(*cells, strict=True)) if any(column)]
     rows = [
-        (each["second"], each["name"], [row[place] for place in used])
-        for each, row in zip(found, cells, strict=True)
+        SettingRow(row.second, row.name, [own[place] for place in used])
+        for row, own in zip(comparisons, cells, strict=True)
     ]
-    return settings.table([head[place] for place in used], rows)
+    return settings.lines([head[place] for place in used], rows)
 
 
-def _comparison_cells(each: Row) -> list[str]:
+def _comparison_cells(row: Comparison) -> list[str]:
     """Success, time, and worst cases; the one over the mean golden flight for protection only."""
-    test, time, mean = McNemar(**each["success"]), each["differences"]["flight_time_s"], "over_mean"
+    time = row.differences["flight_time_s"]
     return [
-        f"{test.pairs}",
-        f"{100 * test.difference:+.1f}",
-        f"{each['corrected_p']:.3g}",
-        "" if math.isnan(time["low"]) else spread(time, 2, sign="+"),
-        _worst(each["over_own"]),
-        "" if math.isnan(each[mean]["recovered_share"]) else _worst(each[mean]),
+        f"{row.success.pairs}",
+        f"{100 * row.success.difference:+.1f}",
+        f"{row.corrected_p:.3g}",
+        "" if math.isnan(time.low) else spread(time, 2, sign="+"),
+        _worst(row.over_own),
+        "" if math.isnan(row.over_mean["recovered_share"]) else _worst(row.over_mean),
     ]
 
 
-def _worst(worst: Row) -> str:
+def _worst(worst: Mapping[str, float]) -> str:
     if math.isnan(worst["increase"]):
         return ""
-    told = percent(worst["increase"], "+.1f")
+    increase = percent(worst["increase"], "+.1f")
     if math.isnan(worst["recovered_share"]):
-        return told
+        return increase
     points = number(worst["recovered"], ".1f", 100.0, " points")
-    return f"{told}, recovered {points}, {percent(worst['recovered_share'])}"
+    return f"{increase}, recovered {points}, {percent(worst['recovered_share'])}"
 
 
 # Quality of flight ----------------------------------------------------------------------------
 
 
-def _quality(found: Sequence[Row], confidence: float) -> list[str]:
-    if not found:
-        return []
-    first = [each["labels"] for each in found if each["metric"] == METRICS[0]]
-    settings = SettingColumns.of(first)
+def quality_lines(quality: Sequence[Quality], confidence: float = 0.95) -> list[str]:
+    """Return a table for each metric: mean, extremes, and difference from golden flights."""
+    settings = SettingColumns.of([row.labels for row in quality if row.metric == METRICS[0]])
     head = ["flights", f"mean ({_sure(confidence)})", "least", "median", "most", "to golden"]
-    told = []
+    lines = []
     for metric, (title, scale) in _TITLES.items():
         rows = [
-            (each["labels"], each["name"], _quality_cells(each, scale))
-            for each in found
-            if each["metric"] == metric
+            SettingRow(row.labels, row.name, _quality_cells(row, scale))
+            for row in quality
+            if row.metric == metric
         ]
-        told += ["", title, *settings.table(head, rows)]
-    return told
+        lines += ["", title, *settings.lines(head, rows)]
+    return lines
 
 
-def _quality_cells(each: Row, scale: float) -> list[str]:
-    extremes = (each["least"], each["median"], each["most"])
+def _quality_cells(row: Quality, scale: float) -> list[str]:
     return [
-        f"{each['mean']['count']}",
-        spread(each["mean"], 2, scale),
-        *(number(value, ".2f", scale) for value in extremes),
-        "" if each["difference"] is None else spread(each["difference"], 2, scale, "+"),
+        f"{row.mean.count}",
+        spread(row.mean, 2, scale),
+        *(number(value, ".2f", scale) for value in (row.least, row.median, row.most)),
+        "" if row.difference is None else spread(row.difference, 2, scale, "+"),
     ]
 
 
 # Overhead -------------------------------------------------------------------------------------
 
 
-def _overhead(found: Sequence[Row], confidence: float) -> list[str]:
-    if not found:
+def overhead_lines(overhead: Sequence[FlightOverhead], confidence: float = 0.95) -> list[str]:
+    """Return a table of checks and one of recomputations."""
+    if not overhead:
         return ["", "overhead: no flight with a detector"]
-    settings = SettingColumns.of([each["labels"] for each in found])
+    settings = SettingColumns.of([row.labels for row in overhead])
     sure = f"({_sure(confidence)})"
-    named = [(each, (each["labels"], label_text(each["labels"]))) for each in found]
     return [
-        "", "detection: checks, host time", *settings.told(),
-        *settings.table(
+        "", "detection: checks, host time", *settings.notes,
+        *settings.lines(
             ["flights", "a second", f"us each {sure}", f"% of time {sure}"],
-            [(*name, _detection_cells(each)) for each, name in named],
+            [_overhead_row(row, _detection_cells(row)) for row in overhead],
         ),
         f"({HOST_CHECKS})",
         "", "recovery: % of flight time, simulated",
-        *settings.table(
+        *settings.lines(
             ["times", *_STAGES, f"in all {sure}", f"+ checks {sure}"],
-            [(*name, _recovery_cells(each)) for each, name in named],
+            [_overhead_row(row, _recovery_cells(row)) for row in overhead],
         ),
     ]  # fmt: skip
 
 
-def _detection_cells(each: Row) -> list[str]:
+def _overhead_row(row: FlightOverhead, cells: Sequence[str]) -> SettingRow:
+    return SettingRow(row.labels, label_text(row.labels), cells)
+
+
+def _detection_cells(row: FlightOverhead) -> list[str]:
     return [
-        f"{each['flights']}",
-        f"{each['checks_per_s']['value']:.1f}",
-        spread(each["check_host_s"], 2, 1e6),
-        _percent(each["detection_host_share"]),
+        f"{row.flights}",
+        f"{row.checks_per_s.value:.1f}",
+        spread(row.check_host_s, 2, 1e6),
+        _overhead_percent(row.detection_host_share),
     ]
 
 
-def _recovery_cells(each: Row) -> list[str]:
+def _recovery_cells(row: FlightOverhead) -> list[str]:
     return [
-        f"{round(math.fsum(each['recomputations'].values()))}",
-        *(_percent(each["recovery_share"][stage], ends=False) for stage in _STAGES),
-        _percent(each["recovery_share_in_all"]),
-        _percent(each["share_in_all"]),
+        f"{round(math.fsum(row.recomputations.values()))}",
+        *(_overhead_percent(row.recovery_share[stage], ends=False) for stage in _STAGES),
+        _overhead_percent(row.recovery_share_in_all),
+        _overhead_percent(row.share_in_all),
     ]
 
 
-def _percent(share: Row, *, ends: bool = True) -> str:
+def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
     """Per cent with four decimals, as in the paper's table; smaller positive values as "<"."""
     value, *between = spread(share, 4, 100.0).split(" ", 1)
-    told = "<0.0001" if 0.0 < share["value"] < 0.5e-6 else value
-    return " ".join([told, *between]) if ends else told
+    value = "<0.0001" if 0.0 < share.value < 0.5e-6 else value
+    return " ".join([value, *between]) if ends else value
 
 
 # Failures -------------------------------------------------------------------------------------
 
 
-def _parts(each: Row) -> list[str]:
-    failure, layers = each["failure"], each["layers"]
-    parts = [f"{failure['count']} of {failure['total']} faults fail the mission, {_share(failure)}"]
+def failure_lines(failures: Sequence[SettingFailures]) -> list[str]:
+    """Return a paragraph for each setting."""
+    lines = ["", "injected faults that fail missions which succeed without:"]
+    if not failures:
+        lines.append("  none: no setting has struck missions and golden flights of them")
+    for row in failures:
+        lines += [f"  {row.name}", *(f"    {part}" for part in _failure_parts(row))]
+    return lines
+
+
+def _failure_parts(row: SettingFailures) -> list[str]:
+    failure, layers = row.failure, row.layers
+    share = rate(failure, ends=1)
+    parts = [f"{failure.count} of {failure.total} faults fail the mission, {share}"]
     if layers is not None:
-        parts.append(f"{each['kernel']} corrupted by {_share(layers['corruption'])} of its faults")
-        given = layers["failure_given_corruption"]
+        parts.append(f"{row.kernel} corrupted by {rate(layers.corruption, ends=1)} of its faults")
+        given = layers.failure_given_corruption
         if given is None:
             parts.append("failure given corruption unknown: more fail than are corrupted")
         else:
             parts.append("failure given corruption {:.3g} ({:.3g} to {:.3g})".format(*given))
-    if each["per_hour"] is not None:
-        parts.append("{:.3g} failures a flight hour ({:.3g} to {:.3g})".format(*each["per_hour"]))
+    if row.per_hour is not None:
+        parts.append("{:.3g} failures a flight hour ({:.3g} to {:.3g})".format(*row.per_hour))
     return parts
-
-
-def _share(share: Row) -> str:
-    ends = f"({100 * share['low']:.1f} to {100 * share['high']:.1f})"
-    return f"{percent(share['share'])} {ends}"
 
 
 # Export ---------------------------------------------------------------------------------------

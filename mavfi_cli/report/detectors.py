@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 
 from mavfi_cli.analysis.detectors import ALL, CSV, NONE
-from mavfi_cli.report.columns import columns, csv_text, number, percent, rate, spread
 from mavfi_cli.report.drawing import (
     NOTE,
     detector_colours,
@@ -20,6 +19,7 @@ from mavfi_cli.report.drawing import (
     open_frame,
     whisker,
 )
+from mavfi_cli.report.table import Table, number, percent, rate, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,19 +33,19 @@ def detector_lines(evaluation: Row) -> list[str]:
     """The evaluation in words and columns."""
     lines = _head(evaluation)
     lines += ["", "Without faults, against the same flights without a detector"]
-    lines += columns(_error_free_rows(_of(evaluation["error_free"], ALL)))
+    lines += Table([*_error_free_rows(_of(evaluation["error_free"], ALL))]).lines()
     faults = _of(evaluation["faults"], ALL)
     if not faults or not faults[0]["planned"]:
         return lines
     lines += ["", "Faults: detection, by an alarm at or after the strike"]
-    lines += columns(_detection_rows(faults, evaluation["curves"]))
+    lines += Table([*_detection_rows(faults, evaluation["curves"])]).lines()
     lines += ["", "Faults: recovery"]
-    lines += columns(_recovery_rows(faults))
-    lines += ["", *columns(_worst_rows(_of(evaluation["faults"], "world")))]
+    lines += Table([*_recovery_rows(faults)]).lines()
+    lines += ["", *Table([*_worst_rows(_of(evaluation["faults"], "world"))]).lines()]
     for by in ("world", "stage", "field", "state"):
-        rows = columns(_group_rows(by, _of(evaluation["faults"], by)))
+        rows = Table([*_group_rows(by, _of(evaluation["faults"], by))]).lines()
         lines += ["", *rows] if len(rows) > 1 else []
-    lines += ["", *columns(_comparison_rows(evaluation["comparisons"]))]
+    lines += ["", *Table([*_comparison_rows(evaluation["comparisons"])]).lines()]
     return [*lines, _INTERVALS]
 
 
@@ -188,7 +188,8 @@ def _share(share: Row) -> str:
 
 def detector_csv(*pairs: pa.Table) -> str:
     """One row per pair: first the pairs without faults, then those with one."""
-    return csv_text((row for table in pairs for row in table.select([*CSV]).to_pylist()), [*CSV])
+    rows = (row for table in pairs for row in table.select([*CSV]).to_pylist())
+    return Table.of_records(rows, [*CSV]).csv()
 
 
 # Pictures -----------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ from mavfi_cli.analysis.beside_model import (
 )
 from mavfi_cli.core.files import plain
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.columns import columns, csv_text, wrapped
 from mavfi_cli.report.drawing import (
     INK,
     NOTE,
@@ -29,6 +28,7 @@ from mavfi_cli.report.drawing import (
     open_frame,
     whisker,
 )
+from mavfi_cli.report.table import Table
 from mavfi_cli.vpm.model import Performance
 from mavfi_cli.vpm.report import (
     CalibratedNumber,
@@ -60,11 +60,11 @@ def model_csv(model: ModelReport | FlightsReport) -> str:
     The header names the units.
     """
     distance = {"distance_m": model.distance_m} if isinstance(model, ModelReport) else {}
-    return csv_text(
+    return Table.of_records(
         {"vehicle": vehicle.vehicle, "board": vehicle.board, **distance} | dict(_flat(asdict(row)))
         for vehicle in model.vehicles
         for row in vehicle.schemes
-    )
+    ).csv()
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -108,40 +108,40 @@ def _vehicle_lines(vehicle: VehicleReport, over: str) -> Iterator[str]:
     yield f"== {vehicle.vehicle}{title}; board {vehicle.board} =="
     yield from (f"Note: {note}" for note in vehicle.notes)
     flying = _flying(vehicle)
-    yield from columns([
+    yield from Table([
         ["scheme", "boards", "compute", "mass", "thrust/weight", "acceleration", "roof", "knee"],
         *([row.scheme, f"{row.boards}", f"{row.compute_kg:.3f} kg", f"{row.mass_kg:.3f} kg",
            f"{own.thrust_to_weight:.2f} N/N", f"{own.acceleration_mps2:.2f} m/s²",
            f"{own.roof_mps:.2f} m/s", f"{own.knee_hz:.1f} Hz"] for row, own, _ in flying),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
     yield ""
-    yield from columns([
+    yield from Table([
         ["scheme", "overhead", "throughput", "velocity", "bound by", "sensor ceiling",
          "compute ceiling"],
         *([row.scheme, f"{row.overhead_percent:.4g} %", f"{own.throughput_hz:.3f} Hz",
            f"{own.velocity_mps:.3f} m/s", own.bound, f"{own.sensor_ceiling_mps:.2f} m/s",
            f"{own.compute_ceiling_mps:.2f} m/s"] for row, own, _ in flying),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
     yield ""
-    yield from columns([
+    yield from Table([
         [f"over {over}", "velocity", "time", "energy", "missions", "flight time", "power",
          "energy", "a charge"],
         *([row.scheme, f"x {ratios.velocity_ratio:.4f}", f"x {ratios.flight_time_ratio:.4f}",
            f"x {ratios.energy_ratio:.4f}", f"x {ratios.missions_ratio:.4f}",
            f"{own.flight_time_s:.1f} s", f"{own.power_w:.1f} W", f"{own.energy_j / 1000:.2f} kJ",
            f"{own.missions:.1f} missions"] for row, own, ratios in flying),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
     yield from (f"{row.scheme}: {row.problem}" for row in vehicle.schemes if row.problem)
     yield from _sensitivity_lines(vehicle.sensitivity)
     yield from _calibration_lines(vehicle.calibrations)
     yield ""
-    yield from wrapped([
+    yield from Table([
         ["number", "value", "source"],
         *([own.parameter, f"{own.value:.5g} {own.unit}", own.source]
           for own in vehicle.parameters),
         *([f"scheme {row.scheme}", f"{row.overhead_percent:.4g} %", row.source]
           for row in vehicle.schemes),
-    ])  # fmt: skip
+    ], prose=True).lines()  # fmt: skip
 
 
 def _sensitivity_lines(rows: Sequence[Sensitivity]) -> Iterator[str]:
@@ -156,7 +156,7 @@ def _sensitivity_lines(rows: Sequence[Sensitivity]) -> Iterator[str]:
             f"  {row.parameter} {row.value:.4g} {row.unit}; 1 % more: velocity {velocity}, "
             f"TMR's time ratio {time}"
         )
-        yield from columns(_point_cells(point, row.unit) for point in row.points)
+        yield from Table([_point_cells(point, row.unit) for point in row.points]).lines()
 
 
 def _point_cells(point: SensitivityPoint, unit: str) -> list[str]:
@@ -173,12 +173,12 @@ def _calibration_lines(rows: Sequence[CalibratedNumber]) -> Iterator[str]:
         return
     yield ""
     yield "Paper, Fig. 15, flight time over detection and recovery; one number is calibrated:"
-    yield from columns([
+    yield from Table([
         ["  board", "a copy", "calibrated", "TMR", "paper's TMR", "DMR, predicted"],
         *([f"  {row.board}", f"{1000 * row.board_kg:.0f} g",
            f"{row.parameter} = {row.value:.4g} {row.unit}", f"x {row.tmr_ratio:.4f}",
            f"x {row.published_tmr_ratio:g}", f"x {row.predicted_dmr_ratio:.4f}"] for row in rows),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
 
 
 # Text: flights beside the model -------------------------------------------------------------------
@@ -210,7 +210,7 @@ def _flight_lines(flights: FlightsReport) -> list[str]:
     for vehicle in flights.vehicles:
         lines += ["", *_flown_lines(vehicle, flights)]
     lines += ["", *_overhead_lines(flights.overheads), "", "What the flights do not scale:"]
-    return [*lines, *wrapped(["", text] for text in flights.not_scaled)]
+    return [*lines, *Table(["", text] for text in flights.not_scaled, prose=True).lines()]
 
 
 def _flown(vehicle: FlownVehicle) -> list[tuple[FlownScheme, FlownNumbers]]:
@@ -220,7 +220,7 @@ def _flown(vehicle: FlownVehicle) -> list[tuple[FlownScheme, FlownNumbers]]:
 def _flown_lines(vehicle: FlownVehicle, flights: FlightsReport) -> Iterator[str]:
     yield f"== {vehicle.vehicle} flown, board {vehicle.board} =="
     rows = _flown(vehicle)
-    yield from columns([
+    yield from Table([
         ["scheme", "mass", "v-max", "a-max", "safe, braking", "success", "ends"],
         *([row.scheme, f"{row.mass_kg:.3f} kg", f"{own.v_max_mps:.3f} m/s",
            f"{own.a_max_mps2:.2f} m/s²", f"{own.braking_velocity_mps:.3f} m/s",
@@ -228,17 +228,17 @@ def _flown_lines(vehicle: FlownVehicle, flights: FlightsReport) -> Iterator[str]
            f"{100 * own.success.high:.0f} %)",
            ", ".join(f"{count} {name}" for name, count in own.outcomes.items())]
           for row, own in rows),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
     for heading, field, shape, unit, factor in _NUMBERS:
         cells = [
             [row.scheme, *_number_cells(getattr(own, field), shape, unit, factor)]
             for row, own in rows
         ]
-        yield from ["", f"{heading}:", *columns([_HEAD, *cells])]
+        yield from ["", f"{heading}:", *Table([_HEAD, *cells]).lines()]
     yield ""
     yield "Why flights take longer than the model says:"
-    yield from columns([["scheme", "path", "pace", "replans", "alarms"],
-                        *([row.scheme, *_reasons(own)] for row, own in rows)])  # fmt: skip
+    yield from Table([["scheme", "path", "pace", "replans", "alarms"],
+                        *([row.scheme, *_reasons(own)] for row, own in rows)]).lines()  # fmt: skip
     over, paper = flights.ratios_over, flights.paper_ratios_over
     for heading, field in (
         *((f"{title.capitalize()} over {over}", field) for title, field in _RATIOS),
@@ -250,7 +250,7 @@ def _flown_lines(vehicle: FlownVehicle, flights: FlightsReport) -> Iterator[str]
             for row, _ in rows
             if getattr(row, field.partition(".")[0]) is not None
         ]
-        yield from ["", f"{heading}:", *columns([_HEAD, *cells])]
+        yield from ["", f"{heading}:", *Table([_HEAD, *cells]).lines()]
     for row in vehicle.schemes:
         yield from _remarks(row)
 
@@ -321,13 +321,13 @@ def _overhead_lines(rows: Sequence[MeasuredOverhead]) -> Iterator[str]:
         yield "Overhead of detection and recovery: no flight with a detector"
         return
     yield "Overhead of detection and recovery, of the kernels' time on the flights' platform:"
-    yield from columns([
+    yield from Table([
         ["detector", "measured", "of it checks", "paper", "recomputations",
          "checks of this host's kernel time"],
         *([row.detector, f"{row.measured_percent:.4g} %", f"{row.checks_percent:.4g} %",
            f"{row.paper_percent:.4g} %", f"{row.alarms} in {row.flights} flights",
            f"{row.checks_of_host_kernels_percent:.4g} %"] for row in rows),
-    ])  # fmt: skip
+    ]).lines()  # fmt: skip
     yield f"({HOST_CHECKS})"
 
 

@@ -12,16 +12,16 @@ import base64
 import importlib.util
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
-from mavfi_cli.report.columns import csv_text
 from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, legend_above, new_figure, svg
 from mavfi_cli.report.paper import DETECTOR_TITLES, PALETTE, SMALLEST, WIDTHS_IN, print_axes
+from mavfi_cli.report.table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -100,7 +100,7 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
             if part["figure"] is not None
         },
         "states": [
-            _chart(f"states-{x}", f"Faults in states, {x}", each["figure"], csv_text(each["rows"]))
+            _chart(f"states-{x}", f"Faults in states, {x}", each["figure"], _csv(each["rows"]))
             for x, each in told["spreads"].items()
             if each
         ],
@@ -112,7 +112,7 @@ def _charts(told: Mapping[str, Any]) -> dict[str, Any]:
 def _item_chart(item: Any, shown: Mapping[str, Any]) -> dict[str, str]:
     name = f"{item.name}-{shown['stack']}".replace(" ", "-")
     flights, title = shown["flights"], f"{item.paper}, {shown['stack']}"
-    csv = csv_text(flights) if flights else shown["table"].csv()
+    csv = _csv(flights) if flights else shown["table"].csv()
     return _chart(f"{name}-flights" if flights else name, title, shown["figure"], csv)
 
 
@@ -133,7 +133,7 @@ def _arm_chart(campaign: str, arms: Sequence[Any]) -> dict[str, str]:
     axes.set_xlim(left=0.0)
     axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
     title = f"Lost missions of each arm of {campaign}"
-    return _chart(f"arms-{campaign}", title, figure, csv_text(rows))
+    return _chart(f"arms-{campaign}", title, figure, _csv(rows))
 
 
 _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
@@ -162,10 +162,14 @@ def _flow_chart(stack: str, flows: Sequence[Any]) -> dict[str, str]:
     look = {"handlelength": 1.0, "columnspacing": 1.0, "labelcolor": INK}
     legend_above(figure, ncols=3, fontsize=SMALLEST, **look)
     title = f"What struck kernels did, {stack}"
-    return _chart(f"kernels-{stack}", title, figure, csv_text(rows))
+    return _chart(f"kernels-{stack}", title, figure, _csv(rows))
 
 
 # Numbers as words ---------------------------------------------------------------------------------
+
+
+def _csv(records: Iterable[Mapping[str, Any]]) -> str:
+    return Table.of_records(records).csv()
 
 
 def _percent(value: float | None, digits: int = 0, sign: str = "") -> str:
@@ -201,7 +205,7 @@ def _link(text: str) -> str:
 
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value, "csv": csv_text,
+    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value, "csv": _csv,
     "link": _link, "toml": Spec.to_toml,
     "detector": lambda name: DETECTOR_TITLES.get(name, name) if name else "none",
     "hourly": lambda rates: "{:.2g} ({:.2g} to {:.2g})".format(*rates),

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.report.columns import WIDTH, blocks, csv_text
 from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
+from mavfi_cli.report.table import FORMATS, Table
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.shares import Share
 
@@ -142,133 +141,46 @@ class PaperTable:
         rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
         return sorted(rows, key=lambda row: -row.cells[place].value)
 
-    def cells(self) -> list[list[str]]:
-        """The table as cells of text, headings first: labels, n, then ours and the paper's."""
+    @property
+    def table(self) -> Table:
+        """Labels, n, then ours beside the paper's, from which no page separates it."""
         head = [*self.labels, "n"]
-        for place, column in enumerate(self.columns):
-            head += [column.title, *(["paper"] if self.printed_in(place) else [])]
+        parts = [1 + self.printed_in(place) for place in range(len(self.columns))]
+        for column, part in zip(self.columns, parts, strict=True):
+            head += [column.title, *["paper"] * (part - 1)]
         rows = [head]
         for row in self.rows:
             cells = [*row.labels, row.count]
-            for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True)):
-                cells.append(column.ours(cell))
-                if self.printed_in(place):
-                    cells.append(column.printed(cell.paper))
+            for column, cell, part in zip(self.columns, row.cells, parts, strict=True):
+                cells += [column.ours(cell), column.printed(cell.paper)][:part]
             rows.append(cells)
-        return rows
+        return Table(
+            rows, labels=len(self.labels), kept=1, parts=parts, name=self.name, title=self.title,
+            notes=self.notes,
+        )  # fmt: skip
 
-    def text(self) -> str:
-        """Aligned columns; those beyond the width continue below."""
-        lines = [self.title, *_in_pairs(self), *self.notes]
-        return "\n".join(line.rstrip() for line in lines) + "\n"
+    def formatted(self, form: str) -> str:
+        """Return the table in one of FORMATS; see `csv` for CSV."""
+        return self.csv() if form == "csv" else FORMATS[form](self.table)
 
     def csv(self) -> str:
-        """One number a line, in full precision."""
-        return csv_text(
+        """Return one number a line, in full precision."""
+        return Table.of_records(
             {
                 "item": self.name,
                 **dict(zip(self.labels, row.labels, strict=True)),
                 "quantity": column.title,
                 **{name: _plain(getattr(cell, name)) for name in ("value", "low", "high")},
                 "n": cell.count,
-                "paper": "" if cell.paper is None else cell.paper,
+                "paper": cell.paper,
             }
             for row in self.rows
             for column, cell in zip(self.columns, row.cells, strict=True)
-        )
+        ).csv()
 
 
-def _in_pairs(table: PaperTable) -> list[str]:
-    """The aligned table, in which the paper's number is never cut off from ours."""
-    rows = table.cells()
-    labels = len(table.labels)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    together = [1, *(1 + table.printed_in(place) for place in range(len(table.columns)))]
-    joined = []
-    for row in rows:
-        numbers = map(str.rjust, row[labels:], widths[labels:])
-        joined.append([*row[:labels], *("  ".join(islice(numbers, each)) for each in together)])
-    return blocks(joined, labels + 1, WIDTH)
-
-
-def _as_markdown(table: PaperTable) -> str:
-    head, *rows = table.cells()
-    aligned = ["---"] * len(table.labels) + ["---:"] * (len(head) - len(table.labels))
-    lines = [_piped(row) for row in (head, aligned, *rows)]
-    return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]).rstrip() + "\n"
-
-
-def _piped(row: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |"
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "<": r"\textless{}", ">": r"\textgreater{}",
-}  # fmt: skip
-
-
-# Sizes of 8 and of 7 points: a character and the gap between two columns of a table are so wide, in
-# points, and so are a column of a printed page and the page.
-_SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsize", 3.9, 4.0))
-_PLACES = (("table", 252.0), ("table*", 516.0))
-
-
-def _as_latex(table: PaperTable) -> str:
-    """A float with a plain tabular, which needs no package.
-
-    It is as wide as a column of two, or as the page, in the largest size that fits.
-    """
-    head, *rows = table.cells()
-    form = "l" * len(table.labels) + "r" * (len(head) - len(table.labels))
-    place, size, gap_pt = _latex_place([head, *rows])
-    lines = [
-        rf"\begin{{{place}}}",
-        rf"\caption{{{_latex(table.title)}}}",
-        rf"\label{{tab:{table.name}}}",
-        rf"\centering{size}\setlength{{\tabcolsep}}{{{gap_pt / 2:g}pt}}",
-        rf"\begin{{tabular}}{{{form}}}",
-        r"\hline",
-        _latex_row(head),
-        r"\hline",
-        *map(_latex_row, rows),
-        r"\hline",
-        r"\end{tabular}",
-        *(rf"\par {_latex(note)}" for note in table.notes),
-        rf"\end{{{place}}}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _latex_place(rows: Sequence[Sequence[str]]) -> tuple[str, str, float]:
-    """The narrowest float and the largest size that hold the table, and the gap; else the last."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for place, width_pt in _PLACES:
-        for size, character_pt, gap_pt in _SIZES:
-            if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
-                return place, size, gap_pt
-    return place, size, gap_pt
-
-
-def _latex_row(row: Sequence[str]) -> str:
-    return " & ".join(map(_latex, row)) + r" \\"
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(each, each) for each in text)
-
-
-def _plain(value: float) -> object:
-    return "" if math.isnan(value) else value
-
-
-FORMATS: Mapping[str, Callable[[PaperTable], str]] = {
-    "text": PaperTable.text,
-    "markdown": _as_markdown,
-    "latex": _as_latex,
-    "csv": PaperTable.csv,
-}
+def _plain(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 # Figures for print --------------------------------------------------------------------------------

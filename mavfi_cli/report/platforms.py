@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
-from mavfi_cli.report.columns import columns, csv_text, number, p_value, percent, rate, spread
+from mavfi_cli.report.table import Table, number, p_value, percent, rate, spread
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.stats.bootstrap import FEW
 
@@ -95,7 +95,7 @@ def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -
         labels = labels if first == "platform" else labels[::-1]
         rows.append([labels[0] if labels[0] != last else "", labels[1], *cells(row)])
         last = labels[0]
-    return columns([["", "", *head], *rows], 2)
+    return Table([["", "", *head], *rows], labels=2).lines()
 
 
 def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: Any) -> list[str]:
@@ -103,7 +103,10 @@ def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: An
     title, *names = head
     told_rows = [[_setting_title(row["setting"]), *cells(row)] for row in rows]
     reference = _titles_of(told)[rows[0]["reference"]]
-    return [title.format(platform["title"], reference), *columns([["", *names], *told_rows], 1)]
+    return [
+        title.format(platform["title"], reference),
+        *Table([["", *names], *told_rows], labels=1).lines(),
+    ]
 
 
 _FLIGHTS = ("flights", "success", "flight time, s", "distance, m")
@@ -241,7 +244,7 @@ def platform_csv(told: Row) -> str:
          for key, cell in row.items()}
         for row in rows
     )  # fmt: skip
-    return csv_text(blank, _NAMES)
+    return Table.of_records(blank, _NAMES).csv()
 
 
 def _at(table: str, row: Row, quantity: str, statistic: str, unit: str) -> dict[str, Any]:

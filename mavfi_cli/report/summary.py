@@ -13,7 +13,7 @@ from mavfi_cli.fi.bits import told_apart
 from mavfi_cli.fi.tracer.image import short_name
 from mavfi_cli.mission.measures import DetectionCost, FlightRecord, record_of
 from mavfi_cli.mission.run_folder import Run
-from mavfi_cli.report.columns import WIDTH
+from mavfi_cli.report.table import WIDTH
 
 Section = Mapping[str, Any]
 _INDENT = 12 * " "

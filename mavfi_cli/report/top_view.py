@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavfi_cli.analysis.trajectories import MissionPicture
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import Run, load_run
 from mavfi_cli.report.drawing import (
@@ -303,15 +304,15 @@ class Trajectories:
     panels: Sequence[tuple[str, _Flights]]
 
     @classmethod
-    def of(cls, pair: Mapping[str, Any]) -> Trajectories:
-        """Read the run folders of `analysis.trajectories.pair`.
+    def of(cls, picture: MissionPicture) -> Trajectories:
+        """Read the run folders of a picture.
 
         Raises:
             RecordError: A run folder cannot be read.
         """
         return cls([
-            (panel["title"], [(each["name"], load_run(each["path"])) for each in panel["flights"]])
-            for panel in pair["panels"]
+            (panel.title, [(flight.name, load_run(flight.path)) for flight in panel.flights])
+            for panel in picture.panels
         ])  # fmt: skip
 
     def draw(self, across: int = _COLUMNS) -> Figure:

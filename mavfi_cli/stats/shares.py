@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
@@ -209,9 +209,26 @@ def pairs_for_difference(
     return math.ceil(root**2 / difference**2 - 1e-9)
 
 
+@dataclass(frozen=True, slots=True)
+class CrossLayer:
+    """Failures of a kernel and of the missions that fly with it.
+
+    Attributes:
+        corruption: share of faults in the isolated kernel that corrupt its output in silence.
+        failure: share of faults that fail the mission.
+        failure_given_corruption: the second over the first, with the ends of the failure's interval
+            over the corruption's point estimate. None if the estimate would be above 1 (crashes and
+            hangs fail missions too) or no output was corrupted.
+    """
+
+    corruption: Share
+    failure: Share
+    failure_given_corruption: tuple[float, float, float] | None
+
+
 def cross_layer(
     corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
-) -> dict[str, Any]:
+) -> CrossLayer:
     """The probability that a mission fails, given an SDC of a kernel.
 
     Both campaigns must sample the same population: the same kernel, level and sampling rule.
@@ -219,26 +236,17 @@ def cross_layer(
     Args:
         corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
         failed, mission_faults: failures beyond the golden ones and applied faults of missions.
-
-    Returns:
-        `corruption`, `failure`: shares of faults that corrupt the kernel, and that fail the
-        mission. `failure_given_corruption`: the second over the first, with the ends of the
-        failure's interval over the corruption's point estimate; None if the estimate would be above
-        1 (crashes and hangs fail missions too) or no output was corrupted.
     """
     corruption = rate(corrupted, kernel_faults, confidence)
     failure = rate(failed, mission_faults, confidence)
     ends = None
     if corrupted and failure.share <= corruption.share:
-        ends = tuple(
+        value, low, high = (
             min(1.0, share / corruption.share)
             for share in (failure.share, failure.low, failure.high)
         )
-    return {
-        "corruption": asdict(corruption),
-        "failure": asdict(failure),
-        "failure_given_corruption": ends,
-    }
+        ends = value, low, high
+    return CrossLayer(corruption, failure, ends)
 
 
 # Clusters ---------------------------------------------------------------------------------------

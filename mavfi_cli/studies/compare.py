@@ -122,8 +122,9 @@ def compare(
     with begin(spec, folder, append=grows) as ledger:
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
         table = flights(ledger)
-    found = figures(plan.platforms, plan.settings, compared(table))
-    seed = timeline_seed(found["flights"], plan.platforms) or plan.first_seed
+    flown = compared(table)
+    found = figures(plan.platforms, plan.settings, flown)
+    seed = timeline_seed(flown, plan.platforms) or plan.first_seed
     return {
         "schema": SCHEMA,
         "plan": plan.told(),
@@ -146,4 +147,4 @@ def _timelines(
     table = fly(missions, folder, Keep.ALL, options, spectator)
     paths = dict(zip(table["platform"].to_pylist(), table["path"].to_pylist(), strict=True))
     runs = {name: load_run(Path(paths[name])) for name in plan.platforms if paths.get(name)}
-    return {"seed": seed, "platforms": timelines(runs)}
+    return {"seed": seed, "platforms": [asdict(line) for line in timelines(runs)]}

@@ -1,6 +1,7 @@
 """Flights of a comparison, made up."""
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 
 from mavfi_cli.analysis.platforms import SCHEMA, figures
@@ -34,8 +35,8 @@ def flight(platform, seed, time_s, setting="golden", **changes):
 
 def table(flights):
     """Flights as columns, with whether they succeeded."""
-    found = pa.Table.from_pylist(flights, SCHEMA)
-    return found.append_column("succeeded", pa.array([f["outcome"] == "success" for f in flights]))
+    found = pa.Table.from_pylist(list(flights), SCHEMA)
+    return found.append_column("succeeded", pc.equal(found["outcome"], "success"))
 
 
 def figures_of(plan, flights):

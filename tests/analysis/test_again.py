@@ -11,6 +11,7 @@ import pytest
 
 from mavfi_cli import library
 from mavfi_cli.analysis.flights import mission_of, read_export
+from mavfi_cli.campaigns.begin import opened
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -40,6 +41,11 @@ def export(folder, tmp_path_factory):
     return path
 
 
+def mission(place, number):
+    with opened(place) as ledger:
+        return mission_of(ledger, number)
+
+
 def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
     for place in (folder, export):
         done = mavfi("replay", str(place), "--mission", "1", "--out", str(tmp_path), "--json")
@@ -49,8 +55,8 @@ def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
 
 
 def test_without_the_fault_it_is_the_golden_one(folder, export):
-    assert mission_of(folder, 1)[0].golden == mission_of(export, 0)[0]
-    assert mission_of(export, 1)[0].fault == FAULT
+    assert mission(folder, 1)[0].golden == mission(export, 0)[0]
+    assert mission(export, 1)[0].fault == FAULT
 
 
 def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):
@@ -68,12 +74,12 @@ def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):
 def test_no_such_mission(folder, export, tmp_path):
     for place in (folder, export):
         with pytest.raises(ConfigError, match="no mission 7"):
-            mission_of(place, 7)
+            mission(place, 7)
     with pytest.raises(RecordError):
-        mission_of(tmp_path, 0)
+        mission(tmp_path, 0)
     pq.write_table(pa.table({"number": [0]}), tmp_path / "foreign.parquet")
     with pytest.raises(RecordError, match="not an export of a campaign"):
-        mission_of(tmp_path / "foreign.parquet", 0)
+        mission(tmp_path / "foreign.parquet", 0)
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", '{"wrold": 3}', '{"seed": -1}'])
@@ -82,7 +88,7 @@ def test_a_mission_of_strange_changes_is_refused(export, tmp_path, text):
     place, texts = table.column_names.index("changes"), pa.array([text] * table.num_rows)
     pq.write_table(table.set_column(place, "changes", texts), path)
     with pytest.raises(RecordError, match="the changes of mission 0 cannot be used"):
-        mission_of(path, 0)
+        mission(path, 0)
 
 
 def test_a_debugger_needs_a_run_folder(folder, mavfi):

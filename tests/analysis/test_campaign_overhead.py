@@ -6,13 +6,12 @@ import re
 
 import pytest
 from click.testing import CliRunner
-from plain_values import named
 
 from mavfi_cli.analysis.overhead import flight_overheads
 from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.cli.campaign import campaign as command
-from mavfi_cli.report.campaign import campaign_lines
+from mavfi_cli.report.campaign import overhead_lines
 
 KERNELS = {
     "point_cloud": {"invocations": 10, "busy_s": 0.1},
@@ -62,7 +61,7 @@ def filled(book):
 
 
 def test_every_setting_with_a_detector_has_its_shares_of_the_flight_time(filled):
-    gad, aad = named(flight_overheads(filled.ledger, groups(filled.ledger)))
+    gad, aad = flight_overheads(filled.ledger, groups(filled.ledger))
     assert (gad.labels, aad.labels) == (GAD, AAD)
     assert (gad.flights, aad.flights) == (3, 3)  # not the one whose fault was not injected
     assert gad.checks_per_s.value == pytest.approx((50.0 + 50.0 + 25.0) / 3)
@@ -83,7 +82,7 @@ def test_every_setting_with_a_detector_has_its_shares_of_the_flight_time(filled)
 
 
 def test_a_setting_that_gathers_several_detectors_has_a_row_for_each(filled):
-    rows = named(flight_overheads(filled.ledger, groups(filled.ledger, ["world"])))
+    rows = flight_overheads(filled.ledger, groups(filled.ledger, ["world"]))
     assert [each.labels for each in rows] == [
         {"world": "dense", "detector": "aad"}, {"world": "dense", "detector": "gad"},
     ]  # fmt: skip
@@ -91,15 +90,15 @@ def test_a_setting_that_gathers_several_detectors_has_a_row_for_each(filled):
 
 def test_the_detector_need_not_be_a_label(book):
     book.add({"setting": "golden"}, 1, 20.0, injected=Injected.GOLDEN, record=watched("l2", 0.01))
-    (row,) = named(flight_overheads(book.ledger, groups(book.ledger)))
+    (row,) = flight_overheads(book.ledger, groups(book.ledger))
     assert row.labels == {"setting": "golden", "detector": "l2"}
     assert math.isnan(row.check_host_s.low)  # one flight has no interval
-    assert re.split("  +", campaign_lines({"overhead": [row]})[3])[-2:] == ["10.00", "0.0500"]
+    assert re.split("  +", overhead_lines([row])[3])[-2:] == ["10.00", "0.0500"]
 
 
 def test_the_tables_say_what_the_host_measured_and_what_was_simulated(filled):
-    found = named(flight_overheads(filled.ledger, groups(filled.ledger)))
-    told = campaign_lines({"overhead": found, "confidence": 0.9})
+    found = flight_overheads(filled.ledger, groups(filled.ledger))
+    told = overhead_lines(found, 0.9)
     assert told[1:3] == [
         "detection: checks, host time", "in all settings that have it: world=dense",
     ]  # fmt: skip
@@ -122,16 +121,14 @@ def overheads_of_one_in(count, book):
     for seed in range(count):
         alarms = ("control",) if seed == 0 else ()
         book.add(labels, 100 + seed, 200.0, record=watched("aad", 0.004, alarms, kernels))
-    found = named(flight_overheads(book.ledger, groups(book.ledger)))
-    return "\n".join(
-        line for line in campaign_lines({"overhead": found}) if line.startswith("rare ")
-    )
+    found = flight_overheads(book.ledger, groups(book.ledger))
+    return "\n".join(line for line in overhead_lines(found) if line.startswith("rare "))
 
 
 def test_a_campaign_without_detectors_says_so(book):
     book.add({"setting": "golden"}, 1, 20.0, injected=Injected.GOLDEN)
-    found = named(flight_overheads(book.ledger, groups(book.ledger)))
-    assert (found, campaign_lines({"overhead": found})) == (
+    found = flight_overheads(book.ledger, groups(book.ledger))
+    assert (found, overhead_lines(found)) == (
         [],
         ["", "overhead: no flight with a detector"],
     )

@@ -5,22 +5,25 @@ import math
 import re
 
 import pytest
-from plain_values import named
 
-from mavfi_cli.analysis.failures import failures
-from mavfi_cli.analysis.summary import METRICS, groups, qualities, summarise
+from mavfi_cli.analysis.failures import setting_failures
+from mavfi_cli.analysis.summary import METRICS, groups, qualities
 from mavfi_cli.campaigns.begin import stopped
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
-from mavfi_cli.report.campaign import campaign_lines
+from mavfi_cli.report.campaign import CampaignReport, failure_lines, quality_lines
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
 FI = {"setting": "FI", "stage": "control"}
 SAVED = {"setting": "D&R", "stage": "control", "detector": "gad"}
+
+
+def summary(ledger, by=()):
+    return CampaignReport.of(ledger, by).summary
 
 
 def fill(book):
@@ -37,14 +40,14 @@ def test_faults_that_did_nothing_are_counted_apart(book):
     for seed, injected in enumerate(fates):
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0 + seed, injected=injected, outcome=outcome)
-    (cell,) = named(summarise(book.ledger)).cells
+    (cell,) = summary(book.ledger).cells
     assert (cell.success.count, cell.success.total) == (2, 3)
     assert (cell.inactive.count, cell.inactive.total) == (3, 3)
     assert (cell.every.count, cell.every.total) == (5, 6)
     assert cell.injected == {fate.value: 1 for fate in sorted(fates, key=lambda f: f.value)}
     assert cell.metrics["flight_time_s"].value == 23.0  # unread, caught
     assert cell.metrics["flight_time_s"].count == 2
-    told = campaign_lines(summarise(book.ledger))
+    told = CampaignReport.of(book.ledger).lines()
     row = told[1]
     assert "  2/3  " in row
     assert "  83.3 %  " in row  # of all six, as the paper counts
@@ -54,9 +57,10 @@ def test_faults_that_did_nothing_are_counted_apart(book):
 
 
 def test_a_campaign_that_was_killed_before_it_had_a_list_has_no_row(book):
-    told = summarise(book.ledger)
-    assert (told["missions"], told["cells"], told["faults"]) == (0, [], [])
-    assert "over" in campaign_lines(told)[0]
+    report = CampaignReport.of(book.ledger)
+    empty = report.summary
+    assert (empty.missions, empty.cells, empty.faults) == (0, [], [])
+    assert "over" in report.lines()[0]
 
 
 def test_errors_are_counted_nowhere_else(book):
@@ -66,13 +70,13 @@ def test_errors_are_counted_nowhere_else(book):
         30, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
         attempts=1, path=None,
     )  # fmt: skip
-    golden = named(summarise(book.ledger)).cells[0]
+    golden = summary(book.ledger).cells[0]
     assert (golden.planned, golden.errors, golden.every.total) == (11, 1, 10)
 
 
 def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     fill(book)
-    faulty, saved = named(summarise(book.ledger)).faults
+    faulty, saved = summary(book.ledger).faults
     assert (faulty.first, faulty.second) == ({"setting": "golden"}, FI)
     assert (faulty.success.pairs, faulty.success.only_first) == (10, 3)
     assert faulty.success.difference == pytest.approx(-0.3)
@@ -81,21 +85,21 @@ def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     assert faulty.differences["flight_time_s"].value == pytest.approx(10.0 + 1 / 7)
     assert faulty.differences["flight_time_s"].count == 7
     assert faulty.differences["replans"].value == 0.0
-    assert faulty.over_own.increase == pytest.approx(11.0 / 20.0)
-    assert math.isnan(faulty.over_own.recovered)
+    assert faulty.over_own["increase"] == pytest.approx(11.0 / 20.0)
+    assert math.isnan(faulty.over_own["recovered"])
     assert saved.second == SAVED
 
 
 def test_protection_is_held_against_the_same_faults_without_it(book):
     fill(book)
-    (saved,) = named(summarise(book.ledger)).protection
+    (saved,) = summary(book.ledger).protection
     assert (saved.first, saved.second) == (FI, SAVED)
     assert (saved.success.only_second, saved.success.neither) == (2, 1)
     assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
     for worst in (saved.over_own, saved.over_mean):
-        assert worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
-        assert worst.recovered_share == pytest.approx(8.0 / 11.0)
-    assert saved.over_mean.golden == 20.0
+        assert worst["recovered"] == pytest.approx((31.0 - 23.0) / 20.0)
+        assert worst["recovered_share"] == pytest.approx(8.0 / 11.0)
+    assert saved.over_mean["golden"] == 20.0
 
 
 def test_the_worst_case_is_no_missions_own_length(book):
@@ -104,10 +108,10 @@ def test_the_worst_case_is_no_missions_own_length(book):
         book.add({"setting": "golden"}, seed, time_s, injected=GOLDEN)
         book.add(FI, seed, time_s)
     book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
-    (faulty,) = named(summarise(book.ledger)).faults
-    assert faulty.over_own.increase == 0.0
-    assert faulty.over_mean.golden == 20.0
-    told = campaign_lines(summarise(book.ledger))
+    (faulty,) = summary(book.ledger).faults
+    assert faulty.over_own["increase"] == 0.0
+    assert faulty.over_mean["golden"] == 20.0
+    told = CampaignReport.of(book.ledger).lines()
     assert told[-2].endswith("  worst over own golden")
     assert told[-1].endswith("  +0.0 %")
 
@@ -124,30 +128,30 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     book.add({"setting": "golden"}, 3, 20.0, injected=GOLDEN)
     book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
     book.add(SAVED, 3, 26.0)
-    (saved,) = named(summarise(book.ledger)).protection
-    assert saved.over_own.increase == pytest.approx(1.0)
-    assert saved.over_own.protected_worst == pytest.approx(1.3)
-    assert saved.over_own.recovered_share == pytest.approx(0.7)
-    assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
-    assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
-    assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
-    told = [re.split("  +", line)[-1] for line in campaign_lines(summarise(book.ledger))]
+    (saved,) = summary(book.ledger).protection
+    assert saved.over_own["increase"] == pytest.approx(1.0)
+    assert saved.over_own["protected_worst"] == pytest.approx(1.3)
+    assert saved.over_own["recovered_share"] == pytest.approx(0.7)
+    assert (saved.over_mean["golden"], saved.over_mean["golden_worst"]) == (20.0, 30.0)
+    assert (saved.over_mean["faulty_worst"], saved.over_mean["protected_worst"]) == (33.0, 30.0)
+    assert saved.over_mean["recovered_share"] == pytest.approx(3.0 / 13.0)
+    told = [re.split("  +", line)[-1] for line in CampaignReport.of(book.ledger).lines()]
     assert told[-5:-3] == ["worst over own golden", "+100.0 %, recovered 70.0 points, 70.0 %"]
     assert told[-2:] == ["worst over mean golden", "+65.0 %, recovered 15.0 points, 23.1 %"]
 
 
 def test_a_group_without_what_it_is_gathered_by_is_named(book):
     fill(book)
-    names = [cell.name for cell in named(summarise(book.ledger, ["stage"])).cells]
+    names = [cell.name for cell in summary(book.ledger, ["stage"]).cells]
     assert names == ["golden", "stage=control"]
-    assert named(summarise(book.ledger, ["detector"])).cells[0].name == "no detector"
-    assert named(summarise(book.ledger, ["setting", "stage"])).cells[0].name == "setting=golden"
-    assert campaign_lines(summarise(book.ledger, ["stage"]))[1].startswith("golden ")
+    assert summary(book.ledger, ["detector"]).cells[0].name == "no detector"
+    assert summary(book.ledger, ["setting", "stage"]).cells[0].name == "setting=golden"
+    assert CampaignReport.of(book.ledger, ["stage"]).lines()[1].startswith("golden ")
 
 
 def test_means_are_called_means(book):
     fill(book)
-    text = "\n".join(campaign_lines(summarise(book.ledger)))
+    text = "\n".join(CampaignReport.of(book.ledger).lines())
     assert "mean time  mean distance  mean energy  mean replans" in text
 
 
@@ -160,8 +164,8 @@ def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
             labels = {"setting": "D&R(G)", "detector": "gad", "stage": "control", **common}
             book.add(labels, seed, 21.0, outcome="collision" if seed else "success")
     found = groups(book.ledger)
-    told = campaign_lines(summarise(book.ledger))
-    told += campaign_lines({"quality": qualities(found)})
+    told = CampaignReport.of(book.ledger).lines()
+    told += quality_lines(qualities(found))
     assert max(map(len, told)) <= 100
     assert told[0] == (
         "in all settings that have it: detector=gad level=instruction stage=control together=true"
@@ -175,7 +179,7 @@ def test_no_line_is_wider_than_a_screen_and_common_labels_are_told_once(book):
 def test_a_label_that_alone_tells_settings_apart_has_a_column(book):
     book.add({"setting": "FI"}, 1, 20.0)
     book.add({"setting": "FI", "field": "sign"}, 1, 21.0)
-    told = campaign_lines(summarise(book.ledger))
+    told = CampaignReport.of(book.ledger).lines()
     assert told[0] == "in all settings that have it: setting=FI"
     assert [line.split()[0] for line in told[1:4]] == ["field", "1/1", "sign"]
 
@@ -187,7 +191,7 @@ def test_gathered_protected_flights_meet_the_same_fault_though_another_did_nothi
             fate = Injected.NOT_INJECTED if idle else ACTIVE
             book.add({"setting": "FI", "stage": stage}, seed, time_s, injected=fate)
             book.add({"setting": "D&R", "stage": stage, "detector": "gad"}, seed, time_s)
-    (saved,) = named(summarise(book.ledger, ["setting"])).protection
+    (saved,) = summary(book.ledger, ["setting"]).protection
     assert (saved.first, saved.second) == ({"setting": "FI"}, {"setting": "D&R"})
     assert saved.success.pairs == 9
     time = saved.differences["flight_time_s"]
@@ -199,7 +203,7 @@ def test_the_detector_none_watches_nothing(book):
     for seed in range(4):
         book.add({"kind": "golden", "detector": "none"}, seed, 20.0, injected=GOLDEN)
         book.add({"kind": "fault", "detector": "none"}, seed, 22.0)
-    (faulty,) = named(summarise(book.ledger)).faults
+    (faulty,) = summary(book.ledger).faults
     assert faulty.success.pairs == 4
 
 
@@ -208,40 +212,40 @@ def test_settings_are_gathered_by_labels(book):
         book.add({"setting": "FI", "stage": "planning", "world": "farm"}, seed, 20.0)
         book.add({"setting": "FI", "stage": "control", "world": "farm"}, seed, 21.0)
         book.add({"setting": "FI", "stage": "control", "world": "dense"}, seed, 22.0)
-    cells = named(summarise(book.ledger, ["setting", "world"])).cells
+    cells = summary(book.ledger, ["setting", "world"]).cells
     assert [(cell.labels["world"], cell.success.total) for cell in cells] == [
         ("farm", 8), ("dense", 4),
     ]  # fmt: skip
     assert cells[0].labels == {"setting": "FI", "world": "farm"}
     with pytest.raises(UnknownName, match="did you mean 'world'"):
-        summarise(book.ledger, ["wrld"])
+        summary(book.ledger, ["wrld"])
 
 
 def test_a_faulty_mission_pairs_with_no_golden_flight_of_another_seed(book):
     book.add({"setting": "golden"}, 1, 20.0, injected=GOLDEN)
     book.add(FI, 2, 30.0)
-    assert summarise(book.ledger)["faults"] == []
+    assert summary(book.ledger).faults == []
 
 
 def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
     fill(book)
-    summary = summarise(book.ledger)
-    text = "\n".join(campaign_lines(summary))
+    report = CampaignReport.of(book.ledger)
+    text = "\n".join(report.lines())
     assert "in all settings that have it: detector=gad stage=control" in text
     assert "7/10" in text
     assert "collision 3" in text
     assert "recovered 40.0 points, 72.7 %" in text
-    assert json.loads(json.dumps(plain(summary), allow_nan=False))["missing"] == 0
+    assert json.loads(json.dumps(plain(report.as_dict()), allow_nan=False))["missing"] == 0
 
 
 def test_a_campaign_that_has_just_begun_has_a_table(book):
     book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
-    assert "all missions" in "\n".join(campaign_lines(summarise(book.ledger)))
+    assert "all missions" in "\n".join(CampaignReport.of(book.ledger).lines())
 
 
 def test_quality_has_intervals_and_extremes_of_every_metric(book):
     fill(book)
-    found = named(qualities(groups(book.ledger)))
+    found = qualities(groups(book.ledger))
     assert [each.metric for each in found[::3]] == [*METRICS]
     golden, faulty, _ = found[:3]
     assert (golden.mean.value, golden.difference) == (20.0, None)
@@ -250,16 +254,16 @@ def test_quality_has_intervals_and_extremes_of_every_metric(book):
     assert faulty.mean.value == pytest.approx(30.0 + 1 / 7)
     assert 30.0 <= faulty.mean.low < faulty.mean.value < faulty.mean.high <= 31.0
     assert faulty.difference.value == pytest.approx(10.0 + 1 / 7)
-    text = "\n".join(campaign_lines({"quality": found}))
+    text = "\n".join(quality_lines(found))
     assert "+10.14" in text
     assert "replans" in text
 
 
 def test_quality_without_a_success_is_no_number(book):
     book.add(FI, 1, 30.0, outcome="collision")
-    found = named(qualities(groups(book.ledger)))
+    found = qualities(groups(book.ledger))
     assert all(math.isnan(each.most) for each in found)
-    assert campaign_lines({"quality": found})[3].split()[-5:] == ["0", "-", "-", "-", "-"]
+    assert quality_lines(found)[3].split()[-5:] == ["0", "-", "-", "-", "-"]
 
 
 def test_failures_are_of_missions_that_succeed_without_the_fault(book):
@@ -272,15 +276,13 @@ def test_failures_are_of_missions_that_succeed_without_the_fault(book):
         book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN, outcome=golden)
         outcome = "collision" if injected is ACTIVE else "success"
         book.add(FI, seed, 20.0, injected=injected, outcome=outcome)
-    faulty, saved = named(failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0))
+    faulty, saved = setting_failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0)
     assert (faulty.labels, faulty.failure.count, faulty.failure.total) == (FI, 3, 11)
     assert (saved.failure.count, saved.failure.total) == (1, 10)
     assert faulty.per_hour == pytest.approx((6 / 11, 2 * faulty.failure.low,
                                              2 * faulty.failure.high))  # fmt: skip
     assert faulty.layers is None
-    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(
-        campaign_lines({"failures": [faulty]})
-    )
+    assert "3 of 11 faults fail the mission, 27.3 %" in "\n".join(failure_lines([faulty]))
 
 
 def native(book, seeds, **fault):
@@ -307,21 +309,21 @@ def kernels_folder(tmp_path, **changes):
 
 def test_failure_given_a_kernels_corruption(book, tmp_path):
     native(book, range(10))
-    (row,) = named(failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path)))
+    (row,) = setting_failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
     assert row.kernel == "octomap"
     assert row.layers.corruption.share == 0.8
     assert row.layers.failure_given_corruption[0] == pytest.approx(0.5 / 0.8)
-    assert "failure given corruption 0.625 (" in "\n".join(campaign_lines({"failures": [row]}))
+    assert "failure given corruption 0.625 (" in "\n".join(failure_lines([row]))
 
 
 def test_no_setting_to_count_failures_of_is_told():
-    assert "none: no setting" in campaign_lines({"failures": []})[-1]
+    assert "none: no setting" in failure_lines([])[-1]
 
 
 def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):
     native(book, range(2), bits=3)
     with pytest.raises(ConfigError, match=r"kernels.json: .*not the same population"):
-        failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
+        setting_failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
 
 
 COUNTLESS = """{"plan": {"rule": "", "compat": null, "model": {}},
@@ -334,7 +336,7 @@ def test_a_folder_without_kernels_is_refused(book, tmp_path, text):
     if text is not None:
         (tmp_path / "kernels.json").write_text(text)
     with pytest.raises(RecordError, match=r"kernels.json: "):
-        failures(book.ledger, groups(book.ledger), tmp_path)
+        setting_failures(book.ledger, groups(book.ledger), tmp_path)
 
 
 def test_settings_that_their_rule_has_stopped_are_named(book):

@@ -54,7 +54,7 @@ def test_recomputation_costs_a_run_of_the_stage():
     assert found.recompute_s == pytest.approx(again_s)
     assert found.share == pytest.approx((0.02 + again_s) / (9.0 - again_s))
     assert found.alarms == 3
-    assert "3 recomputations" in found.told("somewhere")
+    assert "3 recomputations" in found.describe("somewhere")
 
 
 def test_alarms_beyond_the_listed_ones_are_counted():
@@ -74,10 +74,10 @@ def test_flights_are_taken_together_and_faulty_ones_left_out():
     assert found["gad"].share == pytest.approx(0.06 / 18.0)
     assert (
         found["gad"]
-        .told("here")
+        .describe("here")
         .startswith("measured in 2 flights of here on x86: checks 0.3333 %")
     )
-    assert found["aad"].told("here").startswith("measured in 1 flight of here on x86: ")
+    assert found["aad"].describe("here").startswith("measured in 1 flight of here on x86: ")
 
 
 def test_flights_on_another_platform_do_not_count():
@@ -87,7 +87,7 @@ def test_flights_on_another_platform_do_not_count():
     found = ComputeOverhead.of(flights, "tx2")
     assert set(found) == {"gad"}
     assert found["gad"].share == pytest.approx(0.04 / 9.0)
-    told = found["gad"].told("here")
+    told = found["gad"].describe("here")
     assert told.startswith("measured in 1 flight of here on tx2 (1 on other platforms left out): ")
     assert told.endswith("; checks take the time of the host that flew, not scaled to the platform")
 
@@ -126,14 +126,14 @@ def measured(path, platform=None):
 
 def test_the_command_takes_a_run_folder(guarded, tmp_path):
     found = measured(guarded.path)
-    assert found.told("here").startswith("measured in 1 flight of here on x86: checks ")
+    assert found.describe("here").startswith("measured in 1 flight of here on x86: checks ")
     assert measured(guarded.result) == measured(guarded.path, "x86") == found
     assert measured(guarded.path.parent).share > 0.0  # the folder of runs
     asked = ["--overhead", str(guarded.path), "--overhead", "aad=0.5", "--json"]
     told = json.loads(CliRunner().invoke(vpm, asked).stdout)["vehicles"][0]["schemes"]
     given = {row["scheme"]: (row["overhead_percent"], row["source"]) for row in told}
     assert given["aad"] == (0.5, "--overhead")
-    assert given["gad"] == (pytest.approx(100.0 * found.share), found.told(str(guarded.path)))
+    assert given["gad"] == (pytest.approx(100.0 * found.share), found.describe(str(guarded.path)))
     with pytest.raises(
         RecordError, match=r"on tx2 \(--platform\) is recorded there, only gad on x86; "
     ):

@@ -52,9 +52,9 @@ def test_the_chain_takes_the_newest_output_that_was_there():
         ran("collision_check", 1.15, 1.2), ran("collision_check", 1.6, 1.65),
         ran("control", 1.64, 1.641), ran("control", 1.66, 1.661), ran("control", 1.68, 1.681),
     ]  # fmt: skip
-    (told,) = timelines(flight(table, [reaction(1.1, 1.66)]))
-    assert told["chain_s"] == {
-        node: [pytest.approx(start_s - 1.1), pytest.approx(end_s - 1.1)]
+    (line,) = timelines(flight(table, [reaction(1.1, 1.66)]))
+    assert line.chain_s == {
+        node: pytest.approx((start_s - 1.1, end_s - 1.1))
         for node, start_s, end_s in (
             ("point_cloud", 1.1, 1.11), ("octomap", 1.15, 1.6),
             ("collision_check", 1.6, 1.65), ("control", 1.66, 1.661),
@@ -65,35 +65,35 @@ def test_the_chain_takes_the_newest_output_that_was_there():
 def test_the_typical_reaction_is_near_the_median_and_one_that_did_something():
     slow, middle, acted = reaction(1.0, 1.9), reaction(2.0, 2.4), reaction(3.0, 3.5)
     reactions = [slow, middle, acted, reaction(4.0, 4.1)]
-    (told,) = timelines(flight([], reactions))
-    assert told["frame_stamp_s"] == middle.frame_stamp_s
-    (told,) = timelines(flight([], reactions, events=(3.5,)))
-    assert told["frame_stamp_s"] == acted.frame_stamp_s
+    (line,) = timelines(flight([], reactions))
+    assert line.frame_stamp_s == middle.frame_stamp_s
+    (line,) = timelines(flight([], reactions, events=(3.5,)))
+    assert line.frame_stamp_s == acted.frame_stamp_s
     assert timelines(flight([], [])) == []
 
 
 def test_a_flight_with_an_obstacle_tells_what_led_to_its_slowing_down(troubled_flight):
     run = load_run(troubled_flight.path)
-    (told,) = timelines({"x86": run})
-    stamp_s = told["frame_stamp_s"] + told["response_s"]
+    (line,) = timelines({"x86": run})
+    stamp_s = line.frame_stamp_s + line.response_s
     acted = {round(e["stamp_s"], 6): e["text"] for e in run.result["events"]
              if e["kind"] in ("slow", "stop")}  # fmt: skip
-    assert told["answer"] == acted[round(stamp_s, 6)]
-    chain = told["chain_s"]
+    assert line.answer == acted[round(stamp_s, 6)]
+    chain = line.chain_s
     order = ("point_cloud", "octomap", "collision_check", "control", "planner")
     assert tuple(chain) == order
     ends = [0.0]
     for kernel in order:
         start, end = chain[kernel]
         assert start >= ends[-1 if kernel != "planner" else -2] - 1e-9
-        assert [start, end] in told["lanes_s"][kernel]
+        assert (start, end) in line.lanes_s[kernel]
         ends.append(end)
-    assert chain["control"][0] == pytest.approx(told["response_s"])
-    assert told["plan_setpoint_s"] >= chain["planner"][1]
-    assert told["shown_s"][1] >= 1.0
+    assert chain["control"][0] == pytest.approx(line.response_s)
+    assert line.plan_setpoint_s >= chain["planner"][1]
+    assert line.shown_s[1] >= 1.0
     again = timelines({"x86": run, "other": run})
-    assert [row["platform"] for row in again] == ["x86", "other"]
-    assert again[0]["shown_s"] == again[1]["shown_s"]
+    assert [row.platform for row in again] == ["x86", "other"]
+    assert again[0].shown_s == again[1].shown_s
 
 
 def test_latencies_of_the_table_are_those_that_the_nodes_were_busy_for(troubled_flight):

@@ -1,9 +1,8 @@
 """Which flights of a campaign are drawn together, and under which names."""
 
 import pytest
-from plain_values import named
 
-from mavfi_cli.analysis import trajectories
+from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.begin import chosen
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.campaigns.specification import Keep
@@ -11,11 +10,6 @@ from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
-
-
-def pair(*arguments):
-    return named(trajectories.pair(*arguments))
-
 
 GOLDEN = {"setting": "golden", "world": "dense"}
 

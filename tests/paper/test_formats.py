@@ -10,13 +10,8 @@ import pytest
 from made_flights import flight, struck, table
 
 from mavfi_cli.paper.layouts import OF_FLIGHTS, of_flights
-from mavfi_cli.report.paper import (
-    FORMATS,
-    PaperCell,
-    PaperColumn,
-    PaperRow,
-    PaperTable,
-)
+from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
+from mavfi_cli.report.table import FORMATS
 
 WORLDS = ("factory", "farm", "sparse", "dense")
 STATES = ("time_to_collision", "future_collision_seq", "waypoint_position", "waypoint_yaw",
@@ -57,7 +52,7 @@ def laid_out(name):
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_the_text_is_one_screen(name):
-    lines = of_flights(name, FLIGHTS[name]).text().splitlines()
+    lines = of_flights(name, FLIGHTS[name]).formatted("text").splitlines()
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 100
 
@@ -65,18 +60,18 @@ def test_the_text_is_one_screen(name):
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 @pytest.mark.parametrize("form", FORMATS)
 def test_every_layout_has_every_format(name, form):
-    assert FORMATS[form](laid_out(name)).endswith("\n")
+    assert laid_out(name).formatted(form).endswith("\n")
 
 
 def test_the_formats_have_the_same_numbers():
     found = of_flights("table4", FLIGHTS["table4"])
-    ours = found.cells()[2]
+    ours = found.table.rows[2]
     assert ours[:4] == ["injection", "3", "100.0 (44 to 100)", "91.7"]
-    markdown = FORMATS["markdown"](found).splitlines()
+    markdown = found.formatted("markdown").splitlines()
     assert markdown[5].split(" | ")[1:4] == ours[1:4]
-    latex = FORMATS["latex"](found)
+    latex = found.formatted("latex")
     assert "injection & 3 & 100.0 (44 to 100) & 91.7" in latex
-    rows = list(csv.DictReader(io.StringIO(FORMATS["csv"](found))))
+    rows = list(csv.DictReader(io.StringIO(found.formatted("csv"))))
     assert len(rows) == 16
     (row,) = [r for r in rows if r["success, %"] == "injection" and r["quantity"] == "factory"]
     assert (float(row["value"]), row["n"], row["paper"]) == (100.0, "3", "91.7")
@@ -85,7 +80,7 @@ def test_the_formats_have_the_same_numbers():
 
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 def test_latex_is_a_whole_tabular_of_plain_text(name):
-    text = FORMATS["latex"](laid_out(name))
+    text = laid_out(name).formatted("latex")
     (form,) = re.findall(r"\\begin\{tabular\}\{([lr]+)\}", text)
     body = text[text.index(r"\begin{tabular}") : text.index(r"\end{tabular}")]
     rows = [line for line in body.splitlines() if line.endswith(r" \\")]
@@ -100,13 +95,11 @@ def test_latex_is_a_whole_tabular_of_plain_text(name):
     [(1, "table", "footnotesize"), (8, "table*", "footnotesize"), (14, "table*", "scriptsize")],
 )
 def test_a_latex_table_takes_the_place_that_it_needs(columns, place, size):
-    text = FORMATS["latex"](
-        PaperTable(
-            name="t", title="T", labels=("state",),
-            columns=(PaperColumn(title="time, s"),) * columns,
-            rows=(PaperRow(labels=("a",), cells=(PaperCell(value=12.5),) * columns),),
-        )
-    )  # fmt: skip
+    text = PaperTable(
+        name="t", title="T", labels=("state",),
+        columns=(PaperColumn(title="time, s"),) * columns,
+        rows=(PaperRow(labels=("a",), cells=(PaperCell(value=12.5),) * columns),),
+    ).formatted("latex")  # fmt: skip
     assert text.startswith(rf"\begin{{{place}}}")
     assert rf"\centering\{size}" in text
 

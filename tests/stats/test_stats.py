@@ -206,11 +206,11 @@ def test_no_worst_case_without_flights():
 
 def test_failure_given_corruption():
     found = cross_layer(400, 1000, 20, 100)
-    assert found["failure_given_corruption"][0] == pytest.approx(0.5)
-    low, high = found["failure_given_corruption"][1:]
+    assert found.failure_given_corruption[0] == pytest.approx(0.5)
+    low, high = found.failure_given_corruption[1:]
     assert low < 0.5 < high
-    assert cross_layer(0, 1000, 20, 100)["failure_given_corruption"] is None
-    assert cross_layer(10, 1000, 20, 100)["failure_given_corruption"] is None
+    assert cross_layer(0, 1000, 20, 100).failure_given_corruption is None
+    assert cross_layer(10, 1000, 20, 100).failure_given_corruption is None
 
 
 def test_failures_an_hour_are_the_upsets_that_fail_missions():

@@ -4,7 +4,7 @@ from collections import defaultdict
 from dataclasses import replace
 
 import pytest
-from flown_twice import flight
+from flown_twice import flight, table
 
 from mavfi_cli.analysis.platforms import titles
 from mavfi_cli.analysis.timeline import timeline_seed
@@ -108,9 +108,9 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
         *(flight("tx2", seed, 21.0) for seed in (1, 2, 4)),
         flight("tx2", 3, 21.0, outcome="collision"),
     ]
-    assert timeline_seed(flights, plan.platforms) == 4
-    assert timeline_seed([f for f in flights if f["seed"] != 4], plan.platforms) == 1
-    assert timeline_seed([], plan.platforms) is None
+    assert timeline_seed(table(flights), plan.platforms) == 4
+    assert timeline_seed(table(f for f in flights if f["seed"] != 4), plan.platforms) == 1
+    assert timeline_seed(table([]), plan.platforms) is None
 
 
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):

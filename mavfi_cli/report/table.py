@@ -1,0 +1,289 @@
+"""One table as text, Markdown, LaTeX, CSV or HTML, and the formats of the numbers in its cells."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Self
+
+from mavfi_cli.stats.shares import Interval, Share
+
+WIDTH = 100  # characters; default maximum width of a table
+_GAP = 2
+_LEAST_ROOM = 20  # characters; minimum width of the prose column
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells that are already formatted, headings first if there are any.
+
+    Attributes:
+        rows: may differ in length; missing cells are empty.
+        labels: number of left-aligned columns; the others are right-aligned. None aligns all left.
+        kept: number of columns after the labels that every page of a wide table repeats with them.
+        parts: numbers of the other columns that are never separated; empty if every column stands
+            alone.
+        prose: whether the last column is wrapped at the width.
+        name: label of a LaTeX table.
+        title: caption.
+        notes: a line each.
+    """
+
+    rows: Sequence[Sequence[str]]
+    labels: int | None = None
+    kept: int = 0
+    parts: Sequence[int] = ()
+    prose: bool = False
+    name: str = ""
+    title: str = ""
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def of_records(cls, records: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> Self:
+        """One row per record, below the names of the columns, with unrounded numbers.
+
+        Args:
+            names: names of the columns; empty takes the keys of all records, in order.
+        """
+        rows = list(records)
+        keys = names or list(dict.fromkeys(key for row in rows for key in row))
+        cells = ([_text(row.get(key)) for key in keys] for row in rows)
+        return cls([[*keys], *cells])
+
+    def lines(self, width: int | None = None) -> list[str]:
+        """Return one aligned line per row, with two blanks between the cells.
+
+        Args:
+            width: in characters. Columns beyond it continue in further tables below an empty line;
+                each repeats the labels and has at least one other column. None sets no limit.
+        """
+        cells = self._wrapped(width or WIDTH) if self.prose else self._padded()
+        if width is None or self.labels is None:
+            return _aligned(cells, self.labels)
+        lines: list[str] = []
+        own = self.labels + self.kept
+        for first, end in self._pages(_widths(cells), own, width):
+            page = [row[:own] + row[first:end] for row in cells]
+            lines += ([""] if lines else []) + _aligned(page, self.labels)
+        return lines
+
+    def text(self) -> str:
+        """Return title, aligned columns and notes."""
+        lines = [*([self.title] if self.title else []), *self.lines(WIDTH), *self.notes]
+        return "\n".join(lines) + "\n"
+
+    def markdown(self) -> str:
+        """Return a table with pipes, below the title in bold."""
+        head, *rows = self._padded()
+        rules = ["---" if left else "---:" for left in self._left(len(head))]
+        lines = [
+            "| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |"
+            for row in (head, rules, *rows)
+        ]
+        title = [f"**{self.title}**", ""] if self.title else []
+        return "\n".join([*title, *lines, "", *self.notes]).rstrip() + "\n"
+
+    def latex(self) -> str:
+        """Return a float with a plain tabular, which needs no package.
+
+        It is as wide as a column of two, or as the page, in the largest size that fits.
+        """
+        head, *rows = self._padded()
+        form = "".join("l" if left else "r" for left in self._left(len(head)))
+        place, size, gap_pt = _latex_place(_widths([head, *rows]))
+        lines = [
+            rf"\begin{{{place}}}",
+            rf"\caption{{{_latex(self.title)}}}",
+            rf"\label{{tab:{self.name}}}",
+            rf"\centering{size}\setlength{{\tabcolsep}}{{{gap_pt / 2:g}pt}}",
+            rf"\begin{{tabular}}{{{form}}}",
+            r"\hline",
+            _latex_row(head),
+            r"\hline",
+            *map(_latex_row, rows),
+            r"\hline",
+            r"\end{tabular}",
+            *(rf"\par {_latex(note)}" for note in self.notes),
+            rf"\end{{{place}}}",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def csv(self) -> str:
+        """Return one line per row, without title and notes."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(self._padded())
+        return text.getvalue()
+
+    def html(self, *, bare: bool = False) -> str:
+        """Return a table element with escaped cells; those of numbers have the class `n`.
+
+        Args:
+            bare: without title and notes.
+        """
+        head, *rows = self._padded()
+        left = self._left(len(head))
+
+        def line(tag: str, cells: Sequence[str]) -> str:
+            begins = (f"<{tag}>" if label else f'<{tag} class="n">' for label in left)
+            marked = map("{}{}</{}>".format, begins, map(html.escape, cells), [tag] * len(left))
+            return f"<tr>{''.join(marked)}</tr>"
+
+        caption = [f"<caption>{html.escape(self.title)}</caption>"] if self.title else []
+        notes = [f'<p class="note">{html.escape(note)}</p>' for note in self.notes]
+        lines = [
+            "<table>", *([] if bare else caption), f"<thead>{line('th', head)}</thead>", "<tbody>",
+            *(line("td", row) for row in rows), "</tbody>", "</table>", *([] if bare else notes),
+        ]  # fmt: skip
+        return "\n".join(lines) + "\n"
+
+    def _padded(self) -> list[list[str]]:
+        count = max(map(len, self.rows), default=0)
+        return [[*row, *[""] * (count - len(row))] for row in self.rows]
+
+    def _left(self, columns: int) -> list[bool]:
+        return [self.labels is None or place < self.labels for place in range(columns)]
+
+    def _wrapped(self, width: int) -> list[list[str]]:
+        """The rows with further ones for the prose that does not fit beside the other columns."""
+        cells = self._padded()
+        room = width - sum(each + _GAP for each in _widths(cells)[:-1])
+        rows = []
+        for *row, prose in cells:
+            first, *rest = textwrap.wrap(prose, max(room, _LEAST_ROOM)) or [""]
+            rows += [[*row, first], *([""] * len(row) + [line] for line in rest)]
+        return rows
+
+    def _pages(self, widths: Sequence[int], kept: int, width: int) -> Iterator[tuple[int, int]]:
+        """Yield the first column of each page and the column after its last."""
+        own = sum(each + _GAP for each in widths[:kept])
+        first, end, used = kept, kept, own
+        for columns in self.parts or [1] * (len(widths) - kept):
+            needed = sum(widths[end : end + columns]) + _GAP * (columns - 1)
+            if end > first and used + needed > width:
+                yield first, end
+                first, used = end, own
+            used += needed + _GAP
+            end += columns
+        yield first, end
+
+
+FORMATS: Mapping[str, Callable[[Table], str]] = {
+    "text": Table.text,
+    "markdown": Table.markdown,
+    "latex": Table.latex,
+    "html": Table.html,
+    "csv": Table.csv,
+}
+
+
+def _text(value: object) -> str:
+    return "" if value is None else str(value)
+
+
+def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
+    return [max(map(len, column)) for column in zip(*cells, strict=True)]
+
+
+def _aligned(cells: Sequence[Sequence[str]], labels: int | None) -> list[str]:
+    widths = _widths(cells)
+    left = len(widths) if labels is None else labels
+    return [
+        (" " * _GAP)
+        .join(
+            cell.ljust(width) if place < left else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        .rstrip()
+        for row in cells
+    ]
+
+
+# LaTeX --------------------------------------------------------------------------------------------
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"\textless{}", ">": r"\textgreater{}",
+}  # fmt: skip
+# Sizes of 8 and of 7 points with the width of a character and of the gap between two columns, and
+# the widths of a column of a printed page and of the page; all in points.
+_SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsize", 3.9, 4.0))
+_PLACES = (("table", 252.0), ("table*", 516.0))
+
+
+def _latex_place(widths: Sequence[int]) -> tuple[str, str, float]:
+    """The narrowest float and the largest size that hold the table, and the gap; else the last."""
+    for place, width_pt in _PLACES:
+        for size, character_pt, gap_pt in _SIZES:
+            if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
+                return place, size, gap_pt
+    return place, size, gap_pt
+
+
+def _latex_row(row: Sequence[str]) -> str:
+    return " & ".join(map(_latex, row)) + r" \\"
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+# Numbers ------------------------------------------------------------------------------------------
+
+Row = Mapping[str, Any]
+
+
+def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") -> str:
+    """Format a value with its unit; a dash if it is not finite."""
+    return "-" if not math.isfinite(value) else f"{scale * value:{shape}}{unit}"
+
+
+def percent(share: float, shape: str = ".1f") -> str:
+    """Format a share of one as per cent."""
+    return number(share, shape, 100.0, " %")
+
+
+def rate(share: Share | Row, digits: int = 1, ends: int = 0) -> str:
+    """Format a share as per cent with its interval.
+
+    Args:
+        ends: digits of the ends of the interval.
+    """
+    value, low, high = _parts(share, "share")
+    if math.isnan(value):
+        return "-"
+    return f"{100 * value:.{digits}f} % ({100 * low:.{ends}f} to {100 * high:.{ends}f})"
+
+
+def spread(
+    value: Interval | Row,
+    digits: int,
+    scale: float = 1.0,
+    sign: str = "",
+    chance: float | None = None,
+) -> str:
+    """Format a value with its interval and p-value if there are any."""
+    if math.isnan(_parts(value, "value")[0]):
+        return "-"
+    shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
+    middle, low, high = (f"{scale * end:{shape}}" for end in _parts(value, "value"))
+    more = [] if math.isnan(_parts(value, "value")[1]) else [f"{low} to {high}"]
+    more += [] if chance is None else [p_value(chance)]
+    return f"{middle} ({', '.join(more)})" if more else middle
+
+
+def _parts(estimate: Share | Interval | Row, name: str) -> tuple[Any, Any, Any]:
+    """Value, low and high of an estimate, also of one that was read from JSON."""
+    part = estimate.get if isinstance(estimate, Mapping) else partial(getattr, estimate)
+    return part(name), part("low"), part("high")
+
+
+def p_value(chance: float) -> str:
+    """Format a p-value in short form."""
+    return "p<.001" if chance < 0.001 else f"p {chance:.1g}".replace("p 0.", "p .")
