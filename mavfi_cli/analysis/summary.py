@@ -19,11 +19,11 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
-from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
 from mavfi_cli.stats.shares import Interval, Share, rate
 
-RESAMPLES = 1999
+RESAMPLES = TABLE_RESAMPLES
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")

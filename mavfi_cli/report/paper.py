@@ -13,7 +13,7 @@ import numpy as np
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
 from mavfi_cli.report.table import FORMATS, Table
-from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.shares import Share
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Printed = float | str | None  # a number of the paper, its words for it, or nothing
-_RESAMPLES = 1999  # of the bootstrap interval of a cell
 DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
 
 
@@ -52,7 +51,7 @@ class PaperCell:
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
         """A mean with its bootstrap interval."""
-        return cls(**asdict(interval(values, resamples=_RESAMPLES)), paper=paper)
+        return cls(**asdict(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

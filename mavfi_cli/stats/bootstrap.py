@@ -16,6 +16,7 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 RESAMPLES = 9999
+TABLE_RESAMPLES = 1999  # of the many intervals of a table
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
 LARGE = 500  # from here on the mean is normal and the bootstrap would only be slow
 _CHUNK = 4_000_000  # numbers drawn at once

@@ -1,8 +1,13 @@
-"""Tables of text: aligned, and no wider than a screen."""
+"""Tables: aligned and no wider than a screen, and the same cells in every format."""
+
+import csv
+from dataclasses import asdict
+from xml.etree import ElementTree
 
 import pytest
 
-from mavfi_cli.report.table import Table
+from mavfi_cli.report.table import Table, rate, spread
+from mavfi_cli.stats.shares import Interval, Share
 
 ROWS = [["name", "count", "share"], ["a", "1", "0.5 %"], ["long name", "100"]]
 
@@ -50,3 +55,44 @@ def test_prose_goes_on_below_itself():
         "      maker and a scale",
         "x",
     ]
+
+
+WIDE = Table(
+    [["state", "n", "ours", "paper"], ["a|b & <c>", "3", "1.5 %", "2"]],
+    labels=1, kept=1, parts=(2,), name="t", title="A & B", notes=("a note",),
+)  # fmt: skip
+
+
+def test_columns_of_one_part_stay_on_one_page_and_kept_ones_are_repeated():
+    rows = [["x", "n", *"abcd"], ["1", "2", *"3456"]]
+    table = Table(rows, labels=1, kept=1, parts=(2, 2))
+    assert table.lines(13) == ["x  n  a  b", "1  2  3  4", "", "x  n  c  d", "1  2  5  6"]
+    assert table.lines(16) == ["x  n  a  b  c  d", "1  2  3  4  5  6"]
+
+
+def test_markdown_latex_and_html_escape_their_own_marks():
+    markdown = WIDE.markdown().splitlines()
+    assert markdown[:2] == ["**A & B**", ""]
+    assert markdown[3:5] == ["| --- | ---: | ---: | ---: |", r"| a\|b & <c> | 3 | 1.5 % | 2 |"]
+    assert r"a|b \& \textless{}c\textgreater{} & 3 & 1.5 \% & 2 \\" in WIDE.latex()
+    root = ElementTree.fromstring(f"<div>{WIDE.html()}</div>")
+    cells = [(cell.text, cell.get("class")) for cell in root.iter("td")]
+    assert cells == [("a|b & <c>", None), ("3", "n"), ("1.5 %", "n"), ("2", "n")]
+    assert (root.findtext(".//caption"), root.findtext("p")) == ("A & B", "a note")
+    assert ElementTree.fromstring(WIDE.html(bare=True)).find("caption") is None
+
+
+def test_csv_has_unrounded_numbers_and_no_word_for_nothing():
+    records = [{"name": "a,b", "x": 0.1 + 0.2}, {"x": None, "y": True}]
+    rows = list(csv.reader(Table.of_records(records).csv().splitlines()))
+    assert rows == [["name", "x", "y"], ["a,b", "0.30000000000000004", ""], ["", "", "True"]]
+    assert Table.of_records(records, ["y"]).csv() == 'y\n""\nTrue\n'
+
+
+def test_one_formatter_serves_an_estimate_and_its_json():
+    share = Share(count=97, total=100, share=0.97, low=0.915, high=0.9905)
+    assert rate(share) == rate(asdict(share)) == "97.0 % (92 to 99)"
+    assert rate(share, 0, ends=1) == "97 % (91.5 to 99.1)"
+    value = Interval(value=-0.001, low=-1.0, high=1.0, count=4)
+    assert spread(value, 2, sign="+", chance=1e-4) == "-0.00 (-1.00 to +1.00, p<.001)"
+    assert spread(asdict(value), 1) == "0.0 (-1.0 to 1.0)"
