@@ -210,7 +210,8 @@ def _flight_lines(flights: FlightsReport) -> list[str]:
     for vehicle in flights.vehicles:
         lines += ["", *_flown_lines(vehicle, flights)]
     lines += ["", *_overhead_lines(flights.overheads), "", "What the flights do not scale:"]
-    return [*lines, *Table(["", text] for text in flights.not_scaled, prose=True).lines()]
+    rows = [["", text] for text in flights.not_scaled]
+    return [*lines, *Table(rows, prose=True).lines()]
 
 
 def _flown(vehicle: FlownVehicle) -> list[tuple[FlownScheme, FlownNumbers]]:
