@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mavfi_cli.autonomy import planners
 from mavfi_cli.campaigns.ledger import LEDGER, ExportedLedger, Ledger, is_export
 from mavfi_cli.campaigns.missions import (
     PlannedMission,
@@ -29,6 +28,7 @@ from mavfi_cli.campaigns.run import (
 )
 from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec, replaced
+from mavfi_cli.companion.pipeline import CompanionParts
 from mavfi_cli.core.errors import (
     ConfigError,
     FaultSpecError,
@@ -40,8 +40,6 @@ from mavfi_cli.core.files import reading, write_text
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.spec.stack import load_stack
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 SEARCH = "world-search"  # folder of the campaign that finds fixed worlds
@@ -319,9 +317,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
         MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
             for another stack; values make no fault; or the start is blocked.
     """
-    planners.find(config.planner)
-    load_platform(config.platform)
-    load_stack(config.stack)
+    CompanionParts.of(config)
     if config.fault is not None:
         config.fault.check()
     if config.instruction is not None:

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.campaigns.missions import (
     Injected,
+    MissingMission,
     MissionResult,
     PlannedMission,
     ResultState,
@@ -293,8 +294,8 @@ class Ledger:
 
     # Missions to fly ------------------------------------------------------------------------------
 
-    def missing(self, *, errors: bool = False) -> Iterator[tuple[int, int, dict[str, Any]]]:
-        """Number, cell and changes of every mission without a result, in the order of the list.
+    def missing(self, *, errors: bool = False) -> Iterator[MissingMission]:
+        """Missions without a result, in the order of the list.
 
         Read in portions, so that results may be added meanwhile.
 
@@ -314,8 +315,8 @@ class Ledger:
             )
             for number, cell, text in rows:
                 with reading(self._path):
-                    changes = _object(text)
-                yield number, cell, changes
+                    config = structure(_object(text), MissionConfig)
+                yield MissingMission(number, cell, config)
                 last = number
             if not rows:
                 return

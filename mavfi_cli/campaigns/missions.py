@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.mission.measures import FlightRecord, record_of
@@ -130,6 +130,14 @@ def naming(labels: Labels) -> Iterator[None]:
         named = ConfigError(f"{error}{place}")
         named.exit_code = error.exit_code
         raise named from None
+
+
+class MissingMission(NamedTuple):
+    """A mission without a result: its place in the list, its setting, and what to fly."""
+
+    number: int
+    cell: int
+    config: MissionConfig
 
 
 class ResultState(Enum):

@@ -15,20 +15,21 @@ import os
 import shutil
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 from mavfi_cli.campaigns.ledger import RUNS, Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     Injected,
+    MissingMission,
     PlannedMission,
     ResultState,
     canonical,
+    changes_of,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
@@ -40,7 +41,6 @@ from mavfi_cli.campaigns.workers import (
     Cluster,
     LocalWorkers,
 )
-from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, Interrupted
 from mavfi_cli.core.files import file_digest, own_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
@@ -48,10 +48,9 @@ from mavfi_cli.core.processes import interruptible
 from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import record_of
 from mavfi_cli.mission.run_folder import RESULT
-from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import rate
 
-Entry = tuple[int, int, dict[str, Any]]  # number, setting, changes of a mission
 Row = tuple[str | None, str | None]  # outcome, what happened to the fault
 
 
@@ -228,7 +227,7 @@ class MissionQueue:
     """The missing missions in the order of the list; with a stopping rule, each in its batch.
 
     Args:
-        missing: number, setting and changes of each mission.
+        missing: missions without a result.
         stop: the rule; None lets all missions through.
         cells: the setting of each mission, in the order of the list.
         over: number, outcome and fate of the fault of every mission that is over.
@@ -239,13 +238,13 @@ class MissionQueue:
 
     def __init__(
         self,
-        missing: Iterator[Entry],
+        missing: Iterator[MissingMission],
         stop: Stop | None,
         cells: Sequence[int] = (),
         over: Iterable[tuple[int, Row]] = (),
     ) -> None:
         self._missing, self._stop, self._cells = missing, stop, cells
-        self._held: dict[int, deque[Entry]] = {}  # by setting, in the order of the list
+        self._held: dict[int, deque[MissingMission]] = {}  # by setting, in the order of the list
         self._members: dict[int, list[int]] = {}
         self._place: list[int] = []
         for number, cell in enumerate(cells):
@@ -259,22 +258,21 @@ class MissionQueue:
         for number, row in over if stop else ():
             self.record(number, row)
 
-    def next(self) -> Entry | None:
+    def next(self) -> MissingMission | None:
         """The next mission that may begin; None where there is none now."""
         if self._stop is None:
             return next(self._missing, None)
         self._held = {
             cell: held for cell, held in self._held.items() if held and cell not in self.stopped
         }
-        ready = [held for held in self._held.values() if self._passes(held[0][0])]
+        ready = [held for held in self._held.values() if self._passes(held[0].number)]
         if ready:
-            return min(ready, key=lambda held: held[0][0]).popleft()
-        for entry in self._missing:
-            number, cell, _ = entry
-            if self._passes(number):
-                return entry
-            if cell not in self.stopped:
-                self._held.setdefault(cell, deque()).append(entry)
+            return min(ready, key=lambda held: held[0].number).popleft()
+        for mission in self._missing:
+            if self._passes(mission.number):
+                return mission
+            if mission.cell not in self.stopped:
+                self._held.setdefault(mission.cell, deque()).append(mission)
         return None
 
     def _passes(self, number: int) -> bool:
@@ -318,17 +316,17 @@ class _Run:
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
         only = options.only
         missing = ledger.missing(errors=options.errors)
-        wanted = (e for e in missing if only is None or e[0] in only)
+        wanted = (m for m in missing if only is None or m.number in only)
         self._queue = MissionQueue(wanted, stop, ledger.cell_of_each() if stop else (), over())
-        self._again: list[Entry] = []
-        self._flying: dict[int, Entry] = {}
+        self._again: list[MissingMission] = []
+        self._flying: dict[int, MissingMission] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
         self.profiles = (options.profiles or self._folder / PROFILES).absolute()
         self._sharing = Counter(
-            _golden_text(changes)
-            for _, _, changes in ledger.missing(errors=options.errors)
-            if changes.get("instruction") and options.profiles is None
+            mission.config.golden
+            for mission in ledger.missing(errors=options.errors)
+            if mission.config.instruction is not None and options.profiles is None
         )
         names = [str(labels.get("setting", "")) for labels in ledger.cells()]
         self._setting_of = [names[cell] for cell in ledger.cell_of_each()]
@@ -375,15 +373,14 @@ class _Run:
 
     def _fill(self, workers: LocalWorkers | Cluster, asked: Sequence[int]) -> None:
         while workers.free and not asked:
-            entry = self._again.pop() if self._again else self._queue.next()
-            if entry is None:
+            mission = self._again.pop() if self._again else self._queue.next()
+            if mission is None:
                 return
-            number, _, changes = entry
-            if changes.get("firmware"):
-                structure(changes, MissionConfig).require_firmware(*self._options.firmware)
+            number, _, config = mission
+            config.require_firmware(*self._options.firmware)
             self._attempts[number] += 1
-            self._flying[number] = entry
-            workers.start(number, changes, self._made(number), self._options.limit_s)
+            self._flying[number] = mission
+            workers.start(number, changes_of(config), self._made(number), self._options.limit_s)
 
     def _made(self, number: int) -> Path:
         out = self._out(number)
@@ -397,35 +394,34 @@ class _Run:
 
     def _take(self, ended: AttemptEnd) -> None:
         number = ended.number
-        entry = self._flying.pop(number)
+        mission = self._flying.pop(number)
         self._inside_s += ended.wall_s
-        config = structure(entry[2], MissionConfig).to_dict()
         out = self._out(number)
-        verdict = ended.judge(out, config, self._options.limit_s)
+        verdict = ended.judge(out, mission.config, self._options.limit_s)
         last = self._attempts[number] >= ATTEMPTS
         if (verdict.state is None or verdict.doubtful) and not last:
             self._repeated += 1
             self._spectator.on_note(f"mission {number}: {verdict.reason}; begun again")
-            self._again.append(entry)
+            self._again.append(mission)
         elif verdict.state is None:
             self._given_up[number] = verdict.reason
         else:
-            self._settle(ended, verdict, config)
-            self._forget_profiles(entry[2])
+            self._settle(ended, verdict, mission.config)
+            self._forget_profiles(mission.config)
         shutil.rmtree(out, ignore_errors=True)
 
-    def _forget_profiles(self, changes: Mapping[str, Any]) -> None:
+    def _forget_profiles(self, config: MissionConfig) -> None:
         """Remove what missions with the same golden run share after the last of them."""
-        if (golden := _golden_text(changes)) not in self._sharing:
+        if (golden := config.golden) not in self._sharing:
             return
-        if changes.get("instruction"):
+        if config.instruction is not None:
             self._sharing[golden] -= 1
         if not self._sharing[golden]:
             del self._sharing[golden]
-            config = structure(changes, MissionConfig).with_firmware().golden
-            shutil.rmtree(kept_in(self.profiles, config), ignore_errors=True)
+            kept = kept_in(self.profiles, golden.with_firmware())
+            shutil.rmtree(kept, ignore_errors=True)
 
-    def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: Mapping[str, Any]) -> None:
+    def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: MissionConfig) -> None:
         """Store a mission that is over: first its run folder, then its row."""
         assert verdict.state is not None
         number, result = ended.number, verdict.result
@@ -435,8 +431,8 @@ class _Run:
             place = _put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
-        asked = bool(config.get("fault") or config.get("instruction"))
-        injected = Injected.of(result, asked=asked) if flown else None
+        faulty = config.fault is not None or config.instruction is not None
+        injected = Injected.of(result, asked=faulty) if flown else None
         self._ledger.add(
             number,
             state=verdict.state,
@@ -469,11 +465,6 @@ class _Run:
             workers=self._jobs if self._options.cluster is None else None,
             outcomes=self._outcomes,
         )
-
-
-def _golden_text(changes: Mapping[str, Any]) -> str:
-    """The golden mission of a mission as text."""
-    return canonical({name: changes[name] for name in changes if name not in NOT_OF_GOLDEN})
 
 
 def _put_away(run: Path, runs: Path, number: int) -> Path:

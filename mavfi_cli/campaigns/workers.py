@@ -18,7 +18,7 @@ import time
 import uuid
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -34,6 +34,7 @@ from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.measures import record_of
 from mavfi_cli.mission.run_folder import FAULT, RESULT, RunFolder
 from mavfi_cli.spec.fault import PROCESS
+from mavfi_cli.spec.mission import MissionConfig
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -77,16 +78,16 @@ class AttemptEnd:
     exit: int | None = None
     signal: int | None = None
     timeout: bool = False
-    report: Mapping[str, Any] | None = None
+    report: Mapping[str, str] | None = None
     lost: str = "its guard was killed"
     wall_s: float = 0.0
 
-    def judge(self, out: Path, config: Mapping[str, Any], limit_s: float) -> AttemptResult:
+    def judge(self, out: Path, config: MissionConfig, limit_s: float) -> AttemptResult:
         """Judge the end of the attempt.
 
         Args:
             out: the attempt's own folder.
-            config: configuration of the mission, as in records.
+            config: configuration of the mission.
             limit_s: its limit of wall time, s.
 
         Raises:
@@ -194,7 +195,7 @@ _BY_CHANCE = ("VehicleProcessError", "LinkLost", "NoAutopilot", "TargetError")
 _OF_THE_MACHINE = ("RecordError", "TracingForbidden", "BuildMismatch")
 
 
-def _recorded(run: Path, config: Mapping[str, Any]) -> AttemptResult:
+def _recorded(run: Path, config: MissionConfig) -> AttemptResult:
     try:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -204,7 +205,7 @@ def _recorded(run: Path, config: Mapping[str, Any]) -> AttemptResult:
     if outcome == Outcome.INTERRUPTED.value:
         return AttemptResult(state=None, result={}, reason="interrupted")
     crashes = [crash["how"] for node in flight.nodes.values() for crash in node["crashes"]]
-    if config.get("link") is None:  # no fault of the companion can kill the simulated vehicle
+    if config.link is None:  # no fault of the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
             return AttemptResult(state=None, result={}, reason=reason)
         if flight.referee is None:
@@ -228,7 +229,7 @@ def _refused(kind: str, text: str) -> AttemptResult:
     return AttemptResult(state=ResultState.ERROR, result={}, reason=text, doubtful=doubtful)
 
 
-def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]) -> AttemptResult:
+def _cut_off(outcome: Outcome, reason: str, out: Path, config: MissionConfig) -> AttemptResult:
     """Judge a mission whose process ended before it wrote its record, by what is known of it."""
     runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
     run = runs[0] if len(runs) == 1 else None
@@ -237,13 +238,13 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: Mapping[str, Any]
         fault = json.loads(written.read_text(encoding="utf-8"))
     if run is not None and (errors := out / ERRORS).is_file() and errors.stat().st_size:
         errors.replace(run / ERRORS)
-    asked = config.get("fault") or config.get("instruction")
+    asked = config.fault or config.instruction
     result = {
         "schema": 1,
         "outcome": outcome.value,
         "reason": reason,
-        "config": config,
-        "seeds": {"root": config["seed"], "fault": asked["seed"] if asked else None},
+        "config": config.to_dict(),
+        "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
         "quality_of_flight": {},
         "fault": fault,
     }
@@ -322,6 +323,7 @@ class Cluster:
         answer = future.result()
         if isinstance(answer, str):
             raise CampaignStopped(f"a worker has other versions: {answer}")
+        ended: AttemptEnd
         ended, files = answer
         for name, data in files.items():  # where the mission would have written them
             path = out / name
@@ -329,7 +331,7 @@ class Cluster:
                 return AttemptEnd(number=number, lost=f"a worker sent the file {name!r}")
             write = partial(_write, inflate(data, _LARGEST_FILE))
             write_atomically(own_folder(path.parent) / path.name, write)
-        return AttemptEnd(**ended)
+        return ended
 
     def close(self) -> None:
         """Cancel missions that have not begun; results of missions in flight are dropped."""
@@ -389,14 +391,14 @@ def _fly(
     keep: str,
     task: str,
     versions: Mapping[str, str],
-) -> str | tuple[dict[str, Any], dict[str, bytes]]:
+) -> str | tuple[AttemptEnd, dict[str, bytes]]:
     """Fly a mission; run folders that the campaign does not keep are sent without their traces.
 
     Args:
         versions: those of the runner.
 
     Returns:
-        Fields of its `AttemptEnd`, and its files, compressed, by path in its folder. Or how this
+        Its end, and its files, compressed, by path in its folder. Or how this
         worker's versions differ from the runner's; it then does not fly.
     """
     differing = version_differences(versions, _worker_versions())
@@ -412,7 +414,7 @@ def _fly(
         ended: list[AttemptEnd] = []
         while not ended:
             ended = workers.wait(60.0)
-        return asdict(ended[0]), _packed(place, number, Keep(keep))
+        return ended[0], _packed(place, number, Keep(keep))
     finally:
         shutil.rmtree(place, ignore_errors=True)
 

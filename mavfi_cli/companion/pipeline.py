@@ -39,7 +39,8 @@ from mavfi_cli.core.types import (
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.spec.platform import PlatformProfile, load_platform
+from mavfi_cli.spec.stack import Stack
 
 M = TypeVar("M", PointCloud, MapSnapshot, CollisionReport, Trajectory, Command)
 
@@ -77,6 +78,24 @@ class _Setpoint:
     frame_s: float | None  # stamp of a depth frame that no earlier command has used
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompanionParts:
+    """Stack, platform and planner of a mission, loaded by their names."""
+
+    stack: Stack
+    platform: PlatformProfile
+    planner: planners.Planner
+
+    @classmethod
+    def of(cls, config: MissionConfig) -> CompanionParts:
+        """Load the parts of a mission. Raises UnknownName or ConfigError."""
+        return cls(
+            planner=planners.find(config.planner),
+            platform=load_platform(config.platform),
+            stack=config.loaded_stack(),
+        )
+
+
 class Companion:
     """Perception, planning and control of one mission.
 
@@ -88,12 +107,13 @@ class Companion:
     def __init__(
         self,
         config: MissionConfig,
+        parts: CompanionParts,
         briefing: Briefing,
         wall: WallClock,
         injection: NoInjection,
         protection: NoProtection,
     ) -> None:
-        stack, platform = config.loaded_stack(), load_platform(config.platform)
+        stack, platform = parts.stack, parts.platform
         self._config, self._stack = config, stack
         self._injection, self._injector = injection, injection.injector
         self._follower = injection.injector.follower
@@ -116,10 +136,7 @@ class Companion:
             restart_s=config.node_restart_s,
             watchdog_s=config.node_watchdog_s,
         )
-        kernels, add = (
-            Kernels(config, stack, planners.find(config.planner), briefing),
-            self.executor.add,
-        )
+        kernels, add = Kernels(config, stack, parts.planner, briefing), self.executor.add
         self._point_cloud = add(Node("point_cloud", kernels.point_cloud))
         self._octomap = add(Node("octomap", kernels.octomap, on_restart=self._octomap_is_up))
         self._collision_check = add(

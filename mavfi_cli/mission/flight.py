@@ -18,7 +18,7 @@ import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.pipeline import Companion
+from mavfi_cli.companion.pipeline import Companion, CompanionParts
 from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import (
     CommandRefused,
@@ -114,13 +114,14 @@ class Flight:
     def __init__(
         self,
         config: MissionConfig,
+        parts: CompanionParts,
         transport: Transport,
         watcher: Watcher,
         interrupts: Sequence[int],
         injection: NoInjection,
     ) -> None:
         self._config = config
-        self.stack = config.loaded_stack()
+        self._parts, self.stack = parts, parts.stack
         self._interrupts = interrupts
         self.link = RecordedLink(
             transport,
@@ -194,7 +195,9 @@ class Flight:
         if config.detector is not None:
             protection = Protection(config.detector, config.stack, self.wall)
         self.injection.aim(self._shortest_flight_s(briefing), protection)
-        self.companion = Companion(config, briefing, self.wall, self.injection, protection)
+        self.companion = Companion(
+            config, self._parts, briefing, self.wall, self.injection, protection
+        )
         if recorder is not None:
             recorder.briefing = briefing
             self.companion.executor.on_start = recorder.on_start

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.autonomy import planners, warm
+from mavfi_cli.autonomy import warm
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
-from mavfi_cli.companion.pipeline import Companion
+from mavfi_cli.companion.pipeline import Companion, CompanionParts
 from mavfi_cli.companion.protection import Protection
 from mavfi_cli.core.compiled import processor_level
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
@@ -41,7 +41,6 @@ from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
 from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import load_platform
 
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
 
@@ -74,7 +73,7 @@ def fly_mission(
             or its record could not be written.
     """
     config = config.with_firmware()
-    load_platform(config.platform), planners.find(config.planner)  # unknown names end here
+    parts = CompanionParts.of(config)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
     injection = _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
@@ -83,7 +82,7 @@ def fly_mission(
         interruptible() as interrupt,
         other_end(config, launch) as (link, vehicle),
     ):
-        flight = Flight(config, link, watcher, interrupt, injection)
+        flight = Flight(config, parts, link, watcher, interrupt, injection)
         companion = _begin(flight, config, vehicle, recorder)
         folder = RunFolder.new(out, config.world if config.link is None else "link", config.seed)
         flight.injection.begin(folder.fault)

@@ -157,9 +157,9 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
 def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
     """Kinds of the wanted missions that are missing, by number."""
     return {
-        number: _kind(changes.get("instruction"), changes.get("fault"))
-        for number, _, changes in ledger.missing()
-        if number in wanted
+        mission.number: _kind(mission.config.instruction, mission.config.fault)
+        for mission in ledger.missing()
+        if mission.number in wanted
     }
 
 

@@ -7,17 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import planned
 
-from mavfi_cli.campaigns.missions import Injected
+from mavfi_cli.campaigns.missions import Injected, MissingMission
 from mavfi_cli.campaigns.run import MissionQueue
 from mavfi_cli.campaigns.specification import Stop
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import rate
 
+CONFIG = MissionConfig()
 STOP = Stop(margin=0.12, batch=10)
 
 
 def fly(outcomes, cells, slots, seed):
     """Which missions are flown where `slots` of them fly at a time and end in a random order."""
-    queue = MissionQueue(((n, cell, {}) for n, cell in enumerate(cells)), STOP, cells)
+    queue = MissionQueue(
+        (MissingMission(n, cell, CONFIG) for n, cell in enumerate(cells)), STOP, cells
+    )
     rng = random.Random(seed)
     flying, flown = [], []
     while True:
@@ -66,14 +70,14 @@ def test_what_was_flown_before_counts():
     cells = [0] * 100
     outcomes = dict(zip(range(100), ["success"] * 100, strict=True))
     flown, _ = fly(outcomes, cells, 1, 0)
-    left = ((n, 0, {}) for n in range(100) if n not in flown)
+    left = (MissingMission(n, 0, CONFIG) for n in range(100) if n not in flown)
     over = [(n, ("success", "golden")) for n in flown]
     assert MissionQueue(left, STOP, cells, over).next() is None
 
 
 def test_without_a_rule_everything_is_flown():
-    queue = MissionQueue(((n, 0, {}) for n in range(3)), None)
-    assert [queue.next() for _ in range(4)] == [(0, 0, {}), (1, 0, {}), (2, 0, {}), None]
+    queue = MissionQueue((MissingMission(n, 0, CONFIG) for n in range(3)), None)
+    assert [queue.next() for _ in range(4)] == [*((n, 0, CONFIG) for n in range(3)), None]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

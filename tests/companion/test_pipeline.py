@@ -8,7 +8,7 @@ import pytest
 
 from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.companion.pipeline import ATTEMPTS, Companion
+from mavfi_cli.companion.pipeline import ATTEMPTS, Companion, CompanionParts
 from mavfi_cli.companion.protection import PASSED, Decision, NoProtection, Response
 from mavfi_cli.core.types import Briefing, DepthFrame, Stage, Trajectory, VehicleState
 from mavfi_cli.core.wall import WallClock
@@ -99,7 +99,7 @@ def flown():
         camera_offset_flu_m=np.zeros(3),
     )  # fmt: skip
     companion = Companion(
-        config, briefing, WallClock(), NoInjection(), gate,
+        config, CompanionParts.of(config), briefing, WallClock(), NoInjection(), gate,
     )  # fmt: skip
     made = Flown(companion, gate, [])
     companion.executor.nodes["control"].on_start = lambda job, _start_s: made.inputs.append(job)

@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.pipeline import CompanionParts
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link import session, telemetry
 from mavfi_cli.link.codec import Codec, dialect
@@ -148,7 +149,7 @@ class FlightInMemory:
         self.hostile: list[bytes] = []
         self._decoder = Codec(255, 255)
         self._codecs = Codec(*AUTOPILOT), Codec(*CAMERA)
-        self.flight = Flight(config, ours, Watcher(), [], NoInjection())
+        self.flight = Flight(config, CompanionParts.of(config), ours, Watcher(), [], NoInjection())
         self.flight.connect()
         if flies:
             self.flight.brief(config.briefing(self.flight.place_enu_m), None)

@@ -11,7 +11,7 @@ from mavfi_cli.attack.served import CHANNEL, newest_cache_ns
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.node_process import NodeProcess
-from mavfi_cli.companion.pipeline import Companion
+from mavfi_cli.companion.pipeline import Companion, CompanionParts
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.processes import receive, send
@@ -59,7 +59,14 @@ def main() -> None:
     except (OSError, EOFError):
         return
     config = setup.config
-    companion = Companion(config, setup.briefing, WallClock(), NoInjection(), NoProtection())
+    companion = Companion(
+        config,
+        CompanionParts.of(config),
+        setup.briefing,
+        WallClock(),
+        NoInjection(),
+        NoProtection(),
+    )
     send(connection, (node_scope(setup.node, config.planner), newest_cache_ns()))
     NodeProcess.serve(connection, companion.executor.process_of(setup.node))
 
