@@ -19,6 +19,7 @@ import shutil
 import tempfile
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ import numpy as np
 from mavfi_cli.attack.campaign import Plan, one_processor, replay_runs, run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
-from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.mission.kernel_inputs import kernel_targets
 from mavfi_cli.spec.mission import MissionConfig
 
 
@@ -105,14 +106,13 @@ def main() -> None:
     equal = total = 0
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        fed = inputs_of_flight(MissionConfig(stack="hardened"), folder)
         plan = Plan(runs=options.runs, seed=1)
-        for kernel in catalogue.select(options.kernel):
-            own = folder / kernel  # a folder of several kernels is one campaign
+        flight = MissionConfig(stack="hardened")
+        for target in kernel_targets(catalogue.select(options.kernel), flight, folder):
+            own = folder / target.kernel  # a folder of several kernels is one campaign
             own.mkdir()
-            inputs = Path(shutil.copy(fed["inputs"], own))
-            target = KernelTarget(kernel=kernel, **{**fed, "inputs": inputs})
-            same, count = measure(plan, target, own, options.replays)
+            inputs = Path(shutil.copy(target.inputs, own))
+            same, count = measure(plan, replace(target, inputs=inputs), own, options.replays)
             equal, total = equal + same, total + count
     print(f"all kernels: {equal} of {total} replays identical")
 

@@ -40,7 +40,7 @@ from mavfi_cli.attack.profile import detour_of
 from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.inject import instruction_at
 from mavfi_cli.fi.tracer.tracee import ExecutionCounter, Tracee
-from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.mission.kernel_inputs import kernel_targets
 from mavfi_cli.spec.mission import MissionConfig
 
 WAYS = ("free", "ended", "armed", "counted", "detoured", "stopped", "after")
@@ -130,9 +130,9 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        inputs = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))["inputs"]
-        for kernel in catalogue.select(options.kernel):
-            measure(kernel, inputs, options.rounds)
+        names, flight = catalogue.select(options.kernel), MissionConfig(stack="hardened")
+        for target in kernel_targets(names, flight, Path(scratch)):
+            measure(target.kernel, target.inputs, options.rounds)
 
 
 if __name__ == "__main__":

@@ -21,9 +21,8 @@ from capstone import x86
 
 from mavfi_cli.attack.campaign import one_processor
 from mavfi_cli.attack.kernels import catalogue
-from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import places_of
-from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.mission.kernel_inputs import kernel_targets
 from mavfi_cli.spec.mission import MissionConfig
 
 _HEAD = (
@@ -57,9 +56,8 @@ def main() -> None:
     engine.detail = True
     forms: dict[tuple[str, ...], str] = {}
     with tempfile.TemporaryDirectory() as scratch:
-        fed = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
-        for kernel in catalogue.select(()):
-            target = KernelTarget(kernel=kernel, tolerance=0.0, **fed)
+        flight = MissionConfig(stack="hardened")
+        for target in kernel_targets(catalogue.select(()), flight, Path(scratch)):
             with one_processor(), closing(target.open()) as place:
                 rng = np.random.default_rng(1)
                 profiles = [each.profile(rng, windows=16) for each in places_of(place)]

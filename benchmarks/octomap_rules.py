@@ -16,9 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavfi_cli.attack.campaign import Plan, run_campaign
-from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.fi.tracer.fault import FaultModel
-from mavfi_cli.mission.kernel_inputs import inputs_of_flight
+from mavfi_cli.mission.kernel_inputs import kernel_targets
 from mavfi_cli.report.attacks import summarise
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -99,14 +98,14 @@ def main() -> None:
     print("| | injected | benign | crash | hang | SDC | noticeable SDC | SDC without the tree |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
-        fed = inputs_of_flight(MissionConfig(stack="hardened"), Path(scratch))
+        flight = MissionConfig(stack="hardened")
         for name in options.only or VARIANTS:
             kernel, changes = VARIANTS[name]
             path = Path(scratch) / "octomap_rule.py"
             path.write_text(KERNEL.format(**USUAL | kernel))
             plan = replace(Plan(runs=options.runs, seed=1), **changes)
-            target = KernelTarget(kernel=str(path), **fed)
-            (runs,) = run_campaign(plan, [target], jobs=options.jobs)
+            targets = kernel_targets([str(path)], flight, Path(scratch))
+            (runs,) = run_campaign(plan, targets, jobs=options.jobs)
             (told,) = summarise(plan, [runs])["kernels"]
             print(f"| {name} | {' | '.join(cells(told, runs.records))} |", flush=True)
 

@@ -58,7 +58,7 @@ def make(folder: Path, missions: int) -> None:
             }
             ledger.add(
                 number, state=ResultState.FLOWN, result=told, reason="", path=None,
-                injected=Injected.of(told, asked=not golden), wall_s=1.0, attempts=1,
+                injected=Injected.of(told, faulty=not golden), wall_s=1.0, attempts=1,
             )  # fmt: skip
 
 

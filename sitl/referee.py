@@ -136,14 +136,14 @@ class Referee:
             self.distance_m += math.dist(before.position, position)
         may_land = may_land or not armed
         crashed = self._crashes(before.velocity, pose, on_ground=on_ground, may_land=may_land)
-        found = None if self.collision is not None else self._hit(before, pose, crashed=crashed)
+        collision = None if self.collision is not None else self._hit(before, pose, crashed=crashed)
         if self._logs:
             gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
             powers = (power_regression_w, power_propeller_w)
             self._rows.append(
                 (stamp_s, position, velocity, quaternion, gap_m, *powers, armed, on_ground)
             )
-        return found
+        return collision
 
     def _crashes(
         self, velocity_before: Vector, pose: _Pose, *, on_ground: bool, may_land: bool

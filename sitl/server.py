@@ -301,7 +301,7 @@ class _Realtime:
             signs = None if parse_endpoint(url).scheme == "fd" else signing
             make = partial(Client, simulation, preset=preset, signing=signs)
             self._clients.open(url, make)
-        self._told_collision = False
+        self._announced = False
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
@@ -316,13 +316,13 @@ class _Realtime:
             self._serve(Client.send_tick, STEP_US if is_fast else TICK_US, stopped)
             self._simulation.advance(partial(self._between, stopped=stopped) if is_fast else None)
             collision = self._simulation.referee.collision
-            if collision is not None and not self._told_collision:
-                self._told_collision = True
+            if collision is not None and not self._announced:
+                self._announced = True
                 echo(f"{collision.text}; the vehicle stays there until a client reboots it")
             if self._simulation.autopilot.restart_asked:
                 self._simulation.restart()
                 self._clients.for_all(Client.rejoin)
-                self._told_collision = False
+                self._announced = False
                 echo("restarted")
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
@@ -429,7 +429,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
     links = []
     for preset, url in options.links:
         first, *rest = _ways_to(url) or [""]
-        links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{each}" for each in rest)]
+        links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{way}" for way in rest)]
     whose = "anyone" + ("" if options.key_file is None else " who signs")
     if options.setup.trusted:
         whose = f"system {', '.join(map(str, sorted(options.setup.trusted)))} only"

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -28,6 +28,7 @@ from mavfi_cli.fi.tracer.fault import InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee
 
 GOLDEN_RUNS = 3
@@ -48,7 +49,7 @@ class RunResult:
     reason: str  # why the fault was not injected
     run_s: float  # wall time of the whole run
 
-    def completed(self, planned: Mapping[str, Any]) -> dict[str, Any]:
+    def completed(self, planned: FaultRecord) -> FaultRecord:
         """Make the record of the run that was planned so."""
         fault = self.fault
         if fault is not None and not planned["trigger"]:  # a time trigger: it cannot be repeated
@@ -58,7 +59,7 @@ class RunResult:
                 "offset": fault.target.offset,
                 "instruction": fault.instruction,
                 "instruction_bytes": fault.instruction_bytes.hex(),
-                "corruption": fault.corruption and fault.corruption.to_json(),
+                "corruption": None if fault.corruption is None else fault.corruption.to_json(),
             }
         return record.completed(
             planned,
@@ -252,7 +253,7 @@ class LiveAttack:
     followed: Followed
     reason: str
     ended: Ended | None  # None: the process lives on, detached
-    record: dict[str, Any]
+    record: FaultRecord
 
 
 def attack_live(

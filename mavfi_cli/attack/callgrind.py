@@ -48,7 +48,7 @@ def count_executions(
     counts: Path,
     golden: Golden,
     native_s: Callable[[Executions], float | None],
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> tuple[int, Executions]:
     """Run a program under callgrind; its exit code and the executions of its run.
 
@@ -75,7 +75,7 @@ def count_executions(
         )  # fmt: skip
     count = _Count(counts=counts, golden=golden, native_s=native_s)
     try:
-        code = _await_end(process, name, count, tell)
+        code = _await_end(process, name, count, report)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -109,7 +109,7 @@ class _Count:
         """Read the new files; how far the count is, in words."""
         elapsed_s = time.monotonic() - self.begun_s
         if self._read_files():
-            counted = sum(sum(each.values()) for each in self.executions.values())
+            counted = sum(sum(counts.values()) for counts in self.executions.values())
             self.rate = counted / elapsed_s
             if elapsed_s > 2 * self.forecast_at_s:
                 self.forecast_at_s, reached_s = elapsed_s, self.native_s(self.executions)
@@ -144,13 +144,13 @@ class _Count:
 
 
 def _await_end(
-    process: subprocess.Popen[bytes], name: str, count: _Count, tell: Callable[[str], None]
+    process: subprocess.Popen[bytes], name: str, count: _Count, report: Callable[[str], None]
 ) -> int:
     """Wait for the exit code; tell how far it is."""
     while (left_s := count.begun_s + count.limit_s - time.monotonic()) > 0:
         with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(min(_TOLD_EVERY_S, left_s))
-        tell(count.update())
+        report(count.update())
     raise TargetError(name, f"has not ended under callgrind after {count.limit_s:.0f} s")
 
 

@@ -45,6 +45,7 @@ from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 
 if TYPE_CHECKING:
     from mavfi_cli.attack.program import ProgramTarget
@@ -79,7 +80,6 @@ class Plan:
         }
 
 
-Record = dict[str, Any]
 Progress = Callable[[str, int], None]
 Stage = Callable[[str], None]
 
@@ -93,7 +93,7 @@ class TargetRuns:
     goldens: tuple[Golden, ...]  # of each input
     profiles: Profiles
     null_runs: NullRuns
-    records: tuple[Record, ...] = ()
+    records: tuple[FaultRecord, ...] = ()
     prepare_s: float
     wall_s: float = 0.0
 
@@ -111,7 +111,7 @@ class TargetRuns:
         """The input that the fault of this number strikes."""
         return run % len(self.goldens)
 
-    def records_of(self, number: int) -> tuple[Record, ...]:
+    def records_of(self, number: int) -> tuple[FaultRecord, ...]:
         """The runs on one input."""
         return self.records[number :: len(self.goldens)]
 
@@ -146,7 +146,9 @@ def run_campaign(
         names = [target.stream[0] for target in targets if target.stream]
         journal = Journal(folder, plan.to_json(targets[0]), runs=plan.runs, kernels=names or None)
     with _AttackWorkers(jobs) as workers:
-        return [_attack(plan, each, workers, journal, progress, stage, notice) for each in targets]
+        return [
+            _attack(plan, target, workers, journal, progress, stage, notice) for target in targets
+        ]
 
 
 def _attack(
@@ -184,7 +186,7 @@ def _attack(
     )
     stage(f"drawing {plan.runs} faults")
     planned = _draw(plan, bench, prepared)
-    done: dict[int, Record] = {}
+    done: dict[int, FaultRecord] = {}
     if journal is not None:
         done = journal.runs_of(planned)
         journal.flush_plan("-".join(("faults", *target.stream)) + ".jsonl", planned)
@@ -213,7 +215,7 @@ def _prepare(
         place = target.open()
         undo.callback(place.close)
         stage("golden runs")
-        golden = tuple(golden_run(each) for each in places_of(place))
+        golden = tuple(golden_run(part) for part in places_of(place))
         for text in dict.fromkeys(text for run in golden for text in run.notices):
             notice(text)
         rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
@@ -221,8 +223,8 @@ def _prepare(
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
             profiles = tuple(
-                each.profile(rng, windows=plan.windows, watch=_steps_told(stage))
-                for each in places_of(place)
+                part.profile(rng, windows=plan.windows, watch=_steps_told(stage))
+                for part in places_of(place)
             )
         undo.pop_all()
     return place, golden, profiles
@@ -242,9 +244,9 @@ def _steps_told(stage: Callable[[str], None]) -> Watch:
     return watch
 
 
-def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
+def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[FaultRecord]:
     """Make the records of all faults before they run; time rules draw at the stop."""
-    chosen, records = plan.strategy(), []
+    chosen, records = plan.strategy(), list[FaultRecord]()
     for index in range(plan.runs):
         number = prepared.input_of(index)
         profile, fault = prepared.profiles[number], bench.draw(prepared.profiles, index)
@@ -252,7 +254,7 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[Record]:
         if len(prepared.goldens) > 1:
             what["input"] = number
         if profile is None or fault is None:
-            records.append({"version": record.VERSION, "state": "planned", "trigger": []} | what)
+            records.append(record.undrawn(**what))
             continue
         assert profile.image is not None
         struck = replace(fault, corruption=None) if plan.null else fault
@@ -315,7 +317,7 @@ class _Bench:
     def attackers(self, place: JudgedPlace) -> tuple[Attacker, ...]:
         """One attacker for each input of the target, open at a place."""
         pairs = zip(places_of(place), self.golden, strict=True)
-        return tuple(Attacker(place=each, golden=golden) for each, golden in pairs)
+        return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
         """The target's own random numbers; those of fault number i depend on i only."""
@@ -462,7 +464,7 @@ class _Replay:
     target: str  # name of the kernel or program
     run: int
     differs: tuple[str, ...]  # keys of the record that differ; empty if it is identical
-    record: dict[str, Any]
+    record: FaultRecord
 
 
 def replay_runs(
@@ -484,22 +486,22 @@ def replay_runs(
         ConfigError: the folder has the runs of another program.
         BuildMismatch: a record is of another build; says what differs.
     """
-    plan, found = read_plan(folder), False
+    plan, repeated = read_plan(folder), False
     for target in _targets(plan, folder, kernels, program):
         of_it = [e for e in read_runs(folder) if (e.get("kernel"),) == (target.stream or (None,))]
         records = [entry for entry in of_it if entry["trigger"]]
         if not records:
             continue
-        found = True
+        repeated = True
         with one_processor(), contextlib.closing(target.open()) as place:
             places = places_of(place)
-            attackers = [Attacker(place=each, golden=golden_run(each)) for each in places]
+            attackers = [Attacker(place=part, golden=golden_run(part)) for part in places]
             with started(places[0]) as tracee:
                 image = places[0].image(tracee)
             for entry in records[: runs or None]:
                 record.require_same_build(entry, image)
                 yield _replay(attackers[entry.get("input", 0)], entry)
-    if not found:
+    if not repeated:
         raise RecordError(f"{folder}: no runs that can be repeated")
 
 
@@ -539,7 +541,7 @@ def _targets(
         yield KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)
 
 
-def _replay(attacker: Attacker, entry: dict[str, Any]) -> _Replay:
+def _replay(attacker: Attacker, entry: FaultRecord) -> _Replay:
     again = attacker.run(record.fault_of(entry)).completed(entry)
     differs = [name for name in _COMPARED if again.get(name) != entry.get(name)]
     was, now = entry["injection"], again["injection"]

@@ -95,27 +95,27 @@ class OutputComparison:
         """The entries that results depend on."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
-        told: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
+        entries: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
         if self.ignored:
-            told["ignored"] = [pattern.decode() for pattern in self.ignored]
-        return told | {"tolerance": self.tolerance}
+            entries["ignored"] = [pattern.decode() for pattern in self.ignored]
+        return entries | {"tolerance": self.tolerance}
 
     def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
         """Read a run's outputs, by name; None for a file that it did not write."""
-        found: dict[str, bytes | None] = {}
+        outputs: dict[str, bytes | None] = {}
         if self.stdout:
-            found[STDOUT] = self._kept(_beginning(stdout))
+            outputs[STDOUT] = self._kept(_beginning(stdout))
         for name in self.files:
             data = _read_inside(folder, name)
-            found[name] = None if data is None else self._kept(data)
-        return found
+            outputs[name] = None if data is None else self._kept(data)
+        return outputs
 
     def _kept(self, data: bytes) -> bytes:
         if not self.ignored:
             return data
         lines = re.findall(rb"[^\n]*\n|[^\n]+", data)
         return b"".join(
-            line for line in lines if not any(re.search(each, line) for each in self.ignored)
+            line for line in lines if not any(re.search(pattern, line) for pattern in self.ignored)
         )
 
     def difference(self, golden: bytes, output: bytes) -> Difference | None:

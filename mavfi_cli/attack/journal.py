@@ -16,6 +16,7 @@ from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import open_own, read_json, write_atomically, write_json, writing
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 
 PLAN, RUNS = "plan.json", "runs.jsonl"
 _LARGEST_PLAN = 1 << 24  # bytes
@@ -83,21 +84,21 @@ class Journal:
                 path=self._folder,
             )
 
-    def runs_of(self, planned: Sequence[Mapping[str, Any]]) -> dict[int, dict[str, Any]]:
+    def runs_of(self, planned: Sequence[FaultRecord]) -> dict[int, FaultRecord]:
         """Existing runs of the planned faults, by number."""
-        found = {}
+        runs = {}
         for entry in read_runs(self._folder):
             index = entry["run"]
             if index < len(planned) and _same_fault(entry, planned[index]):
-                found[index] = entry
-        return found
+                runs[index] = entry
+        return runs
 
-    def flush_plan(self, name: str, planned: Iterable[Mapping[str, Any]]) -> None:
+    def flush_plan(self, name: str, planned: Iterable[FaultRecord]) -> None:
         """Flush the faults to a file of that name before the first one runs."""
         text = "".join(json.dumps(entry) + "\n" for entry in planned).encode()
         write_atomically(self._folder / name, lambda file: file.write(text))
 
-    def append(self, entry: Mapping[str, Any]) -> None:
+    def append(self, entry: FaultRecord) -> None:
         """Append a run that is over."""
         self._write((json.dumps(entry) + "\n").encode())
 
@@ -116,7 +117,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
     return read_json(folder / PLAN, _LARGEST_PLAN)
 
 
-def read_runs(folder: Path) -> list[dict[str, Any]]:
+def read_runs(folder: Path) -> list[FaultRecord]:
     """Read the completed records of a folder; incomplete lines are left out.
 
     A run that was repeated, because the program was built anew, replaces the earlier one.
@@ -129,15 +130,15 @@ def read_runs(folder: Path) -> list[dict[str, Any]]:
         return []
     with writing(path):
         lines = path.read_text(encoding="utf-8").splitlines()
-    found: dict[tuple[Any, int], dict[str, Any]] = {}
+    runs: dict[tuple[str | None, int], FaultRecord] = {}
     for line in lines:
         with contextlib.suppress(AttributeError, KeyError, RecursionError, TypeError, ValueError):
             entry = json.loads(line)
-            found[entry.get("kernel"), entry["run"]] = entry
-    return list(found.values())
+            runs[entry.get("kernel"), entry["run"]] = entry
+    return list(runs.values())
 
 
-def _same_fault(entry: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
+def _same_fault(entry: FaultRecord, planned: FaultRecord) -> bool:
     if entry.get("kernel") != planned.get("kernel"):
         return False
     golden = planned.get("golden_sha256")
@@ -145,4 +146,4 @@ def _same_fault(entry: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
         return False
     if not planned["trigger"]:
         return not entry["trigger"]
-    return all(entry.get(name) == planned[name] for name in _DRAWN)
+    return all(entry.get(name) == planned.get(name) for name in _DRAWN)

@@ -76,20 +76,20 @@ def make_null_runs(
     while True:
         tasks = _by_turns([(number, draw(profiles, number)) for number in range(_FAULTS)])
         made = _make(tasks, run)
-        differing = [each for each in made if each.differs]
+        differing = [null_run for null_run in made if null_run.differs]
         if not differing:
             return profiles, NullRuns(
                 tasks=tasks,
-                counting=Counter(each.method for each in made if each.reached),
+                counting=Counter(null_run.method for null_run in made if null_run.reached),
                 unused=tuple(method.value for method in unused),
             )
-        methods = {each.method for each in differing}
+        methods = {null_run.method for null_run in differing}
         spoiling = [at for at, method in enumerate(_DETOURS) if method.value in methods]
-        again = [each.differs for each in _make([differing[0].task] * _REPEATED, run)]
+        again = [null_run.differs for null_run in _make([differing[0].task] * _REPEATED, run)]
         if len(spoiling) < len(methods) or not all(again):
             raise TargetError(name, _problem(made))
         unused = _DETOURS[: spoiling[-1] + 1]
-        profiles = tuple(each and each.without(unused) for each in profiles)
+        profiles = tuple(profile and profile.without(unused) for profile in profiles)
 
 
 def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
@@ -103,7 +103,7 @@ def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: flo
         TargetError: it ends differently from the golden run now.
     """
     time.sleep(max(0.0, golden_s + _APART_S - time.monotonic()))
-    if any(each.differs for each in _make(null_runs.tasks[:1], run)):
+    if any(null_run.differs for null_run in _make(null_runs.tasks[:1], run)):
         raise TargetError(
             name,
             "a run without a flip ends differently from the golden run now, which it did not at "
@@ -140,11 +140,11 @@ def _make(tasks: Sequence[Task], run: Run) -> list[_NullRun]:
 def _problem(made: Iterable[_NullRun]) -> str:
     """Why the outcomes of a target cannot be told."""
     methods: dict[str, list[_NullRun]] = defaultdict(list)
-    for each in made:
-        methods[each.method].append(each)
+    for null_run in made:
+        methods[null_run.method].append(null_run)
     parts = []
     for method, runs in methods.items():
-        ends = Counter(each.outcome.title for each in runs if each.differs)
+        ends = Counter(null_run.outcome.title for null_run in runs if null_run.differs)
         text = ", ".join(f"{title} {count}" for title, count in ends.items())
         parts.append(f"{method}: {ends.total()} of {len(runs)}{text and f' ({text})'}")
     return (
@@ -161,7 +161,7 @@ def _by_turns(faults: Sequence[Task]) -> tuple[Task, ...]:
         stops = _detours(task[1])
         places = methods.setdefault(_counting(task[1]), {})
         places.setdefault(stops[0].location if stops else None, []).append(task)
-    return tuple(_in_turn([_in_turn(each.values()) for each in methods.values()])[:NULL_RUNS])
+    return tuple(_in_turn([_in_turn(group.values()) for group in methods.values()])[:NULL_RUNS])
 
 
 def _in_turn(lists: Iterable[Sequence[Task]]) -> list[Task]:
@@ -171,10 +171,10 @@ def _in_turn(lists: Iterable[Sequence[Task]]) -> list[Task]:
 def _detours(fault: InstructionFault | None) -> list[CountedStop]:
     """The stages of a fault's trigger that a detour counts."""
     stages = () if fault is None else fault.trigger
-    return [each for each in stages if each.detour is not None and each.count >= DETOUR_COST]
+    return [stage for stage in stages if stage.detour is not None and stage.count >= DETOUR_COST]
 
 
 def _counting(fault: InstructionFault | None) -> Counting:
     """The counting method of a fault, of several that which changes the most code."""
-    used = {each.detour.counting for each in _detours(fault) if each.detour is not None}
-    return next((each for each in Counting if each in used), Counting.BREAKPOINT)
+    used = {stage.detour.counting for stage in _detours(fault) if stage.detour is not None}
+    return next((method for method in Counting if method in used), Counting.BREAKPOINT)

@@ -19,10 +19,9 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.counted import CountedRun, CountedStop, Counting, Detour
 from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
 from mavfi_cli.fi.tracer.image import Image, Location, Scope, short_name
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.fi.tracer.sampling import Segment, Stratum, draw_fault, record_window
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.stats.shares import Interval, estimated_total
@@ -127,7 +127,7 @@ class TargetProfile:
                 return Location(piece.object, piece.offset + at)
         raise ValueError(f"{address:#x} is not in scope")
 
-    def window_of(self, record: Mapping[str, Any]) -> Window | None:
+    def window_of(self, record: FaultRecord) -> Window | None:
         """The sampled window of a fault; None if no sample of windows was taken."""
         first = record["trigger"][0]
         return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
@@ -164,7 +164,9 @@ class TargetProfile:
         """Make the same profile for a run that has to reach `begin` first."""
 
         def later(stratum: Stratum) -> Stratum:
-            segments = (replace(each, start=(begin, *each.start)) for each in stratum.segments)
+            segments = (
+                replace(segment, start=(begin, *segment.start)) for segment in stratum.segments
+            )
             return replace(stratum, segments=tuple(segments))
 
         return replace(self, strata=tuple(map(later, self.strata)))
@@ -191,10 +193,10 @@ class TargetProfile:
         parts = [f"{some} of {all_} windows from {name}" for name, (some, all_) in windows.items()]
         if len(windows) < len({stratum.marker for stratum in self.strata}):
             parts.insert(0, "the beginning")
-        found = self.instructions
+        count = self.instructions
         return (
-            f"about {found.value:.3g} executed instructions in scope (95 % interval "
-            f"{found.low:.3g} to {found.high:.3g}), by sample: {', '.join(parts)}; "
+            f"about {count.value:.3g} executed instructions in scope (95 % interval "
+            f"{count.low:.3g} to {count.high:.3g}), by sample: {', '.join(parts)}; "
             f"{self.executed} stepped"
         )
 
@@ -355,15 +357,15 @@ def _counted(
 ) -> tuple[CountedRun, Image, tuple[ScopeCode, ...]]:
     """The executions in scope, in a native run."""
     image, code, scope = _code(place)
-    objects = {each.path: each.bias for each in map(image.named, scope.objects) if each.path}
+    objects = {entry.path: entry.bias for entry in map(image.named, scope.objects) if entry.path}
     # Valgrind names the code of an object only if a file is mapped to its writable data. The code
     # of another one lies where it was linked, or else nobody knows where.
     biases = objects | {UNNAMED: 0}
     executions = {
         biases[path] + offset: count
-        for path, found in counts.items()
+        for path, executions in counts.items()
         if path in biases
-        for offset, count in found.items()
+        for offset, count in executions.items()
         if biases[path] + offset in scope
     }
     return CountedRun.of(executions, lambda address: _code_of(code, address)), image, code
@@ -379,8 +381,8 @@ def _require_counts(
         count, address = int(run.counts[index]), int(run.addresses[index])
         with started(place) as tracee:
             reached = all(
-                tracee.run_to(image.address(each.location), each.count, each.detour)
-                for each in run.stages(index, count, image.locate)
+                tracee.run_to(image.address(stage.location), stage.count, stage.detour)
+                for stage in run.stages(index, count, image.locate)
             )
             more = reached and tracee.run_to(address, 2)
         if more or not reached:
@@ -472,9 +474,9 @@ class _Stepper:
         left = sorted(numbers.tolist())
         segments: list[Segment] = []
         while left:  # one pass, unless a function calls itself
-            found = list(self._pass(left))
-            segments += found
-            left = left[len(found) :]
+            windows = list(self._pass(left))
+            segments += windows
+            left = left[len(windows) :]
         return Stratum(marker=self.marker, segments=tuple(segments), windows_in_run=count)
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:

@@ -172,8 +172,8 @@ class _Workplace:
             self._command, stdout=self._stdout, stderr=self._stderr, mechanism=self.target.mechanism
         )
         if not run_to_entry(tracee):
-            said = self._stderr.read_text(errors="replace").strip().splitlines()
-            problem = f"ends before its entry point{': ' + said[0] if said else ''}"
+            lines = self._stderr.read_text(errors="replace").strip().splitlines()
+            problem = f"ends before its entry point{': ' + lines[0] if lines else ''}"
             raise TargetError(self._command.argv[0], problem)
         return tracee
 
@@ -239,7 +239,7 @@ class _Workplace:
         self._folder.renew()
         code, executions = count_executions(
             self._command, stdout=self._stdout, stderr=self._stderr, counts=self._counts,
-            golden=self._known_golden(), native_s=self._native_s, tell=watch or (lambda _: None),
+            golden=self._known_golden(), native_s=self._native_s, report=watch or (lambda _: None),
         )  # fmt: skip
         self._require_golden("run under callgrind", Ended(exit_code=code, signal=None))
         return profile_counted(self, rng, executions, begun)
@@ -350,8 +350,8 @@ class _Workplace:
                 f"{self.name} ends with exit code {exit_code} without a fault"
                 f"{self._last_words()}; a run that ends in the same way is benign"
             )
-        written = [Path(each) for each in self._watch().written]
-        outside = [each for each in written if not each.is_relative_to(self._folder.tree)]
+        written = [Path(path) for path in self._watch().written]
+        outside = [path for path in written if not path.is_relative_to(self._folder.tree)]
         if outside:
             yield (
                 f"{self.name} writes outside its folder: {_first_of(outside)}; runs share that, "
@@ -359,9 +359,9 @@ class _Workplace:
             )
         compared = [self._folder.path / name for name in self.target.comparison.files]
         ignored = [
-            Path(os.path.relpath(each, self._folder.path))
-            for each in written
-            if each.is_relative_to(self._folder.path) and each not in compared and each.is_file()
+            Path(os.path.relpath(path, self._folder.path))
+            for path in written
+            if path.is_relative_to(self._folder.path) and path not in compared and path.is_file()
         ]
         if ignored:
             yield (

@@ -109,8 +109,8 @@ class ServedProcess:
 
     def last_words(self) -> str:
         """The last line that the program wrote to its standard error."""
-        said = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
-        return said[-1] if said else "its process ended"
+        lines = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "its process ended"
 
     def _end(self) -> None:
         self.connection.close()
@@ -135,4 +135,6 @@ def newest_cache_ns() -> int:
     specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
     files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]
     folders = sorted({os.path.dirname(file) for file in files})
-    return max((os.stat(each).st_mtime_ns for each in folders if os.path.isdir(each)), default=0)
+    return max(
+        (os.stat(folder).st_mtime_ns for folder in folders if os.path.isdir(folder)), default=0
+    )

@@ -91,8 +91,8 @@ class JudgedPlace(AttackPlace, Protocol):
 
 def places_of(place: JudgedPlace) -> Sequence[JudgedPlace]:
     """The places of a target's inputs, if it names them in `inputs`; most have one, their own."""
-    found: Sequence[JudgedPlace] = getattr(place, "inputs", (place,))
-    return found
+    inputs: Sequence[JudgedPlace] = getattr(place, "inputs", (place,))
+    return inputs
 
 
 class AttackTarget(Protocol):
@@ -143,5 +143,5 @@ def judged(
 
 def signal_name(number: int) -> str:
     """The name of a signal."""
-    known = {each.value for each in signal.Signals}
+    known = {member.value for member in signal.Signals}
     return signal.Signals(number).name if number in known else f"signal {number}"

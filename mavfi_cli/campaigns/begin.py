@@ -146,13 +146,13 @@ def _folder(what: str) -> Path | None:
         return folder
     if folder.suffix == ".toml":
         return None
-    meant = [each for each in begun() if Path(each).name == what]
+    meant = [other for other in begun() if Path(other).name == what]
     raise UnknownName("campaign", what, meant or [*PRESETS.names, *begun()])
 
 
 def begun() -> list[str]:
     """The folders of all campaigns in the default place."""
-    return sorted(str(each.parent) for each in DEFAULT.glob(f"*/{LEDGER}"))
+    return sorted(str(path.parent) for path in DEFAULT.glob(f"*/{LEDGER}"))
 
 
 def _require_one_meaning(what: str) -> None:
@@ -165,7 +165,7 @@ def _require_one_meaning(what: str) -> None:
         )
 
 
-def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
+def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
     """Return the campaign of a study to fly in a folder, and whether its list grows.
 
     More repetitions of the same study continue fewer, because lists grow by repetition.
@@ -177,17 +177,17 @@ def resumed(asked: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[
         ConfigError: the folder holds another campaign; says how it differs.
     """
     if not (folder / LEDGER).is_file():
-        return asked, False
+        return spec, False
     with Ledger(folder) as ledger:
         stored = stored_spec(ledger)
     if stored is None:  # killed before it was stored, or another study: the list decides
-        return asked, False
-    ours = replace(asked, name=stored.name, about=stored.about, keep=stored.keep)
-    grows = asked.repetitions > stored.repetitions
+        return spec, False
+    ours = replace(spec, name=stored.name, about=stored.about, keep=stored.keep)
+    grows = spec.repetitions > stored.repetitions
     alike = replace(ours, repetitions=stored.repetitions) if grows else ours
-    if found := stored.differences(alike, repetitions):
+    if differences := stored.differences(alike, repetitions):
         raise ConfigError(
-            f"holds another {what}: {'; '.join(found)}; choose another --out", path=folder
+            f"holds another {what}: {'; '.join(differences)}; choose another --out", path=folder
         )
     return ours, grows
 
@@ -392,10 +392,12 @@ def _search(
             for flight in range(rule.flights)
         ]
         with run_campaign(planned, folder, options, spectator, append=True) as ledger:
-            replans = {each.mission.config: fields_of(each.result)["replans"]
-                       for each in ledger.results()}  # fmt: skip
+            replans = {mission.mission.config: fields_of(mission.result)["replans"]
+                       for mission in ledger.results()}  # fmt: skip
         for seed in seeds:
-            own = (replans[each.config] for each in planned if each.config.world_seed == seed)
+            own = (
+                replans[mission.config] for mission in planned if mission.config.world_seed == seed
+            )
             flown = (*flown, tuple(count for count in own if count is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.campaigns.missions import (
     Injected,
+    Labels,
     MissingMission,
     MissionResult,
     PlannedMission,
@@ -34,7 +35,7 @@ from mavfi_cli.campaigns.missions import (
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import inflate, open_own, plain, read_parquet, reading, writing
-from mavfi_cli.mission.measures import fields_of, record_of
+from mavfi_cli.mission.measures import Record, fields_of, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 if TYPE_CHECKING:
@@ -80,10 +81,10 @@ _PORTION = 5000  # rows that are read at once
 
 def _object(text: str | bytes) -> dict[str, Any]:
     """Read a JSON object. Raises TypeError or ValueError."""
-    found = json.loads(text)
-    if not isinstance(found, dict):
-        raise TypeError(f"expected a JSON object, got a {type(found).__name__}")
-    return found
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise TypeError(f"expected a JSON object, got a {type(value).__name__}")
+    return value
 
 
 class Ledger:
@@ -175,11 +176,11 @@ class Ledger:
                     self._db.execute(statement)
                 self._db.execute("INSERT INTO meta VALUES ('schema', ?)", (str(SCHEMA),))
             return
-        found = self.meta("schema") if "meta" in tables else None
-        if found != str(SCHEMA):
-            told = f"of version {found}" if found is not None else "of no version"
+        schema = self.meta("schema") if "meta" in tables else None
+        if schema != str(SCHEMA):
+            version = f"of version {schema}" if schema is not None else "of no version"
             raise ConfigError(
-                f"a ledger {told}; this mavfi reads version {SCHEMA}", path=self._path
+                f"a ledger {version}; this mavfi reads version {SCHEMA}", path=self._path
             )
 
     @contextlib.contextmanager
@@ -211,8 +212,10 @@ class Ledger:
 
     def meta(self, key: str) -> str | None:
         """An entry about the campaign; None if it was never stored."""
-        found = [str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)]
-        return found[0] if found else None
+        values = [
+            str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)
+        ]
+        return values[0] if values else None
 
     def set_meta(self, values: Mapping[str, str]) -> None:
         """Store entries about the campaign, all or none."""
@@ -243,7 +246,7 @@ class Ledger:
         name: str,
         cells: Mapping[str, int],
         missions: Iterable[tuple[int, int, str, str]],
-        results: Iterable[Mapping[str, Any]],
+        results: Iterable[Record],
     ) -> None:
         """Store the rows of a whole campaign without its records.
 
@@ -257,7 +260,7 @@ class Ledger:
         """
         own = [column[1] for column in self._rows("PRAGMA table_info(results)")]
         marks = ", ".join("?" * len(own))
-        given = ([each.get(column) for column in own] for each in results)
+        given = ([result.get(column) for column in own] for result in results)
         with self._transaction():
             self._db.execute("INSERT INTO meta VALUES ('name', ?)", (name,))
             rows = ((number, labels) for labels, number in cells.items())
@@ -270,14 +273,14 @@ class Ledger:
         ((count,),) = self._rows("SELECT count(*) FROM missions")
         return int(count)
 
-    def cells(self) -> list[dict[str, Any]]:
+    def cells(self) -> list[Labels]:
         """The settings, by number.
 
         Raises:
             RecordError: the ledger is damaged, for example because a mission's setting is missing.
         """
         with reading(self._path):
-            cells = [
+            cells: list[Labels] = [
                 _object(text) for (text,) in self._rows("SELECT labels FROM cells ORDER BY cell")
             ]
             for (cell,) in self._rows("SELECT DISTINCT cell FROM missions"):
@@ -345,7 +348,7 @@ class Ledger:
         number: int,
         *,
         state: ResultState,
-        result: Mapping[str, Any],
+        result: Record,
         reason: str,
         injected: Injected | None,
         wall_s: float,
@@ -394,7 +397,7 @@ class Ledger:
             for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
                 wall_s, attempts, path, blob = rest
                 with reading(self._path):
-                    found = MissionResult(
+                    over = MissionResult(
                         number=number,
                         mission=PlannedMission(
                             config=structure(_object(changes), MissionConfig),
@@ -410,7 +413,7 @@ class Ledger:
                         attempts=attempts,
                         path=None if path is None else self.folder.absolute() / path,
                     )
-                yield found
+                yield over
 
     def configs(self, numbers: Sequence[int]) -> Iterator[MissionConfig]:
         """Configurations of these missions, in the order of the list.

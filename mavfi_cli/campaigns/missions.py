@@ -7,18 +7,19 @@ import functools
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
-from mavfi_cli.mission.measures import FlightRecord, record_of
+from mavfi_cli.mission.measures import FlightRecord, Record, record_of
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
 Labels = Mapping[str, Label]  # of a setting, by name
+Changes = Mapping[str, Any]  # values of a mission by name, as JSON holds them
 _FIRST = ("setting", "world")  # labels that come before the others
 
 
@@ -48,7 +49,6 @@ class PlannedMission:
 
 
 _DEFAULT = MissionConfig()
-_BASE: Mapping[str, Any] = json.loads(json.dumps(asdict(_DEFAULT)))
 # Faults and protection, which a golden run does not have.
 _TREATMENT = ("fault", "instruction", "detector", "isolate")
 _NAMES = tuple(each.name for each in fields(MissionConfig))
@@ -68,25 +68,25 @@ def canonical(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
-def changes_of(config: MissionConfig) -> dict[str, Any]:
-    """The values of a mission that differ from the defaults, as plain values."""
-    changed = {
-        name: _plain(value)
+def changes_of(config: MissionConfig) -> Changes:
+    """The values of a mission that differ from the defaults."""
+    return {
+        name: plain
         for name in _NAMES
-        if (value := getattr(config, name)) != getattr(_DEFAULT, name)
+        if (value := getattr(config, name)) != (default := getattr(_DEFAULT, name))
+        and (plain := _plain(value)) != _plain(default)
     }
-    return {name: value for name, value in changed.items() if value != _BASE[name]}
 
 
 def _plain(value: Any) -> Any:
     """The value as JSON gives it back; `asdict` copies, which is slow for long lists."""
     if isinstance(value, tuple | list):
-        return [_plain(each) for each in value]
+        return [_plain(item) for item in value]
     names = getattr(value, "__dataclass_fields__", None)
     return value if names is None else {name: _plain(getattr(value, name)) for name in names}
 
 
-def kind_of(changes: Mapping[str, Any], apart: Collection[str]) -> str:
+def kind_of(changes: Changes, apart: Collection[str]) -> str:
     """A mission as text without some of its values, and without the seeds of its faults.
 
     Args:
@@ -101,8 +101,8 @@ def kind_of(changes: Mapping[str, Any], apart: Collection[str]) -> str:
 
 def label_text(labels: Labels) -> str:
     """A setting in one phrase; the same whatever the order of its labels."""
-    told = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
-    return " ".join(told) or "all missions"
+    phrases = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
+    return " ".join(phrases) or "all missions"
 
 
 def label_value(value: Label) -> str:
@@ -112,8 +112,8 @@ def label_value(value: Label) -> str:
 
 def ordered(names: Iterable[str]) -> list[str]:
     """Names of labels in the order in which they are shown."""
-    found = set(names)
-    return [name for name in _FIRST if name in found] + sorted(found - set(_FIRST))
+    unordered = set(names)
+    return [name for name in _FIRST if name in unordered] + sorted(unordered - set(_FIRST))
 
 
 @contextlib.contextmanager
@@ -172,19 +172,19 @@ class Injected(Enum):
     NULL = "null"  # everything but the flip, as was asked for
 
     @classmethod
-    def of(cls, result: Mapping[str, Any], *, asked: bool) -> Injected:
+    def of(cls, result: Record, *, faulty: bool) -> Injected:
         """What happened to the fault of a mission, by its record; `asked`: it was to have one."""
         flight = record_of(result)
         fault = flight.fault
-        if not asked:
+        if not faulty:
             return cls.GOLDEN
         if not fault or fault["state"] in ("planned", "not_injected"):
             return cls.NOT_INJECTED
         if fault["state"] == "null":
             return cls.NULL
         activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
-        found = cls(_BY_ACTIVATION.get(activation["activation"], "active"))
-        return cls.CAUGHT if found is cls.NOT_ACTIVATED and _caught(flight) else found
+        fate = cls(_BY_ACTIVATION.get(activation["activation"], "active"))
+        return cls.CAUGHT if fate is cls.NOT_ACTIVATED and _caught(flight) else fate
 
 
 def _caught(flight: FlightRecord) -> bool:
@@ -228,7 +228,7 @@ class MissionResult:
     state: ResultState
     outcome: str | None
     reason: str
-    result: Mapping[str, Any]
+    result: Record
     injected: Injected | None
     wall_s: float
     attempts: int

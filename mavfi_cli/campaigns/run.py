@@ -145,7 +145,7 @@ def run_campaign(
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=append)
         options = options or Options()
-        named = {each.config.firmware for each in missions if each.config.firmware}
+        named = {mission.config.firmware for mission in missions if mission.config.firmware}
         options = replace(options, firmware=options.firmware | named)
         fly_missing(ledger, options, spectator or Spectator(), stop)
     return Ledger(folder)
@@ -181,17 +181,19 @@ def store_plan(
         else:
             new.append(mission)
     if stored and not append and (new or left.total()):
-        firsts = {"new": [each.stored for each in new], "gone": [*+left]}
-        shown = [f"the first {how} one is {a[0][0]} {a[0][2]}" for how, a in firsts.items() if a]
-        found = [*differing] or shown
-        found.append(f"{stored} missions there, {len(missions)} here, of which {len(new)} are new")
+        firsts = {"new": [mission.stored for mission in new], "gone": [*+left]}
+        examples = [f"the first {how} one is {a[0][0]} {a[0][2]}" for how, a in firsts.items() if a]
+        reasons = [*differing] or examples
+        reasons.append(
+            f"{stored} missions there, {len(missions)} here, of which {len(new)} are new"
+        )
         remedy = "choose another folder"
         if left.total():
-            found[-1] += f", and {left.total()} are gone"
+            reasons[-1] += f", and {left.total()} are gone"
         elif can_append:
             remedy = f"{can_append}, or {remedy}"
         raise ConfigError(
-            f"holds another campaign: {'; '.join([*found, remedy])}", path=ledger.folder
+            f"holds another campaign: {'; '.join([*reasons, remedy])}", path=ledger.folder
         )
     _note_files(ledger, new)
     ledger.plan(new)
@@ -206,8 +208,8 @@ def fly_missing(
         MavfiError: as `run_campaign`.
     """
     run = _Run(ledger, options, spectator, stop)
-    with _prepared(ledger.folder, run.profiles), interruptible() as asked:
-        run.fly(asked)
+    with _prepared(ledger.folder, run.profiles), interruptible() as interrupts:
+        run.fly(interrupts)
 
 
 @contextlib.contextmanager
@@ -338,31 +340,31 @@ class _Run:
         self._over = self._before
         self._begun = time.monotonic()
 
-    def fly(self, asked: Sequence[int]) -> None:
+    def fly(self, interrupts: Sequence[int]) -> None:
         """Fly until nothing is missing, or the user asks to stop."""
-        told, options = False, self._options
+        announced, options = False, self._options
         fleet: LocalWorkers | Cluster
         if options.cluster is None:
             fleet = LocalWorkers(self._jobs, options.task)
         else:
             fleet = Cluster(options.cluster, options.keep, options.task, options.cluster_key)
         with contextlib.closing(fleet) as workers:
-            while len(asked) < 2:
-                self._fill(workers, asked)
+            while len(interrupts) < 2:
+                self._fill(workers, interrupts)
                 if not self._flying:
                     break
                 over = workers.wait(_LOOK_S)
-                self._fill(workers, asked)  # at once: the ledger is written while they fly
+                self._fill(workers, interrupts)  # at once: the ledger is written while they fly
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress())
-                if asked and self._flying and not told:
-                    told = True
+                if interrupts and self._flying and not announced:
+                    announced = True
                     self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
         if self._options.profiles is None and not self._sharing:
             shutil.rmtree(self.profiles, ignore_errors=True)  # an interruption may have left some
         self._spectator.on_end(self._progress())
-        if asked:
+        if interrupts:
             raise Interrupted("interrupted; run again to go on")
         if self._given_up:
             number, reason = next(iter(sorted(self._given_up.items())))
@@ -371,8 +373,8 @@ class _Run:
                 f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
             )
 
-    def _fill(self, workers: LocalWorkers | Cluster, asked: Sequence[int]) -> None:
-        while workers.free and not asked:
+    def _fill(self, workers: LocalWorkers | Cluster, interrupts: Sequence[int]) -> None:
+        while workers.free and not interrupts:
             mission = self._again.pop() if self._again else self._queue.next()
             if mission is None:
                 return
@@ -432,7 +434,7 @@ class _Run:
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
         faulty = config.fault is not None or config.instruction is not None
-        injected = Injected.of(result, asked=faulty) if flown else None
+        injected = Injected.of(result, faulty=faulty) if flown else None
         self._ledger.add(
             number,
             state=verdict.state,

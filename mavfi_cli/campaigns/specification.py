@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.campaigns.missions import Label, PlannedMission, naming
+from mavfi_cli.campaigns.missions import Label, Labels, PlannedMission, naming
 from mavfi_cli.core.config import structure, toml_text
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream
@@ -20,6 +20,7 @@ from mavfi_cli.spec.mission import MissionConfig
 
 SAMPLE = 20  # `sampled` keeps about one success in 20
 _WORD = 1 << 32
+Factors = Mapping[str, Any]  # values of factors by name, as TOML holds them
 
 
 # Factors: what may differ between missions, and the record that has it as a field ----------------
@@ -44,7 +45,7 @@ _OF_FAULTS = dict.fromkeys((*_ALIASES, "level", *_FAULT["source"], *_FAULT["inst
 NAMES = (*MISSION, *_DETECTOR, *(name for name in _OF_FAULTS if name != "target"))
 
 
-def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> MissionConfig:
+def _mission_of(values: Factors, seed: int, fault_seed: int) -> MissionConfig:
     mission = {name: values[name] for name in MISSION if name in values}
     mission["seed"] = values.get("seed", seed)
     mission |= _fault(values, fault_seed)
@@ -56,16 +57,16 @@ def _mission_of(values: Mapping[str, Any], seed: int, fault_seed: int) -> Missio
     return structure(mission, MissionConfig)
 
 
-def _fault(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
+def _fault(values: Factors, seed: int) -> Factors:
     """The field `fault` or `instruction` of the mission; empty without a fault."""
-    asked = {name: each for name, each in values.items() if name not in (*MISSION, *_DETECTOR)}
-    level = asked.pop("level", "source")
+    given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
+    level = given.pop("level", "source")
     if level not in [*_LEVELS]:
         raise ConfigError(f"expected {' or '.join(_LEVELS)}, got {level!r}", key="level")
-    targets = [name for name in _ALIASES if name in asked]
+    targets = [name for name in _ALIASES if name in given]
     if len(targets) > 1:
         raise ConfigError("a fault strikes a stage or a site, not both")
-    fault = {_ALIASES[name] if name in targets else name: each for name, each in asked.items()}
+    fault = {_ALIASES[name] if name in targets else name: value for name, value in given.items()}
     for name in fault:
         if name not in _FAULT[level]:
             match = nearest(name, (*_ALIASES, *_FAULT[level]))
@@ -73,8 +74,8 @@ def _fault(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
             raise ConfigError(f"no factor of faults at {level} level{hint}", key=name)
     if targets:
         return {_LEVELS[level][0]: {**fault, "seed": seed}}
-    if asked or "level" in values:
-        named = sorted({*asked, *({"level"} & set(values))})
+    if given or "level" in values:
+        named = sorted({*given, *({"level"} & set(values))})
         raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
     return {}
 
@@ -146,14 +147,14 @@ class FixedWorld:
         least, most = self.replans
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """The rule and the worlds that it has found, in one line."""
-        found = []
+        phrases = []
         for world, seed in self.world_seed.items():
             flown = self.flown.get(world)
             median = "named" if flown is None else f"median {statistics.median(flown[-1]):g}"
-            found.append(f"{world} {seed} ({median})")
-        return f"world seeds: {', '.join(found or ['none yet'])}; {self.rule()}"
+            phrases.append(f"{world} {seed} ({median})")
+        return f"world seeds: {', '.join(phrases or ['none yet'])}; {self.rule()}"
 
     def rule(self) -> str:
         """The rule in words."""
@@ -224,7 +225,7 @@ class Spec:
     first_seed: int = 1
     repetitions: int = 1
     keep: Keep = Keep.FAILURES  # run folders to keep: none, failures, sampled or all
-    fixed: Mapping[str, Any] = field(default_factory=dict)
+    fixed: Factors = field(default_factory=dict)
     axes: Axes = field(default_factory=dict)
     settings: tuple[Setting, ...] = (Setting(),)
     stop: Stop | None = None
@@ -245,8 +246,11 @@ class Spec:
             raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
 
         settings = tuple(
-            replace(each, repetitions=each.repetitions and max(1, round(each.repetitions * scale)))
-            for each in self.settings
+            replace(
+                setting,
+                repetitions=setting.repetitions and max(1, round(setting.repetitions * scale)),
+            )
+            for setting in self.settings
         )
         repetitions = max(1, round(self.repetitions * scale))
         return replace(self, repetitions=repetitions, settings=settings)
@@ -277,16 +281,16 @@ class Spec:
         """Return the programs that missions name as their firmware. Raises as `kinds`."""
         return frozenset(kind.config.firmware for kind in self.kinds() if kind.config.firmware)
 
-    def _points(self) -> list[tuple[dict[str, Any], dict[str, Label], int]]:
+    def _points(self) -> list[tuple[Factors, Labels, int]]:
         """Combine the factors; return each combination with its labels and repetitions."""
         crossed = [
-            ({**self.axes, **each.axes}, each.name, each.repetitions or self.repetitions)
-            for each in self.settings
+            ({**self.axes, **setting.axes}, setting.name, setting.repetitions or self.repetitions)
+            for setting in self.settings
         ]
         planned = sum(count * math.prod(map(len, axes.values())) for axes, _, count in crossed)
         if planned > MOST:
             raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
-        points = []
+        points: list[tuple[Factors, Labels, int]] = []
         for axes, name, count in crossed:
             for values in itertools.product(*axes.values()):
                 chosen = dict(zip(axes, values, strict=True))
@@ -300,9 +304,7 @@ class Spec:
             raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
         return points
 
-    def _mission(
-        self, values: Mapping[str, Any], labels: Mapping[str, Label], repetition: int
-    ) -> PlannedMission:
+    def _mission(self, values: Factors, labels: Labels, repetition: int) -> PlannedMission:
         seed = values.get("seed", self.first_seed + repetition)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
@@ -314,36 +316,36 @@ class Spec:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)
 
-    def differences(self, asked: Spec, repetitions: str = "repetitions") -> list[str]:
+    def differences(self, other: Spec, repetitions: str = "repetitions") -> list[str]:
         """A phrase for each factor or number that differs; names and stops do not count.
 
         Args:
             repetitions: the word for repetitions.
         """
-        there, here = self._choices(repetitions), asked._choices(repetitions)
+        there, here = self._choices(repetitions), other._choices(repetitions)
         if there == here:  # equal values in other settings
-            there, here = self._by_setting(), asked._by_setting()
+            there, here = self._by_setting(), other._by_setting()
         pairs = {key: (there.get(key), here.get(key)) for key in (*there, *here)}
         return [
-            f"{key} {_told(old)} there, {_told(new)} here"
+            f"{key} {_listed(old)} there, {_listed(new)} here"
             for key, (old, new) in pairs.items()
             if old != new
         ]
 
     def _choices(self, repetitions: str) -> dict[str, list[Any]]:
         """Factors with all their values, and the numbers."""
-        found: dict[str, list[Any]] = {}
+        choices: dict[str, list[Any]] = {}
         for axes in (self.axes, *(setting.axes for setting in self.settings)):
             for name, values in axes.items():
-                known = found.setdefault(name, [])
+                known = choices.setdefault(name, [])
                 known += [value for value in values if value not in known]
-        found |= {f"mission.{name}": [value] for name, value in self.fixed.items()}
+        choices |= {f"mission.{name}": [value] for name, value in self.fixed.items()}
         if self.fixed_world is not None:
-            found["rule of fixed worlds"] = [self.fixed_world.rule()]
+            choices["rule of fixed worlds"] = [self.fixed_world.rule()]
             seeds = self.fixed_world.world_seed.items()
-            found["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
+            choices["fixed worlds"] = [f"{world} {seed}" for world, seed in seeds]
         return {
-            **found,
+            **choices,
             repetitions: [self.repetitions],
             "first seed": [self.first_seed],
             "fault seed": [self.seed],
@@ -351,23 +353,23 @@ class Spec:
         }
 
     def _by_setting(self) -> dict[str, list[Any]]:
-        found = {name: list(values) for name, values in self.axes.items()}
+        choices = {name: list(values) for name, values in self.axes.items()}
         for number, setting in enumerate(self.settings):
             own = dict(setting.axes)
             if setting.repetitions is not None:
                 own["repetitions"] = (setting.repetitions,)
             name = setting.name or number
-            found |= {f"{factor} of setting {name}": list(own[factor]) for factor in own}
-        return found
+            choices |= {f"{factor} of setting {name}": list(own[factor]) for factor in own}
+        return choices
 
     def to_toml(self) -> str:
         """TOML from which `parse_spec` makes an equal specification."""
         names = ("name", "about", "seed", "first_seed", "repetitions")
         settings = []
-        for each in self.settings:
-            own = {"name": each.name or None, "repetitions": each.repetitions}
+        for setting in self.settings:
+            own = {"name": setting.name or None, "repetitions": setting.repetitions}
             own = {key: value for key, value in own.items() if value is not None}
-            settings.append({**own, **each.axes})
+            settings.append({**own, **setting.axes})
         tables = {
             "mission": self.fixed,
             "factors": self.axes,
@@ -379,7 +381,7 @@ class Spec:
         return toml_text({**plain, "keep": self.keep.value, **tables})
 
 
-def _told(values: Sequence[Any] | None) -> str:
+def _listed(values: Sequence[Any] | None) -> str:
     return ", ".join(map(str, values)) if values else "none"
 
 

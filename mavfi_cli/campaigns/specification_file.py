@@ -6,13 +6,13 @@ import datetime
 import hashlib
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
-from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Keep, Spec
+from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Factors, Keep, Spec
 from mavfi_cli.core.config import (
     Shipped,
     parse_toml,
@@ -51,7 +51,7 @@ def parse_spec(text: str, path: Path) -> Spec:
     return _read_spec(parse_toml(text, path), path, text)
 
 
-def _read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
+def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
     """Read a specification from TOML's tables; `path` as for `parse_spec`, `text` for lines."""
     _require_table(data, "", _TOP, path)
     mission, factors = data.get("mission", {}), data.get("factors", {})
@@ -62,19 +62,19 @@ def _read_spec(data: Mapping[str, Any], path: Path, text: str = "") -> Spec:
     for name, value in mission.items():
         _require_usable(name, value, f"mission.{name}", path)
     _require_table(factors, "factors", NAMES, path)
-    found = []
-    for number, each in enumerate(settings):
+    axes_of_settings = []
+    for number, table in enumerate(settings):
         place = f"setting[{number}]"
-        _require_table(each, place, (*NAMES, *_SETTING), path)
-        own = {name: each[name] for name in _SETTING if name in each}
-        rest = {name: value for name, value in each.items() if name not in own}
-        found.append({**own, "axes": _axes(rest, place, path)})
+        _require_table(table, place, (*NAMES, *_SETTING), path)
+        own = {name: table[name] for name in _SETTING if name in table}
+        rest = {name: value for name, value in table.items() if name not in own}
+        axes_of_settings.append({**own, "axes": _axes(rest, place, path)})
     values: dict[str, Any] = {
         "name": path.stem,
         **{name: value for name, value in data.items() if name not in _FACTORS},
         "fixed": mission,
         "axes": _axes(factors, "factors", path),
-        "settings": found,
+        "settings": axes_of_settings,
     }
     if "keep" in values:
         values["keep"] = named_member(Keep, "policy of keeping runs", str(values["keep"]))
@@ -98,16 +98,16 @@ def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
         raise ConfigError(f"no factor is a date or a time, got {value}", path=path, key=key)
 
 
-def _axes(table: Mapping[str, Any], place: str, path: Path) -> Axes:
+def _axes(table: Factors, place: str, path: Path) -> Axes:
     """Read factors, each with its value or values."""
     axes: dict[str, tuple[Any, ...]] = {}
     for name, value in table.items():
         key, several = f"{place}.{name}", isinstance(value, list)
         if name in LISTS:
-            several = several and any(isinstance(each, list) for each in value)
+            several = several and any(isinstance(item, list) for item in value)
         values = tuple(value) if several else (value,)
-        for each in values:
-            _require_usable(name, each, key, path)
+        for item in values:
+            _require_usable(name, item, key, path)
         if name == "planner":  # one planner is one setting, however it is written
             values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
         if name not in LISTS and not values:
@@ -169,17 +169,17 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
     if key not in NAMES:
         raise ConfigError.unknown_key(key, NAMES)
     fixed, crossed = data.setdefault("mission", {}), data.setdefault("factors", {})
-    found = [table for table in (crossed, *data["setting"]) if key in table]
-    for table in found:
+    tables = [table for table in (crossed, *data["setting"]) if key in table]
+    for table in tables:
         table[key] = values
-    if not found and key not in fixed and (key not in MISSION or key == "seed"):
+    if not tables and key not in fixed and (key not in MISSION or key == "seed"):
         known = {name for table in (fixed, crossed, *data["setting"]) for name in table}
         have = ", ".join(sorted(known & set(NAMES))) or "none"
         raise ConfigError(f"the campaign has no such factor to replace; it has {have}", key=key)
     one = not isinstance(values[0], list) if key in LISTS and values else len(values) == 1
-    if not found and one:
+    if not tables and one:
         fixed[key] = values if key in LISTS else values[0]
-    elif not found:
+    elif not tables:
         fixed.pop(key, None)
         crossed[key] = values
 
@@ -190,7 +190,7 @@ def _values(key: str, text: str) -> list[Any]:
     if listed and isinstance(values := _value(text), list):
         return values
     several = text[1:-1] if key in LISTS and listed else text
-    return [_value(each.strip()) for each in _COMMA.split(several)]
+    return [_value(part.strip()) for part in _COMMA.split(several)]
 
 
 def _value(text: str) -> Any:

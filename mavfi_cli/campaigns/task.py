@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+from mavfi_cli.campaigns.missions import Changes
 
 
 def prepare() -> None:
@@ -20,7 +20,7 @@ def prepare() -> None:
     VehicleInProcess.warm_up()
 
 
-def perform(changes: Mapping[str, Any], out: Path) -> Path:
+def perform(changes: Changes, out: Path) -> Path:
     """Fly the mission of `missions.changes_of`; return its run folder, which is in `out`.
 
     Raises:

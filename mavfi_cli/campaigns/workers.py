@@ -24,14 +24,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavfi_cli.campaigns.cluster_keys import security
-from mavfi_cli.campaigns.missions import ResultState
+from mavfi_cli.campaigns.missions import Changes, ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.files import ScratchFolder, inflate, own_folder, write_atomically
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.measures import record_of
+from mavfi_cli.mission.measures import Record, record_of
 from mavfi_cli.mission.run_folder import FAULT, RESULT, RunFolder
 from mavfi_cli.spec.fault import PROCESS
 from mavfi_cli.spec.mission import MissionConfig
@@ -55,7 +55,7 @@ class AttemptResult:
     """
 
     state: ResultState | None
-    result: Mapping[str, Any]
+    result: Record
     reason: str
     run: Path | None = None
     doubtful: bool = False
@@ -134,8 +134,8 @@ class LocalWorkers:
         """Number of missions that may be started now."""
         return self._jobs - len(self._number)
 
-    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
-        """Start a mission; `changes`: its values that differ from the defaults.
+    def start(self, number: int, changes: Changes, out: Path, limit_s: float) -> None:
+        """Start a mission.
 
         Raises:
             MavfiError: the processes cannot be started.
@@ -150,9 +150,9 @@ class LocalWorkers:
         for key, _ in self._selector.select(timeout_s):
             channel = key.fileobj
             assert isinstance(channel, socket.socket)
-            said = _heard(channel) or {}
-            if "pid" not in said:  # not the begin of the worker
-                ended.append(AttemptEnd(number=self._number[channel], **said))
+            message = _heard(channel) or {}
+            if "pid" not in message:  # not the begin of the worker
+                ended.append(AttemptEnd(number=self._number[channel], **message))
                 self._release(channel)
         return ended
 
@@ -178,8 +178,8 @@ def _heard(channel: socket.socket) -> Mapping[str, Any] | None:
     """Read a guard's next message; None if it is gone or sends nothing in time."""
     with contextlib.suppress(OSError):
         if packet := channel.recv(PACKET):
-            said: dict[str, Any] = json.loads(packet)
-            return said
+            message: dict[str, Any] = json.loads(packet)
+            return message
     return None
 
 
@@ -238,13 +238,13 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: MissionConfig) ->
         fault = json.loads(written.read_text(encoding="utf-8"))
     if run is not None and (errors := out / ERRORS).is_file() and errors.stat().st_size:
         errors.replace(run / ERRORS)
-    asked = config.fault or config.instruction
+    planned = config.fault or config.instruction
     result = {
         "schema": 1,
         "outcome": outcome.value,
         "reason": reason,
         "config": config.to_dict(),
-        "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
+        "seeds": {"root": config.seed, "fault": planned.seed if planned else None},
         "quality_of_flight": {},
         "fault": fault,
     }
@@ -297,7 +297,7 @@ class Cluster:
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
-    def start(self, number: int, changes: Mapping[str, Any], out: Path, limit_s: float) -> None:
+    def start(self, number: int, changes: Changes, out: Path, limit_s: float) -> None:
         """Send a mission to the cluster."""
         self._submitted += 1
         future = self._client.submit(
@@ -366,8 +366,8 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
         raise CampaignStopped(f"{address}: no worker within {WORKERS_S:g} s") from None
-    told = client.run(_worker_versions, on_error="return")
-    for worker, versions in sorted(told.items()):
+    answers = client.run(_worker_versions, on_error="return")
+    for worker, versions in sorted(answers.items()):
         if not isinstance(versions, dict):
             raise CampaignStopped(f"worker {worker} cannot fly missions: {versions!r}")
         differing = version_differences(ours, versions)
@@ -386,7 +386,7 @@ def _worker_versions() -> dict[str, str]:
 
 def _fly(
     number: int,
-    changes: Mapping[str, Any],
+    changes: Changes,
     limit_s: float,
     keep: str,
     task: str,

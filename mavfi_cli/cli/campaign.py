@@ -346,7 +346,7 @@ def _planned(
     spec = chosen_spec(what, scale, changes)
     missions = flyable(spec)
     settings = Counter(label_text(mission.labels) for mission in missions)
-    rule = None if spec.fixed_world is None else spec.fixed_world.told()
+    rule = None if spec.fixed_world is None else spec.fixed_world.describe()
     pairs = len({mission.pair for mission in missions})
     told = {
         "name": spec.name, "about": spec.about, "fixed_world": rule, "missions": len(missions),

@@ -203,7 +203,7 @@ class Executor:
     def process_of(self, name: str) -> dict[str, Callable[[Any, float], Any]]:
         """Return the kernels in the process of a node, by node name."""
         node = self.nodes[name]
-        return {each.name: each.kernel for each in (node, *node.mates)}
+        return {member.name: member.kernel for member in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
         """Run a node's kernel in a separate process from now on, until `close`.
@@ -334,8 +334,8 @@ class Executor:
 
     def _start_next(self, node: AnyNode) -> None:
         """Start the next node of the process that has an input."""
-        for each in (*node.mates, node):
-            self._start_if_free(each)
+        for member in (*node.mates, node):
+            self._start_if_free(member)
 
     def _free_cores(self, number: int) -> None:
         self._working -= number
@@ -365,8 +365,8 @@ class Executor:
         """
         node = self.nodes[name]
         together = (node, *node.mates)
-        jobs = [self._jobs.pop(each.name) for each in together if each.name in self._jobs]
-        if not jobs and any(each.busy for each in together):
+        jobs = [self._jobs.pop(member.name) for member in together if member.name in self._jobs]
+        if not jobs and any(member.busy for member in together):
             return
         for job in jobs:  # the result must not depend on the host's progress
             job.settle(self.wall)
@@ -400,10 +400,10 @@ class Executor:
             node.process.close(kill=True)
         process = NodeProcess.fork(self.process_of(node.name))
         together = (node, *node.mates)
-        for each in together:
-            each.process = process
-            each.restarts += 1
-            each.busy = False
-        for each in together:
-            each.on_restart()
+        for member in together:
+            member.process = process
+            member.restarts += 1
+            member.busy = False
+        for member in together:
+            member.on_restart()
         self._start_next(node)

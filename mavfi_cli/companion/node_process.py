@@ -147,8 +147,8 @@ class NodeProcess:
         finally:
             self._answered()
         if answer.error is not None:
-            how, _, told = answer.error.partition("\n")
-            raise NodeLost(hung=False, how=how, traceback=told)
+            how, _, text = answer.error.partition("\n")
+            raise NodeLost(hung=False, how=how, traceback=text)
         return answer.output, answer.host_s
 
     def _await(self, number: int) -> _Answer:
@@ -180,10 +180,10 @@ class NodeProcess:
 
     def _end(self) -> str:
         """Return in words how the process ended."""
-        told = self._ending()
+        ending = self._ending()
         self._gone = True
-        if told is not None:
-            return told
+        if ending is not None:
+            return ending
         with contextlib.suppress(ChildProcessError):
             _, status = os.waitpid(self.pid, 0)
             if os.WIFSIGNALED(status):

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from time import perf_counter
 from typing import Any
@@ -70,6 +70,18 @@ class _Recovery:
     since_s: float | None = None
     in_a_row: int = 0
     alarm: Alarm | None = None  # of the last message, if it raised one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ListedAlarm:
+    """An alarm in the record."""
+
+    stamp_s: float
+    message: str  # report, plan, ahead (active plan) or tick
+    stage: str
+    score: float
+    states: tuple[str, ...]
+    response: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,9 +156,9 @@ class Protection(NoProtection):
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
         self._recoveries = {stage: _Recovery() for stage in Stage}
-        self._alarms: list[dict[str, Any]] = []
+        self._alarms: list[_ListedAlarm] = []
         self._news: list[str] = []
-        self._told_s: dict[Stage, float] = {}
+        self._announced_s: dict[Stage, float] = {}
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
         """Judge a collision report on its arrival."""
@@ -224,23 +236,23 @@ class Protection(NoProtection):
             self._close(recovery, stamp_s)
         if len(self._alarms) < MAX_LISTED_ALARMS:
             self._alarms.append(
-                {
-                    "stamp_s": round(stamp_s, 9),
-                    "message": message,  # report, plan, ahead (active plan) or tick
-                    "stage": stage.value,
-                    "score": alarm.score,
-                    "states": alarm.states,
-                    "response": response.value,
-                }
+                _ListedAlarm(
+                    stamp_s=round(stamp_s, 9),
+                    message=message,
+                    stage=stage.value,
+                    score=alarm.score,
+                    states=alarm.states,
+                    response=response.value,
+                )
             )
-        self._tell(alarm, stage, response, stamp_s)
+        self._announce(alarm, stage, response, stamp_s)
         return Decision(response=response, alarm=alarm)
 
-    def _tell(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
-        last_s = self._told_s.get(stage)
+    def _announce(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
+        last_s = self._announced_s.get(stage)
         if response is not Response.HOLD and last_s is not None and stamp_s - last_s < TOLD_EVERY_S:
             return
-        self._told_s[stage] = stamp_s
+        self._announced_s[stage] = stamp_s
         where = ", ".join(alarm.states[:2]) or "all states together"
         self._news.append(f"{alarm.detector} alarm in {stage.value}: {where}; {response.value}")
 
@@ -266,8 +278,8 @@ class Protection(NoProtection):
 
     def news(self) -> list[str]:
         """Return the lines to announce since the last call."""
-        told, self._news = self._news, []
-        return told
+        news, self._news = self._news, []
+        return news
 
     def summary(self) -> dict[str, Any]:
         """Return checks, alarms and recoveries as plain values."""
@@ -278,7 +290,7 @@ class Protection(NoProtection):
             "checks": self._checks,
             "alarm_count": sum(self._responses.values()),
             "responses": self._responses,
-            "alarms": self._alarms,
+            "alarms": [asdict(alarm) for alarm in self._alarms],
             "recoveries": {
                 stage.value: {"count": entry.count, "total_s": round(entry.total_s, 9)}
                 for stage, entry in self._recoveries.items()

@@ -376,7 +376,7 @@ class Flight:
             self._camera_asked = True
             self._seen_s = stamp_s
             self._session.start_camera(1.0 / self._config.camera_rate_hz)
-        self.logger.tell(stamp_s, self._session, companion, self.injection)
+        self.logger.log_tick(stamp_s, self._session, companion, self.injection)
         return True
 
     def _nearly_up(self, state: VehicleState | None) -> bool:

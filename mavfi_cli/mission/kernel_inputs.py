@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from mavfi_cli.attack.kernels.inputs import (
     INPUTS,
@@ -106,12 +106,12 @@ def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
 
 
 def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
-    found = _hard_tasks(config, recorder)
+    tasks = _hard_tasks(config, recorder)
     for seed in range(config.seed + 1, config.seed + _FLIGHTS):
-        if len(found) >= INPUTS_A_KERNEL:
-            return _spread(found)
+        if len(tasks) >= INPUTS_A_KERNEL:
+            return _spread(tasks)
         another = replace(config, seed=seed)
-        found += _hard_tasks(another, _flown(another))
+        tasks += _hard_tasks(another, _flown(another))
     raise TargetError(
         _flight_name(config), "has too few plans around an obstacle, and so have the next seeds"
     )
@@ -148,18 +148,19 @@ def _tracked(
         raise TargetError("golden flight", "never followed a trajectory")
     first = ticks[0]
     state = tracking.TrackingState(yaw_rad=first.yaw_rad, stamp_s=first.inputs.stamp_s)
-    chosen, found = _spread(following), []
+    chosen, tracked = _spread(following), []
     for index, tick in enumerate(ticks[: chosen[-1] + 1]):
-        found += [(state, tick.inputs)] * chosen.count(index)
+        tracked += [(state, tick.inputs)] * chosen.count(index)
         state, _ = tracking.step(state, tick.inputs, params)
-    return found
+    return tracked
 
 
-def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
-    """Return the inputs of a golden run, from the folder or else from a flight.
+def kernel_targets(
+    kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
+) -> list[KernelTarget]:
+    """Return the kernels of these names, with the inputs of a golden run.
 
-    Returns:
-        Arguments of a `KernelTarget` about its inputs: file, SHA-256, and flight in words.
+    The inputs are those in the folder, or else of a flight, which are then stored there.
 
     Raises:
         ConfigError: The folder contains the inputs of another flight.
@@ -173,7 +174,16 @@ def inputs_of_flight(config: MissionConfig, folder: Path) -> dict[str, Any]:
     (known, *_), sha256 = load_inputs(path)
     if known.flight != _flight_name(config):
         raise ConfigError(f"holds inputs of a {known.flight}", path=path)
-    return {"inputs": path, "inputs_sha256": sha256, "flight": known.flight}
+    return [
+        KernelTarget(
+            kernel=kernel,
+            tolerance=tolerance,
+            inputs=path,
+            inputs_sha256=sha256,
+            flight=known.flight,
+        )
+        for kernel in kernels
+    ]
 
 
 def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
@@ -182,14 +192,6 @@ def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
     Collision check, planner and control have the parameters of `hardened`.
     """
     return MissionConfig(world=world, seed=seed, stack="hardened")
-
-
-def kernel_targets(
-    kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
-) -> list[KernelTarget]:
-    """The kernels of these names, with the inputs of a flight. Raises as `inputs_of_flight`."""
-    fed = inputs_of_flight(config, folder)
-    return [KernelTarget(kernel=each, tolerance=tolerance, **fed) for each in kernels]
 
 
 def _flight_name(config: MissionConfig) -> str:

@@ -51,7 +51,7 @@ def quality_of(
         return dict.fromkeys(QUALITY)
     distance_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     flight_time_s = float(stamps[-1] - stamps[0])
-    found = {
+    quality = {
         "flight_time_s": flight_time_s,
         "distance_m": distance_m,
         "mean_speed_mps": distance_m / flight_time_s,
@@ -59,12 +59,14 @@ def quality_of(
         "goal_distance_m": norm(positions[-1] - goal_enu_m),
     }
     if "clearance_m" in flown:
-        found["min_clearance_m"] = float(flown["clearance_m"].min())
+        quality["min_clearance_m"] = float(flown["clearance_m"].min())
         for kind in ("regression", "propeller"):
             energy_j = np.trapezoid(flown[f"power_{kind}_w"], stamps)
-            found[f"energy_{kind}_j"] = float(energy_j)
+            quality[f"energy_{kind}_j"] = float(energy_j)
     # Without obstacles the clearance is infinite; what the referee could not measure is NaN.
-    return {name: found[name] if np.isfinite(found.get(name, np.nan)) else None for name in QUALITY}
+    return {
+        name: quality[name] if np.isfinite(quality.get(name, np.nan)) else None for name in QUALITY
+    }
 
 
 # Sections -----------------------------------------------------------------------------------------
@@ -158,7 +160,7 @@ def measures_of(record: Record) -> dict[str, Any]:
             {"stamp_s": alarm["stamp_s"], "stage": alarm["stage"]}
             for alarm in detection.get("alarms", ())
         ],
-        "episodes": sum(each["count"] for each in detection.get("recoveries", {}).values()),
+        "episodes": sum(recovery["count"] for recovery in detection.get("recoveries", {}).values()),
         "struck_s": hit.get("struck_s"),
         "struck_sites": hit["struck_sites"],
         "first_bits": hit.get("first_bits", []),
@@ -173,10 +175,10 @@ def fields_of(record: Record) -> dict[str, Any]:
 
 def _at(record: Record, *place: str) -> Any:
     """A field of a field; None where either is missing."""
-    found: Any = record
+    value: Any = record
     for name in place:
-        found = (found or {}).get(name)
-    return found
+        value = (value or {}).get(name)
+    return value
 
 
 def _straight_m(record: Record) -> float | None:
@@ -204,15 +206,15 @@ _FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits
 
 
 def _source(fault: Record) -> dict[str, Any]:
-    found = {"strikes": fault.get("strike_count"), "struck_sites": list(fault.get("states", ()))}
+    drawn = {"strikes": fault.get("strike_count"), "struck_sites": list(fault.get("states", ()))}
     strikes: Sequence[Record] = fault.get("strikes") or ()
     if not strikes:
-        return found
+        return drawn
     first = strikes[0]
     changes: Sequence[Record] = first["changes"]  # none where a process was killed
     reader: Record = _at(fault, "activation", "first_reader") or {}
     return {
-        **found,
+        **drawn,
         "struck_s": first["stamp_s"] if fault.get("state") == "applied" else None,
         "first_bits": list(changes[0]["bits"]) if changes else [],
         "strike_s": first["stamp_s"],

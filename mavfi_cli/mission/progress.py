@@ -1,4 +1,4 @@
-"""What a mission tells while it flies: to a `Watcher` its progress, to a `Recorder` its inputs."""
+"""Observers of a mission in flight: a `Watcher` of its progress, a `Recorder` of its inputs."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Recorder:
 
 
 class FlightLogger:
-    """Finds events by comparing each tick with the last, and tells them to a watcher."""
+    """Detects events by comparing each tick with the last, and reports them to a watcher."""
 
     def __init__(self, watcher: Watcher) -> None:
         self.events: list[Event] = []
@@ -90,7 +90,7 @@ class FlightLogger:
         self.events.append(event)
         self._watcher.on_event(event)
 
-    def tell(
+    def log_tick(
         self,
         stamp_s: float,
         session: OffboardSession,
@@ -103,17 +103,17 @@ class FlightLogger:
             self._phase = phase
             self.note(stamp_s, "phase", phase.value, state)
         texts = session.telemetry.texts
-        for each in texts.since(self._texts):
+        for received in texts.since(self._texts):
             if self._noted_texts <= _MOST_TEXTS:
                 last = self._noted_texts == _MOST_TEXTS
-                text = "further texts are not recorded" if last else each.text
+                text = "further texts are not recorded" if last else received.text
                 self.note(stamp_s, "autopilot", text, state)
                 self._noted_texts += 1
         self._texts = texts.total
         for text in injection.news():
             self.note(stamp_s, "fault", text, state)
         if companion is not None:
-            self._tell_of(companion, stamp_s, session)
+            self._log_companion(companion, stamp_s, session)
         if state is not None and stamp_s >= self._next_progress_s:
             self._next_progress_s = stamp_s + _PROGRESS_EVERY_S
             pilot = None if companion is None else companion.pilot
@@ -128,7 +128,9 @@ class FlightLogger:
                 )
             )
 
-    def _tell_of(self, companion: Companion, stamp_s: float, session: OffboardSession) -> None:
+    def _log_companion(
+        self, companion: Companion, stamp_s: float, session: OffboardSession
+    ) -> None:
         for text in companion.protection.news():
             self.note(stamp_s, "alarm", text, session.state)
             session.announce(text)

@@ -10,7 +10,7 @@ import resource
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from mavfi_cli.core.files import (
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import FlightTruth, Outcome, Reaction
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
@@ -51,7 +52,7 @@ def fly_mission(
     watcher: Watcher,
     *,
     recorder: Recorder | None = None,
-    repeat: Mapping[str, Any] | None = None,
+    repeat: FaultRecord | None = None,
     profiles: Path | None = None,
     for_debugger: Callable[[int], None] | None = None,
     launch: StartVehicle = Vehicle.start,
@@ -106,7 +107,7 @@ def fly_mission(
 def _plan_injection(
     config: MissionConfig,
     profiles: Path,
-    repeat: Mapping[str, Any] | None,
+    repeat: FaultRecord | None,
     for_debugger: Callable[[int], None] | None,
 ) -> NoInjection:
     """Plan the fault of a mission. Arguments as for `fly_mission`."""
@@ -200,7 +201,7 @@ def _write(
 ) -> None:
     log, report = (None, {}) if truth is None else (truth.log, truth.report)
     assert flight.outcome is not None
-    asked, goal = config.fault or config.instruction, companion.pilot.goal_enu_m
+    fault, goal = config.fault or config.instruction, companion.pilot.goal_enu_m
     flown = flight.trace.motion() if log is None else log
     failures = dict(companion.plan_failures)
     files = {name: file_digest(name) for name in config.files}
@@ -209,7 +210,7 @@ def _write(
         "outcome": flight.outcome.value,
         "reason": flight.reason,
         "config": replace(config, goal_tolerance_m=flight.stack.goal_tolerance_m).to_dict(),
-        "seeds": {"root": config.seed, "fault": asked.seed if asked else None},
+        "seeds": {"root": config.seed, "fault": fault.seed if fault else None},
         "simulated_s": flight.end_s - flight.begun_s,
         "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal),
         "pilot": asdict(companion.pilot.counters),
@@ -236,8 +237,8 @@ def _write(
     folder.write_plans(companion.plans)
     executor = companion.executor
     folder.write_timetable(executor.timetable, companion.reactions)
-    told = [*(loss.traceback for loss in executor.losses), crash]
-    if errors := [text for text in told if text]:
+    tracebacks = [*(loss.traceback for loss in executor.losses), crash]
+    if errors := [text for text in tracebacks if text]:
         write_text(folder.crash, "\n".join(errors))
     write_json(folder.result, result)
 
@@ -326,7 +327,7 @@ def fly_again(
     Raises:
         RecordError: The run is not repeatable.
     """
-    from mavfi_cli.fi.tracer.record import read
+    from mavfi_cli.fi.tracer.record import read  # loads the tracer
 
     config = run.mission(with_fault=with_fault, firmware=firmware)
     repeat = read(run.folder.fault) if config.instruction is not None else None

@@ -131,8 +131,8 @@ class RunFolder:
         """Write the timetable: kernel, start and end of each invocation, then the reactions."""
         import pyarrow as pa
 
-        rows = [(each.node, each.start_s, each.end_s) for each in invocations]
-        rows += [(_RESPONSE, each.frame_stamp_s, each.setpoint_stamp_s) for each in reactions]
+        rows = [(run.node, run.start_s, run.end_s) for run in invocations]
+        rows += [(_RESPONSE, r.frame_stamp_s, r.setpoint_stamp_s) for r in reactions]
         kinds = {"kernel": pa.string(), "start_s": pa.float64(), "end_s": pa.float64()}
         columns = {
             name: pa.array([row[place] for row in rows], kind)
@@ -380,17 +380,17 @@ class Run:
             columns = [c for c in columns if not c.startswith(("truth_", "power_"))]
         stamps = self.trace["stamp_s"]
         rows = limit = min(self.trace.num_rows, other.trace.num_rows)
-        found: _Parting | None = None
+        first: _Parting | None = None
         traces = (self.trace, other.trace)
         for column in (c for c in columns if c not in leave_out):
             pair = (trace.slice(0, limit)[column].to_pylist() for trace in traces)
             for row, (a, b) in enumerate(zip(*pair, strict=True)):
                 if a != b and not (a != a and b != b):  # NaN equals NaN
-                    found = _Parting(stamp_s=stamps[row].as_py(), column=column, this=a, other=b)
+                    first = _Parting(stamp_s=stamps[row].as_py(), column=column, this=a, other=b)
                     limit = row
                     break
-        if found is not None:
-            return found
+        if first is not None:
+            return first
         stamp_s = stamps[rows - 1].as_py() if rows else 0.0
         ends = {
             "outcome": (self.record.outcome, other.record.outcome),

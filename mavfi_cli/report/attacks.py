@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.analysis.failures import KERNELS
-from mavfi_cli.attack.campaign import Plan, Record, TargetRuns
+from mavfi_cli.attack.campaign import Plan, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
 from mavfi_cli.report.table import WIDTH, Table
 from mavfi_cli.stats.shares import Cluster, clustered_share, unseen_share
@@ -98,11 +99,11 @@ def _counted(names: Iterable[str]) -> dict[str, int]:
     return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
 
 
-def _with(records: Iterable[Record], outcome: RunOutcome) -> Iterator[Record]:
+def _with(records: Iterable[FaultRecord], outcome: RunOutcome) -> Iterator[FaultRecord]:
     return (entry for entry in records if entry["outcome"] == outcome.value)
 
 
-def _crash(entry: Mapping[str, Any]) -> str:
+def _crash(entry: FaultRecord) -> str:
     if entry["signal"]:
         return signal_name(entry["signal"])
     if "exit_code" in entry:
@@ -204,7 +205,7 @@ def _noticeable(runs: TargetRuns) -> dict[str, Any]:
     )
 
 
-def _parts(records: Sequence[Record]) -> dict[str, Any]:
+def _parts(records: Sequence[FaultRecord]) -> dict[str, Any]:
     """The parts of silent corruptions: the number of runs that have one, and its size."""
     found: dict[str, list[float]] = {}
     for entry in _with(records, RunOutcome.SDC):
@@ -348,7 +349,7 @@ def save_runs(
     return KERNELS, "kernels.csv", "kernels.svg"
 
 
-def _cells(entry: Record, columns: Sequence[str]) -> dict[str, str]:
+def _cells(entry: FaultRecord, columns: Sequence[str]) -> dict[str, str]:
     flat = {**entry, **(entry.get("corruption") or {}), **entry["injection"]}
     if isinstance(entry["magnitude"], Mapping):
         flat.update(entry["magnitude"])

@@ -230,7 +230,7 @@ class _Authority:
         self._say = say
         self._holder: _Sender | None = None
         self._held_us = 0
-        self._told: set[_Sender] = set()
+        self._warned: set[_Sender] = set()
 
     def may_command(self, message: Any, link: Link) -> bool:
         """Return False if a message commands the vehicle and its sender is not trusted."""
@@ -240,8 +240,8 @@ class _Authority:
         kind = message.get_type()
         if kind not in _COMMANDING or (kind in _COMMANDS and message.command in _HARMLESS):
             return True
-        names = ", ".join(str(each) for each in sorted(self._trusted))
-        self._tell((link, system, 0), f"Commands of system {system} refused, trusted: {names}")
+        names = ", ".join(str(number) for number in sorted(self._trusted))
+        self._warn_once((link, system, 0), f"Commands of system {system} refused, trusted: {names}")
         return False
 
     def follows(self, message: Any, link: Link, stamp_us: int, silence_us: float) -> bool:
@@ -253,20 +253,20 @@ class _Authority:
         holder = self._holder
         if holder is not None and holder != sender:
             if stamp_us - self._held_us <= silence_us:
-                self._tell(
+                self._warn_once(
                     sender, f"Setpoints of {_name(sender)} ignored: {_name(holder)} commands"
                 )
                 return False
             self._say(Severity.WARNING, f"{_name(sender)} commands instead of {_name(holder)}")
-            self._told.clear()
+            self._warned.clear()
         self._holder, self._held_us = sender, stamp_us
         return True
 
-    def _tell(self, sender: _Sender, text: str) -> None:
-        if sender not in self._told:
-            if len(self._told) >= _TOLD:
-                self._told.clear()
-            self._told.add(sender)
+    def _warn_once(self, sender: _Sender, text: str) -> None:
+        if sender not in self._warned:
+            if len(self._warned) >= _TOLD:
+                self._warned.clear()
+            self._warned.add(sender)
             self._say(Severity.WARNING, text)
 
 

@@ -90,24 +90,24 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
     The path is searched on a grid of 0.5 m at the goal's height. Paths over or under an obstacle
     are ignored.
     """
-    found = check_world(made, clearance_m=clearance)
+    result = check_world(made, clearance_m=clearance)
     if as_json:
-        echo(json.dumps({**made.as_json(), "check": found.as_json()}, indent=1))
+        echo(json.dumps({**made.as_json(), "check": result.as_json()}, indent=1))
     else:
         near_start, near_goal = (
             f"{m:.1f} m away" if math.isfinite(m) else "none"
-            for m in (found.start_clearance_m, found.goal_clearance_m)
+            for m in (result.start_clearance_m, result.goal_clearance_m)
         )
         start, goal = map(show, (made.start_enu_m, made.goal_enu_m))
-        path = "none" if found.path_m is None else f"{found.path_m:.1f} m"
+        path = "none" if result.path_m is None else f"{result.path_m:.1f} m"
         echo(
             f"{_boxes(made)}\n"
             f"start  {start}, nearest obstacle {near_start}\n"
             f"goal   {goal}, nearest obstacle {near_goal}\n"
-            f"path   {path} with {found.clearance_m:g} m clearance; straight "
-            f"{found.straight_m:.1f} m"
+            f"path   {path} with {result.clearance_m:g} m clearance; straight "
+            f"{result.straight_m:.1f} m"
         )
-    if expect == "path" and not found.path_exists:
+    if expect == "path" and not result.path_exists:
         sys.exit(1)
 
 

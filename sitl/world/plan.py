@@ -67,11 +67,11 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _W
     ends = np.array([world.start_enu_m[:2], world.goal_enu_m[:2]])
     cells = np.minimum(np.floor((ends - origin) / _CELL_M).astype(int), np.array(free.shape) - 1)
     start, goal = map(tuple, cells.tolist())
-    found = _shortest(free, start, goal)
+    path_cells = _shortest(free, start, goal)
     plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
     path = np.zeros((0, 3))
-    if found is not None:
-        corners = origin + (np.array(_straighten(free, found)) + 0.5) * _CELL_M
+    if path_cells is not None:
+        corners = origin + (np.array(_straighten(free, path_cells)) + 0.5) * _CELL_M
         path = np.column_stack([corners, np.full(len(corners), height)])
     start_gaps = distance_to_boxes(world.boxes_enu_m, world.start_enu_m, plan=True)
     goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
@@ -81,7 +81,7 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _W
         goal_clearance_m=float(goal_gaps.min(initial=math.inf)),
         straight_m=float(np.hypot(*plan)),
         path_m=None
-        if found is None
+        if path_cells is None
         else float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
         path_enu_m=path,
     )

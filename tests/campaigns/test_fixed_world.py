@@ -64,7 +64,7 @@ def test_all_missions_in_a_world_fly_the_first_candidate_that_fits(begun, campai
     assert {config.stack for config in flown} == {"hardened"}  # the first
     assert {config.fault for config in flown} == {None}
     assert sorted({config.seed for config in flown}) == [1, 2, 3]
-    assert rule.told() == (
+    assert rule.describe() == (
         "world seeds: rising 5 (median 5); "
         "the first from 1 on whose golden flights replan 5 to 6 times (median of 3)"
     )
@@ -111,7 +111,7 @@ def test_a_world_in_which_none_fits_is_an_error_unless_it_is_named_or_left_out(b
     rule, missions = begun(spec_of(named))
     assert rule.world_seed == {"flat": 7, "rising": 5}
     assert sum('"world_seed":7' in each for each in missions) == 6
-    assert "flat 7 (named)" in rule.told()
+    assert "flat 7 (named)" in rule.describe()
 
 
 def test_a_seed_of_the_mission_goes_before_the_rule(begun):

@@ -174,8 +174,8 @@ def test_a_database_of_somebody_else_is_refused(tmp_path):
     ],
 )
 def test_what_became_of_a_fault(fault, injected):
-    assert Injected.of({"fault": fault}, asked=True) is injected
-    assert Injected.of({"fault": fault}, asked=False) is Injected.GOLDEN
+    assert Injected.of({"fault": fault}, faulty=True) is injected
+    assert Injected.of({"fault": fault}, faulty=False) is Injected.GOLDEN
 
 
 @pytest.mark.parametrize(
@@ -197,5 +197,5 @@ def test_a_fault_that_a_detector_withheld_was_no_idle_one(alarm, injected):
         "strikes": [{"stamp_s": 11.0, "changes": [{"state": "command_yaw"}]}],
     }
     result = {"fault": fault, "detection": {"alarms": [told]}}
-    assert Injected.of(result, asked=True) is injected
-    assert Injected.of({**result, "detection": None}, asked=True) is Injected.NOT_ACTIVATED
+    assert Injected.of(result, faulty=True) is injected
+    assert Injected.of({**result, "detection": None}, faulty=True) is Injected.NOT_ACTIVATED

@@ -1,5 +1,6 @@
 """The vehicle inside the mission's process: its records, and what becomes of its errors."""
 
+import select
 from dataclasses import replace
 
 import pytest
@@ -39,6 +40,17 @@ def test_only_a_flight_by_the_wall_clock_has_a_vehicle_in_another_process(short_
         vehicle = Vehicle.start(config)
         assert isinstance(vehicle, VehicleProcess) == expected
         assert vehicle.end() is None
+
+
+@pytest.mark.parametrize("start", [Vehicle.start, VehicleProcess])
+def test_the_vehicle_starts_where_the_mission_does_to_the_last_digit(short_config, start):
+    place = (1.0 / 3.0, -2.0 / 7.0, 0.0)
+    vehicle = start(replace(short_config, world="sparse", start=place, goal=None))
+    if isinstance(vehicle, VehicleProcess):
+        select.select([vehicle.link.fileno()], [], [])  # its first message follows the briefing
+    assert vehicle.briefing().start_enu_m.tolist() == list(place)
+    assert vehicle.end() is None
+    assert vehicle.truth is not None
 
 
 @pytest.fixture

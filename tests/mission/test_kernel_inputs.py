@@ -9,7 +9,7 @@ from mavfi_cli.attack.kernels.inputs import load_inputs, save_inputs
 from mavfi_cli.autonomy import collision
 from mavfi_cli.autonomy.planners import PlanningParams, PlanningProblem
 from mavfi_cli.core.errors import ConfigError, TargetError
-from mavfi_cli.mission.kernel_inputs import inputs_of_flight, record_inputs
+from mavfi_cli.mission.kernel_inputs import kernel_targets, record_inputs
 from mavfi_cli.spec.mission import MissionConfig
 
 
@@ -55,11 +55,11 @@ def test_some_trajectories_are_free_and_some_are_not_if_the_flight_had_both(inpu
 
 
 def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
-    fed = inputs_of_flight(config, tmp_path)
-    assert fed["inputs_sha256"] == save_inputs(tmp_path / "again.npz", inputs)
-    assert load_inputs(fed["inputs"])[1] == fed["inputs_sha256"]
+    (target,) = kernel_targets(["control"], config, tmp_path)
+    assert target.inputs_sha256 == save_inputs(tmp_path / "again.npz", inputs)
+    assert load_inputs(target.inputs)[1] == target.inputs_sha256
     with pytest.raises(ConfigError, match="holds inputs of a golden flight"):
-        inputs_of_flight(MissionConfig(world="farm"), tmp_path)
+        kernel_targets([], MissionConfig(world="farm"), tmp_path)
 
 
 def test_a_flight_without_a_detour_has_no_planning_problems(monkeypatch):

@@ -136,15 +136,15 @@ def _maps(golden: Numbers, output: Numbers) -> Difference:
 
 
 def _occupied(output: Numbers) -> set[tuple[int, int, int]]:
-    found: set[tuple[int, int, int]] = set()
+    occupied: set[tuple[int, int, int]] = set()
     for x, y, z, size in occupied_leaves(output["payload"].tobytes()).tolist():
         if size > 64:  # a corrupted stream: one huge cube stands for itself
-            found.add((x, y, z))
+            occupied.add((x, y, z))
             continue
-        found.update(
+        occupied.update(
             (x + i, y + j, z + k) for i in range(size) for j in range(size) for k in range(size)
         )
-    return found
+    return occupied
 
 
 def _checks(golden: Numbers, output: Numbers) -> Difference:
@@ -152,10 +152,10 @@ def _checks(golden: Numbers, output: Numbers) -> Difference:
 
     A collision that is missed or made up is noticeable, and a gap in time above `_A_TICK_S`.
     """
-    found = _numbers(golden, output)
+    difference = _numbers(golden, output)
     times, others = golden["time_to_collision_s"], output.get("time_to_collision_s")
     if others is None or others.shape != times.shape:
-        return found
+        return difference
     ours, theirs = times.astype(np.float64), others.astype(np.float64)
     hit, also = np.isfinite(ours), np.isfinite(theirs)
     gaps = np.abs(ours[hit & also] - theirs[hit & also])
@@ -165,9 +165,9 @@ def _checks(golden: Numbers, output: Numbers) -> Difference:
         "gap_s": float(gaps.max(initial=0.0)),
     }
     return replace(
-        found,
+        difference,
         text=f"{parts['missed']} of {int(hit.sum())} collisions missed, {parts['false_alarms']} "
-        f"made up, {parts['gap_s']:.3g} s; {found.text}",
+        f"made up, {parts['gap_s']:.3g} s; {difference.text}",
         noticeable=bool((hit != also).any() or parts["gap_s"] > _A_TICK_S),
         parts=parts,
     )
@@ -267,8 +267,8 @@ class _Tree:
 
 def _read_tree(data: bytes) -> _Tree | None:
     """Read a tree from the bytes of an `.ot` file; None if they are no tree."""
-    _, found, nodes = data.partition(b"\ndata\n")
-    if not found or not nodes or len(nodes) % _NODE.itemsize:
+    _, marker, nodes = data.partition(b"\ndata\n")
+    if not marker or not nodes or len(nodes) % _NODE.itemsize:
         return None
     table = np.frombuffer(nodes, _NODE)
     children = np.ascontiguousarray(table["children"])
@@ -355,9 +355,9 @@ class Kernel:
         """The machine code that can be hit, in a process in which the kernel has run."""
         from mavfi_cli.attack.kernels.scope import compiled_scope, kernel_scope
 
-        found = kernel_scope(self.name) if self.code is None else self.code()
+        scope = kernel_scope(self.name) if self.code is None else self.code()
         more = tuple(compiled_scope(self.name, function).entry for function in self.inner)
-        return replace(found, inner=(*found.inner, *more))
+        return replace(scope, inner=(*scope.inner, *more))
 
 
 def _point_cloud(inputs: KernelInputs) -> Call:
@@ -397,16 +397,16 @@ def _collision_check(inputs: KernelInputs) -> Call:
         for time_s in poses.tolist():
             state, report = collision.step(state, replace(check, time_s=time_s), params)
             reports.append(report)
-        times_s = [each.time_to_collision_s for each in reports]
+        times_s = [report.time_to_collision_s for report in reports]
         blocked = [
             waypoint_index(trajectory, pose + time_s) if math.isfinite(time_s) else -1
             for pose, time_s in zip(poses.tolist(), times_s, strict=True)
         ]
         return {
-            "collision": np.array([each.collision for each in reports]),
+            "collision": np.array([report.collision for report in reports]),
             "time_to_collision_s": np.array(times_s),
             "blocked_waypoint": np.array(blocked),
-            "future_collision_seq": np.array([each.future_collision_seq for each in reports]),
+            "future_collision_seq": np.array([report.future_collision_seq for report in reports]),
         }
 
     return call
@@ -535,8 +535,8 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
     wanted = {find(name).name for name in chosen if not name.endswith(".py")}
     if not chosen:
         wanted = set(KERNELS)
-    found = (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))
-    for name, count in Counter(find(each).name for each in found).items():
+    ordered = (*(name for name in KERNELS if name in wanted), *dict.fromkeys(files))
+    for name, count in Counter(find(kernel).name for kernel in ordered).items():
         if count > 1:
             raise TargetError(name, "several kernels have this name")
-    return found
+    return ordered

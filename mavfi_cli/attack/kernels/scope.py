@@ -147,8 +147,8 @@ def node_scope(node: str, planner: str) -> KernelScope:
         FaultError: its kernel has not run in this process yet.
     """
     kernel = kernel_of_node(node, planner)
-    found = kernel_scope(kernel)
-    return found if kernel not in PLANNERS else _whole_request(found)
+    scope = kernel_scope(kernel)
+    return scope if kernel not in PLANNERS else _whole_request(scope)
 
 
 def _whole_request(search: KernelScope) -> KernelScope:
@@ -250,7 +250,7 @@ def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
 def _functions_with(image: Image, library: str, *parts: str) -> list[Function]:
     """The functions of a library whose names contain one of the texts."""
     named = image.named(library).functions
-    return [each for each in named if any(part in each.name for part in parts)]
+    return [function for function in named if any(part in function.name for part in parts)]
 
 
 def _object_of(image: Image, prefix: str, folder: str = "") -> str:

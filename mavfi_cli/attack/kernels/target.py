@@ -117,8 +117,8 @@ class _KernelPlace:
         try:
             scope: KernelScope = receive(self._template.connection)
         except (OSError, EOFError):
-            said = self._template.last_words()
-            raise TargetError(self.name, f"cannot be attacked: {said}") from None
+            words = self._template.last_words()
+            raise TargetError(self.name, f"cannot be attacked: {words}") from None
         return scope
 
     def start(self) -> Tracee:
@@ -131,10 +131,10 @@ class _KernelPlace:
         control = self._template.connection
         os.ftruncate(self._output, 0)
         control.send(RUN + bytes([self._number]))
-        told = control.recv(PID_BYTES)
-        if len(told) < PID_BYTES:
+        packet = control.recv(PID_BYTES)
+        if len(packet) < PID_BYTES:
             raise FaultError(f"the process that loads {self.name} has died")
-        tracee = Tracee.attach(int.from_bytes(told, "little"), mechanism=self._target.mechanism)
+        tracee = Tracee.attach(int.from_bytes(packet, "little"), mechanism=self._target.mechanism)
         control.send(GO)
         return tracee
 

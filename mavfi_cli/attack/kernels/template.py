@@ -45,7 +45,7 @@ def main() -> None:
     connection = socket.socket(fileno=CHANNEL)
     name, inputs = receive(connection)
     kernel = catalogue.find(name)
-    calls = [kernel.prepare(each) for each in inputs_of_bytes(inputs)]
+    calls = [kernel.prepare(part) for part in inputs_of_bytes(inputs)]
     for call in calls * (2 if kernel.repeatable else 0):
         pack(call())
     _limit(kernel.memory_mb)

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
 from mavfi_cli.core.files import write_text
@@ -24,11 +24,12 @@ from mavfi_cli.fi.tracer.fault import (
 )
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
+from mavfi_cli.fi.tracer.record_fields import FaultRecord, StageRecord
 
 VERSION = 2  # 1 took whole registers for operands
 
 
-def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, Any]:
+def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecord:
     """Make the record before the flip.
 
     Args:
@@ -36,7 +37,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
         context: further entries: seed, sampling rule, scope, kernel, program, run.
     """
     target = fault.target
-    return {
+    record = {
         "version": VERSION,
         "state": "planned",
         "level": "instruction",
@@ -54,26 +55,36 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> dict[str, 
         },
         **context,
     }
+    return cast(FaultRecord, record)
 
 
-def _stage_to_json(stage: CountedStop) -> dict[str, Any]:
-    told = {"object": stage.location.object, "offset": stage.location.offset, "count": stage.count}
-    return told | ({} if stage.detour is None else {"detour": asdict(stage.detour)})
+def undrawn(**context: Any) -> FaultRecord:
+    """Make the record of a fault that is drawn at a moment of the run."""
+    return cast(FaultRecord, {"version": VERSION, "state": "planned", "trigger": [], **context})
+
+
+def _stage_to_json(stage: CountedStop) -> StageRecord:
+    location = stage.location
+    entry = StageRecord(object=location.object, offset=location.offset, count=stage.count)
+    if stage.detour is not None:
+        entry["detour"] = asdict(stage.detour)
+    return entry
 
 
 def completed(
-    record: Mapping[str, Any], injection: Injection | None, followed: Followed, **result: Any
-) -> dict[str, Any]:
+    record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
+) -> FaultRecord:
     """Make the record after the run; `injection` is None if the trigger was not reached."""
     what: dict[str, Any] = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}
         what = asdict(injection) | values
     activation = asdict(followed) | {"activation": followed.activation.value}
-    return {**record, "state": "completed", "injection": what, "activation": activation, **result}
+    written = {"state": "completed", "injection": what, "activation": activation, **result}
+    return cast(FaultRecord, {**record, **written})
 
 
-def fault_of(record: Mapping[str, Any]) -> InstructionFault:
+def fault_of(record: FaultRecord) -> InstructionFault:
     """Read the fault that a record describes, to repeat it.
 
     Raises:
@@ -106,7 +117,7 @@ def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
     return InstructionCorruption(**{**data, **converted})
 
 
-def require_same_build(record: Mapping[str, Any], image: Image) -> None:
+def require_same_build(record: FaultRecord, image: Image) -> None:
     """Refuse a record whose objects are not the loaded ones.
 
     Raises:
@@ -123,7 +134,7 @@ def require_same_build(record: Mapping[str, Any], image: Image) -> None:
         raise BuildMismatch(differences)
 
 
-def write(path: Path, record: Mapping[str, Any]) -> None:
+def write(path: Path, record: FaultRecord) -> None:
     """Write a record and flush it to the disk before returning.
 
     Raises:
@@ -132,7 +143,7 @@ def write(path: Path, record: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(record, indent=1) + "\n")
 
 
-def read(path: Path) -> dict[str, Any]:
+def read(path: Path) -> FaultRecord:
     """Read a record.
 
     Raises:
@@ -146,4 +157,4 @@ def read(path: Path) -> dict[str, Any]:
         raise RecordError(f"{path}: not a fault record ({error})") from None
     if not isinstance(record, dict) or "trigger" not in record:
         raise RecordError(f"{path}: not a fault record")
-    return record
+    return cast(FaultRecord, record)

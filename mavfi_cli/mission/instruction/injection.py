@@ -44,6 +44,7 @@ from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.fault import InstructionFault
 from mavfi_cli.fi.tracer.image import Image, Scope
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM, kept_in
@@ -93,9 +94,9 @@ def _plan_fault(
     config: MissionConfig, profiles: Path, fly_golden: FlyGolden
 ) -> tuple[InstructionFault, dict[str, Any]]:
     """Draw the fault of a mission, and the entries of _CONTEXT."""
-    asked = config.instruction
-    assert asked is not None
-    strategy, node = asked.strategy(), asked.node()
+    request = config.instruction
+    assert request is not None
+    strategy, node = request.strategy(), request.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
     folder = own_folder(kept_in(own_folder(profiles), golden))
@@ -127,10 +128,10 @@ def _plan_fault(
             f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
             "world, seed or node"
         )
-    rng = Stream.FAULT.generator(asked.seed, "instruction")
+    rng = Stream.FAULT.generator(request.seed, "instruction")
     drawn = draw_invocation(node, counts, rng)
     profiling = Stream.FAULT.generator(config.seed, "profile", kernel, drawn.number)
-    found = _kept(
+    profile = _kept(
         folder / f"profile-{kernel}-{drawn.number}.npz",
         TargetProfile,
         lambda: replace(
@@ -141,7 +142,7 @@ def _plan_fault(
         ),
         sound=_is_sound,
     )
-    fault = found.draw(replace(strategy, whole_process=False), rng)
+    fault = profile.draw(replace(strategy, whole_process=False), rng)
     context = {
         "node": node,
         "kernel": kernel,
@@ -149,13 +150,13 @@ def _plan_fault(
         "invocations": drawn.of,
         "node_invocation": drawn.order,
         "stamp_s": round(orders[drawn.order - 1][1], 9),
-        "sampling": asked.sampling_name(),
-        "windows": found.windows,
-        "profiled_instructions": found.executed,
-        "seed": asked.seed,
-        "request": asdict(asked),
+        "sampling": request.sampling_name(),
+        "windows": profile.windows,
+        "profiled_instructions": profile.executed,
+        "seed": request.seed,
+        "request": asdict(request),
     }
-    return replace(fault, corruption=None) if asked.null else fault, context
+    return replace(fault, corruption=None) if request.null else fault, context
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,8 +335,8 @@ class Rehearsal:
             TargetError: nothing in scope executes.
         """
         with contextlib.closing(cls(setup, orders, entry - earlier)) as place:
-            found = TracerThread(lambda _armed: place.profile(rng)).result()
-        return found.after(CountedStop(place.scope_of_node.entry, entry))
+            profile = TracerThread(lambda _armed: place.profile(rng)).result()
+        return profile.after(CountedStop(place.scope_of_node.entry, entry))
 
     def close(self) -> None:
         """End the node."""
@@ -353,7 +354,7 @@ class InstructionInjection(NoInjection):
         fault: InstructionFault,
         context: Mapping[str, Any],
         *,
-        recorded: Mapping[str, Any] | None = None,
+        recorded: FaultRecord | None = None,
         for_debugger: Callable[[int], None] | None = None,
     ) -> None:
         super().__init__()
@@ -365,7 +366,7 @@ class InstructionInjection(NoInjection):
         self._tracer: TracerThread[LiveAttack] | None = None
         self._reached = threading.Event()  # the trigger, or the end of the attack without it
         self._struck = False  # in an invocation whose answer is there
-        self._told = False
+        self._reported = False
 
     @classmethod
     def plan(
@@ -394,7 +395,7 @@ class InstructionInjection(NoInjection):
 
     @classmethod
     def of_record(
-        cls, recorded: Mapping[str, Any], for_debugger: Callable[[int], None] | None = None
+        cls, recorded: FaultRecord, for_debugger: Callable[[int], None] | None = None
     ) -> InstructionInjection:
         """Repeat the fault of a record.
 
@@ -404,7 +405,7 @@ class InstructionInjection(NoInjection):
         fault = record.fault_of(recorded)
         if missing := [name for name in _CONTEXT if name not in recorded]:
             raise RecordError(f"the fault record is damaged: it has no {missing[0]!r}")
-        context = {name: recorded[name] for name in _CONTEXT}
+        context = {name: recorded.get(name) for name in _CONTEXT}
         return cls(fault, context, recorded=recorded, for_debugger=for_debugger)
 
     def begin(self, path: Path) -> None:
@@ -474,9 +475,9 @@ class InstructionInjection(NoInjection):
 
     def news(self) -> list[str]:
         """The fault as text, once the struck invocation is over."""
-        if self._told or self._tracer is None or not self._struck:
+        if self._reported or self._tracer is None or not self._struck:
             return []
-        self._told = True
+        self._reported = True
         done = self._tracer.result()
         return [] if self._fault.corruption is None else [_attack_text(done.record)]
 
@@ -489,8 +490,8 @@ class InstructionInjection(NoInjection):
         state = "applied" if injection["applied"] else "not_injected"
         if written["corruption"] is None and not reason:
             state = "null"
-        told = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
-        return {**written, **told}
+        ending = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
+        return {**written, **ending}
 
     def close(self) -> None:
         """End the node's process if no executor owns it."""
@@ -498,12 +499,13 @@ class InstructionInjection(NoInjection):
             self._spawned.kill()
 
 
-def _attack_text(written: Mapping[str, Any]) -> str:
+def _attack_text(written: FaultRecord) -> str:
     place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
     where = f"{written['kernel']}, {written['instruction']} at {place}"
     if not written["injection"]["applied"]:
         return f"fault in {where}: not injected ({written.get('not_injected_reason', '')})"
     corruption = written["corruption"]
+    assert corruption is not None
     bits = ", ".join(map(str, corruption["bits"]))
     what = corruption["register"] or corruption["site"]
     activation = written["activation"]["activation"].replace("_", " ")

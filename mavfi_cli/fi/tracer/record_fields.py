@@ -1,0 +1,45 @@
+"""The fields of a fault record that the program reads again, without what writes them."""
+
+from __future__ import annotations
+
+from typing import Any, NotRequired, TypedDict
+
+
+class StageRecord(TypedDict):
+    """One stage of a trigger."""
+
+    object: str
+    offset: int
+    count: int
+    detour: NotRequired[dict[str, Any]]
+
+
+class FaultRecord(TypedDict, total=False):
+    """A fault record, planned or completed. docs/reference/records.md lists all of its fields."""
+
+    version: int
+    state: str
+    object: str
+    offset: int
+    symbol: str
+    instruction: str
+    instruction_bytes: str  # hexadecimal
+    k: int
+    trigger: list[StageRecord]  # empty if the fault is drawn at a moment
+    corruption: dict[str, Any] | None  # None: a null run
+    build_ids: dict[str, str | None]
+    injection: dict[str, Any]
+    activation: dict[str, Any]
+    not_injected_reason: str
+    node: str
+    kernel: str
+    golden_sha256: str
+    run: int
+    input: int
+    outcome: str
+    run_s: float
+    within_tolerance: bool
+    signal: int | None
+    exit_code: int
+    error: str
+    magnitude: dict[str, Any]
