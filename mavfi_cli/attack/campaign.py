@@ -23,7 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
 
@@ -254,7 +254,8 @@ def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[FaultRecord]:
         if len(prepared.goldens) > 1:
             what["input"] = number
         if profile is None or fault is None:
-            records.append(record.undrawn(**what))
+            undrawn = {"version": record.VERSION, "state": "planned", "trigger": [], **what}
+            records.append(cast(FaultRecord, undrawn))
             continue
         assert profile.image is not None
         struck = replace(fault, corruption=None) if plan.null else fault

@@ -104,7 +104,7 @@ def chosen_spec(
     return stored
 
 
-def folder_of(what: str) -> Path:
+def _folder_of(what: str) -> Path:
     """The named folder, or the folder into which the named campaign is flown.
 
     Args:
@@ -126,11 +126,11 @@ def opened(what: str | Path) -> Iterator[Ledger]:
     """Open a campaign for reading: a preset, a TOML file, a folder, or an exported .parquet file.
 
     Raises:
-        MavfiError: as `folder_of`, `Ledger` and `ExportedLedger`.
+        MavfiError: as `_folder_of`, `Ledger` and `ExportedLedger`.
         RecordError: an error of the block shows that what was read is damaged.
     """
     path = Path(what)
-    ledger = ExportedLedger(path) if is_export(path) else Ledger(folder_of(str(what)))
+    ledger = ExportedLedger(path) if is_export(path) else Ledger(_folder_of(str(what)))
     with ledger, reading(ledger.folder):
         yield ledger
 

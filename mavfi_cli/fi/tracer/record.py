@@ -58,11 +58,6 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecor
     return cast(FaultRecord, record)
 
 
-def undrawn(**context: Any) -> FaultRecord:
-    """Make the record of a fault that is drawn at a moment of the run."""
-    return cast(FaultRecord, {"version": VERSION, "state": "planned", "trigger": [], **context})
-
-
 def _stage_to_json(stage: CountedStop) -> StageRecord:
     location = stage.location
     entry = StageRecord(object=location.object, offset=location.offset, count=stage.count)
