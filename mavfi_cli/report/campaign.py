@@ -119,7 +119,7 @@ class CampaignReport:
 def state_lines(ledger: Ledger) -> list[str]:
     """Name the fixed world and the settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
-    world = [] if spec is None or spec.fixed_world is None else [spec.fixed_world.told()]
+    world = [] if spec is None or spec.fixed_world is None else [spec.fixed_world.describe()]
     return [*world, *(f"known well enough, so not flown on: {name}" for name in stopped(ledger))]
 
 
