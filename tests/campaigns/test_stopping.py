@@ -15,6 +15,7 @@ from mavfi_cli.stats.shares import rate
 
 CONFIG = MissionConfig()
 STOP = Stop(margin=0.12, batch=10)
+rate(1, 2)  # imports SciPy, for which an example of hypothesis has no time
 
 
 def fly(outcomes, cells, slots, seed):
