@@ -1,17 +1,18 @@
 """Evaluate detectors with and without faults: counts of pairs, each with its interval.
 
 Pairs are flights of one mission: golden, faulty, and faulty with a detector. Faults that were not
-injected or not read are counted separately and enter no other number. The detectors fly all harmful
-faults, and the harmless ones of the `complete` missions. The effect of a fault is taken from the
-unprotected flight, because a detector may withhold the value before it is read.
+injected or not read are counted separately and enter no other number, and so are those of missions
+whose golden flight fails, because nothing can harm these. The detectors fly all harmful faults, and
+the harmless ones of the `complete` missions. The effect of a fault is taken from the unprotected
+flight, because a detector may withhold the value before it is read.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import IntArray, chosen, flags, known, numbers
-from mavfi_cli.analysis.pairs import paired
+from mavfi_cli.analysis.pairs import LONGER, against_golden, paired, partners
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
@@ -28,12 +29,9 @@ from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
 from mavfi_cli.stats.roc import curves
 from mavfi_cli.stats.shares import Interval, Share, mixture, rate
 
-LONGER = 0.05  # fraction of the golden flight time beyond which a fault is harmful
 NONE = "none"  # no detector: the reference of all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
 KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
-Flight = Mapping[str, Any]  # a row of `analysis.flights`
-Place = tuple[str, str, tuple[Any, ...]]  # kind, detector, KEY
 # Columns from which pairs are made; the labels are those of KEY, the kind and the detector.
 WANTED = (
     "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
@@ -50,115 +48,234 @@ CSV = {
     "alarms": _COUNT, "episodes": _COUNT,
 }  # fmt: skip
 SCHEMA = pa.schema(
-    CSV | dict.fromkeys(("golden_won", "faulty_won", "won", "active", "struck", "seen", "undone",
-                         "complete"), _FLAG)
+    CSV | dict.fromkeys(("golden_won", "faulty_won", "won", "active", "judged", "struck", "seen",
+                         "undone", "complete"), _FLAG)
     | {"faulty_lengthening": _NUMBER, "faulty_struck_s": _NUMBER, "golden_path": _TEXT,
        "faulty_path": _TEXT}
 )  # fmt: skip
-
-
+# A flight, as its row in SCHEMA names its own values.
+_FLOWN = pa.schema(
+    [(name, CSV[name]) for name in ("kind", "detector", *KEY, "injected", "state", "bits",
+                                    "crashed", "outcome", "time_s", "struck_s", "alarms",
+                                    "episodes")]
+    + [("won", _FLAG), ("path", _TEXT)]
+)  # fmt: skip
 # Effects of a fault on an unprotected flight, compared with its golden flight.
 HARMLESS = "none"
-LOST = "lost"  # the golden flight reached the goal, this one did not
-LATE = "longer"  # both did, this one took more than LONGER longer
-OTHERWISE = "otherwise"  # both failed, in different ways
+LOST = "lost"  # this one does not reach the goal
+LATE = "longer"  # both do, this one takes more than LONGER times as long
+RESAMPLES = 999
+TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick per state message
+ALL = "all"
+GROUPS = (ALL, "world", "stage", "field", "state")  # labels by which faults are grouped
+_NOTHING_SEEN = -math.log(0.025)  # upper 95 % limit of a Poisson count that was 0
+# Harmful faults with their scores, and the scores of error-free flights, for each detector.
+Scored = Callable[[str], tuple[pa.Table, list[float]]]
 
 
-def _harm_of(golden: Flight, flown: Flight) -> str:
-    """Effect of a treatment on a mission, compared with its golden flight.
+# Results ------------------------------------------------------------------------------------------
 
-    A mission that succeeds although its golden flight failed is not harmed.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorFreeRow:
+    """A detector on flights without faults, compared with the same flights without it.
+
+    Attributes:
+        by, value: label by which the flights are grouped, and its value.
+        hours: flight time with the detector, from take-over to the end of the mission.
+        alarms, episodes: all alarms, and consecutive ones as one.
+        alarms_per_hour: bootstrap over flights; with no alarm at all, a Poisson upper limit.
+        with_alarm: flights with at least one.
+        lost: golden successes that failed with the detector; gained: the other way round.
+        success: golden first.
+        lengthening: median of flight time over golden flight time, minus 1, of both successful.
     """
-    if flown["succeeded"]:
-        longer = golden["succeeded"] and (_lengthening(golden, flown) or 0.0) > LONGER
-        return LATE if longer else HARMLESS
-    if golden["succeeded"]:
-        return LOST
-    return HARMLESS if flown["outcome"] == golden["outcome"] else OTHERWISE
+
+    by: str
+    value: str
+    detector: str
+    flights: int
+    hours: float
+    alarms: int
+    episodes: int
+    alarms_per_hour: Interval
+    with_alarm: Share
+    lost: Share
+    gained: int
+    success: McNemar
+    lengthening: Interval
 
 
-def _lengthening(golden: Flight, flown: Flight) -> float | None:
-    """Flight time over golden flight time, minus 1; None if either flight failed."""
-    if not (golden["succeeded"] and flown["succeeded"]):
-        return None
-    if not golden["flight_time_s"] or flown["flight_time_s"] is None:
-        return None
-    return float(flown["flight_time_s"] / golden["flight_time_s"] - 1.0)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorstFlight:
+    """The worst successful flight time and its recovery, as in the paper's section VII-A.
 
+    The paper flies one world with one seed. Here every mission has its own seed, so every flight is
+    compared with its own golden flight.
 
-def _common(kind: str, golden: Flight, flown: Flight) -> dict[str, Any]:
-    return {
-        "kind": kind,
-        "golden_outcome": golden["outcome"],
-        "golden_time_s": golden["flight_time_s"],
-        "golden_won": golden["succeeded"],
-        "outcome": flown["outcome"],
-        "time_s": flown["flight_time_s"],
-        "won": flown["succeeded"],
-        "lengthening": _lengthening(golden, flown),
-        "alarms": flown["alarm_count"] or 0,
-        "episodes": flown["episodes"],
-    }
-
-
-def _first_alarm(flown: Flight, from_s: float | None) -> Mapping[str, Any] | None:
-    """The first alarm at that time or later; None if there is none."""
-    if from_s is None:
-        return None
-    return next((alarm for alarm in flown["alarms"] if alarm["stamp_s"] >= from_s - 1e-9), None)
-
-
-def _fault_pair(
-    labels: Mapping[str, Any],
-    golden: Flight,
-    faulty: Flight,
-    watched: Flight,
-    protected: Flight,
-    *,
-    complete: bool,
-) -> dict[str, Any]:
-    """A golden flight, the same with a fault, and with fault and detector, as a row of SCHEMA.
-
-    `active`: the unprotected flight was struck, and something read it or may have. `struck`: the
-    protected flight was; otherwise there was nothing to detect. `seen`: it had an alarm at or
-    after the strike. `by_chance`: the detector also raises one after that time without the fault.
-
-    Args:
-        watched: the golden flight with the detector.
-        protected: the faulty flight itself for the detector `none`.
-        complete: whether all faults of its mission are flown with detectors; otherwise only
-            harmful ones are.
+    Attributes:
+        faulty, protected: the largest flight time over golden flight time, minus 1.
+        recovered: how much lower the second is, in parts of the golden flight time. Resampled
+            missions never hold a worse case than the worst that was seen, so the interval says how
+            much it hangs on single flights, not how bad it can become.
+        recovered_share: of the increase; NaN if no flight took more than LONGER times as long.
     """
-    active = faulty["injected"] in (Injected.ACTIVE.value, Injected.UNREAD.value)
-    harm, remaining = _harm_of(golden, faulty), _harm_of(golden, protected)
-    struck_s = protected["struck_s"]
-    alarm = _first_alarm(protected, struck_s)
-    return {
-        **labels,
-        **_common(FAULT, golden, protected),
-        "state": "+".join(faulty["struck_sites"]) or labels["target"],
-        "bits": " ".join(map(str, faulty["first_bits"])),
-        "injected": faulty["injected"],
-        "harm": harm if active else "",
-        "crashed": faulty["crashed"],
-        "faulty_outcome": faulty["outcome"],
-        "faulty_time_s": faulty["flight_time_s"],
-        "struck_s": struck_s,
-        "alarm_s": alarm and alarm["stamp_s"],
-        "alarm_stage": alarm and alarm["stage"],
-        "latency_s": None if alarm is None else max(0.0, alarm["stamp_s"] - struck_s),
-        "by_chance": _first_alarm(watched, struck_s) is not None,
-        "remaining_harm": remaining if active else "",
-        "faulty_won": faulty["succeeded"],
-        "active": active,
-        "struck": struck_s is not None,
-        "seen": alarm is not None,
-        "undone": remaining == HARMLESS,
-        "complete": complete,
-        "faulty_lengthening": _lengthening(golden, faulty),
-        "faulty_struck_s": faulty["struck_s"],
-        "faulty_path": faulty["path"],
-    }
+
+    faulty: float
+    protected: float
+    recovered: Interval
+    recovered_share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultRow:
+    """A detector on flights with faults. Shares after `active` concern active faults only.
+
+    Attributes:
+        by, value: label by which the faults are grouped, and its value.
+        planned: number of faults, divided into `not_injected`, `not_activated` (never read),
+            `golden_failed` (the mission fails without the fault as well) and `active`.
+        crashed: faults that killed a node, which are noticed without any detector.
+        harmful: `lost` or `longer`.
+        flown: with this detector: all harmful faults, and the harmless ones of complete missions.
+        not_struck: those that never struck because the protected flight had diverged; they enter
+            no rate of detection.
+        latency_s, latency_s_p95: median and 95th percentile from strike to alarm, harmful faults.
+        detected_harmful: with an alarm at or after the strike.
+        detected_active: the same of all faults of complete missions.
+        detected_inactive: the same of faults that were struck but not activated.
+        by_chance: flights of complete missions that have an alarm in that time without their fault
+            as well.
+        recovered: of the lost missions those that succeed with protection.
+        undone: of the harmful faults those that do no harm with it.
+        added: of the harmless faults those that do harm with it.
+        unprotected: success rate of all missions with an active fault.
+        protected: the same with the detector: `share`, `low` and `high` of harmful and harmless
+            faults, each with its own rate, weighted by how many there are.
+        success: on complete missions, unprotected first.
+        worst: of the flown faults.
+    """
+
+    by: str
+    value: str
+    detector: str
+    planned: int
+    not_injected: int
+    not_activated: int
+    golden_failed: int
+    active: int
+    crashed: int
+    harmful: Share
+    lost: int
+    longer: int
+    flown: int
+    not_struck: int
+    latency_s: Interval
+    latency_s_p95: Interval
+    latency_ticks: float
+    latency_ticks_p95: float
+    detected_harmful: Share
+    detected_active: Share
+    detected_inactive: Share
+    by_chance: Share
+    recovered: Share
+    undone: Share
+    added: Share
+    unprotected: Share
+    protected: dict[str, float]
+    success: McNemar
+    worst: WorstFlight
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectedTest:
+    """McNemar's test of two detectors, with its p-value corrected over all of them by Holm."""
+
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+    p_value: float
+    difference: float
+    corrected_p: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorComparison:
+    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+
+    first: str
+    second: str
+    recovered: CorrectedTest
+    undone: CorrectedTest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorCurves:
+    """The curves of a detector, as in `stats.roc.curves`; `areas` of the faults of each group."""
+
+    positives: int
+    negatives: int
+    thresholds: list[float]
+    false_positive_rate: list[float]
+    recall: list[float]
+    precision: list[float]
+    area: float
+    area_low: float
+    area_high: float
+    average_precision: float
+    operating_point: tuple[float, float]
+    areas: list[dict[str, str | float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorResults:
+    """Results of the pairs: a row per group and detector; curves by detector."""
+
+    error_free: list[ErrorFreeRow]
+    faults: list[FaultRow]
+    comparisons: list[DetectorComparison]
+    curves: dict[str, DetectorCurves]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluatedPlan:
+    """What an evaluation flew.
+
+    Attributes:
+        detectors: threshold and digest of the model, by name.
+        places: stage, target and bit field of each kind of fault.
+        mission: parameters of all missions that are not the defaults.
+    """
+
+    worlds: tuple[str, ...]
+    detectors: dict[str, dict[str, float | str]]
+    protect: tuple[str, ...]
+    places: list[dict[str, str]]
+    mission: dict[str, Any]
+    level: str
+    flights: int
+    harmless_flights: int
+    golden_flights: int
+    first_seed: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation(DetectorResults):
+    """The contents of `evaluation.json`.
+
+    Attributes:
+        errors: labels and reason of each mission that could not begin.
+    """
+
+    schema: int
+    plan: EvaluatedPlan
+    versions: dict[str, str]
+    errors: list[str]
+
+
+# Pairs --------------------------------------------------------------------------------------------
 
 
 def pairs_of(
@@ -169,53 +286,134 @@ def pairs_of(
     Args:
         flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
         complete: whether all faults of the mission with this seed are flown with detectors.
+
+    Returns:
+        Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and
+        something read it or may have. `judged`: also the golden flight succeeds. `struck`: the
+        protected flight was; otherwise there was nothing to detect. `seen`: it had an alarm at or
+        after the strike. `by_chance`: the detector also raises one after that time without the
+        fault.
     """
-    known = {place: row for table in flights for place, row in _placed(table)}
-    free, struck = [], []
-    for (kind, detector, key), flight in known.items():
-        mission = (*key[:2], *[None] * (len(KEY) - 2))
-        golden = known.get((ERROR_FREE, NONE, mission))
-        watched = known.get((ERROR_FREE, detector, mission))
-        faulty = known.get((kind, NONE, key))
-        if detector not in detectors or golden is None:
-            continue
-        if kind == ERROR_FREE:
-            labels = {"world": key[0], "seed": key[1], "detector": detector}
-            told = _common(ERROR_FREE, golden, flight)
-            free.append({**labels, **told, "golden_path": golden["path"]})
-        elif watched is not None and faulty is not None:
-            labels = {**dict(zip(KEY, key, strict=True)), "detector": detector}
-            whole = complete(key[1])
-            struck.append(_fault_pair(labels, golden, faulty, watched, flight, complete=whole))
-    return pa.Table.from_pylist(free, SCHEMA), pa.Table.from_pylist(struck, SCHEMA)
+    rows = [row for table in flights for row in _rows_of(table)]
+    alarms = [row.pop("all_alarms") for row in rows]
+    table = pa.Table.from_pylist(rows, _FLOWN)
+    free = np.asarray(pc.equal(table["kind"], ERROR_FREE))
+    bare = np.asarray(pc.equal(table["detector"], NONE))
+    golden = partners(table, table, ("world", "seed"), only=free & bare)
+    watched = partners(table, table, ("world", "seed", "detector"), only=free)
+    faulty = partners(table, table, ("kind", *KEY), only=bare)
+    wanted = np.asarray(pc.is_in(table["detector"], pa.array([*detectors], _TEXT)))
+    wanted &= golden >= 0
+    whole = np.flatnonzero(wanted & free)
+    treated = np.flatnonzero(wanted & ~free & (watched >= 0) & (faulty >= 0))
+    struck_s = table["struck_s"].to_pylist()
+    caught = [_first_alarm(alarms[place], struck_s[place]) for place in treated]
+    chance = [_first_alarm(alarms[watched[place]], struck_s[place]) for place in treated]
+    own, bare_own = table.take(treated), table.take(faulty[treated])
+    active = pc.is_in(
+        bare_own["injected"], pa.array([Injected.ACTIVE.value, Injected.UNREAD.value])
+    )
+    pairs = _against(table.take(golden[treated]), own)
+    unprotected = _against(table.take(golden[treated]), bare_own)
+    judged = pc.and_(active, pairs["golden_won"])
+    latency_s = [alarm and max(0.0, alarm[0] - struck_s[place])
+                 for alarm, place in zip(caught, treated, strict=True)]  # fmt: skip
+    faults = pairs | {
+        "state": pc.coalesce(bare_own["state"], own["target"]),
+        "bits": bare_own["bits"],
+        "injected": bare_own["injected"],
+        "crashed": bare_own["crashed"],
+        "harm": pc.if_else(judged, unprotected["harm"], ""),
+        "remaining_harm": pc.if_else(judged, pairs["harm"], ""),
+        "faulty_outcome": bare_own["outcome"],
+        "faulty_time_s": bare_own["time_s"],
+        "faulty_won": bare_own["won"],
+        "faulty_lengthening": unprotected["lengthening"],
+        "faulty_struck_s": bare_own["struck_s"],
+        "faulty_path": bare_own["path"],
+        "alarm_s": [alarm and alarm[0] for alarm in caught],
+        "alarm_stage": [alarm and alarm[1] for alarm in caught],
+        "latency_s": latency_s,
+        "seen": [alarm is not None for alarm in caught],
+        "by_chance": [alarm is not None for alarm in chance],
+        "active": active,
+        "judged": judged,
+        "struck": pc.is_valid(own["struck_s"]),
+        "undone": pc.equal(pairs["harm"], HARMLESS),
+        "complete": [complete(seed) for seed in own["seed"].to_pylist()],
+    }
+    error_free = _against(table.take(golden[whole]), table.take(whole))
+    error_free |= dict.fromkeys(("harm", "injected", "state", "bits", "crashed"))
+    return _table_of(error_free, len(whole)), _table_of(faults, len(treated))
 
 
-def _placed(table: pa.Table) -> Iterator[tuple[Place, Flight]]:
-    names = [name for name in ("kind", "detector", *KEY) if f"label_{name}" in table.column_names]
-    for row in table.select([*(f"label_{name}" for name in names), *WANTED]).to_pylist():
-        key = tuple(row.get(f"label_{name}") for name in KEY)
-        yield (str(row["label_kind"]), str(row["label_detector"]), key), row
+def _rows_of(table: pa.Table) -> Iterator[dict[str, Any]]:
+    """The flights as rows of _FLOWN, with time and stage of each alarm in `all_alarms`."""
+    labels = [name for name in ("kind", "detector", *KEY) if f"label_{name}" in table.column_names]
+    for row in table.select([*(f"label_{name}" for name in labels), *WANTED]).to_pylist():
+        yield {
+            **{name: row[f"label_{name}"] for name in labels},
+            **{name: row[name] for name in ("injected", "crashed", "outcome", "struck_s",
+                                            "episodes", "path")},
+            "state": "+".join(row["struck_sites"]) or None,
+            "bits": " ".join(map(str, row["first_bits"])),
+            "time_s": row["flight_time_s"],
+            "won": row["succeeded"],
+            "alarms": row["alarm_count"] or 0,
+            "all_alarms": [(alarm["stamp_s"], alarm["stage"]) for alarm in row["alarms"]],
+        }  # fmt: skip
+
+
+def _first_alarm(
+    alarms: Iterable[tuple[float, str]], from_s: float | None
+) -> tuple[float, str] | None:
+    """The first alarm at that time or later; None if there is none."""
+    if from_s is None:
+        return None
+    return next((alarm for alarm in alarms if alarm[0] >= from_s - 1e-9), None)
+
+
+def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
+    """The columns of SCHEMA that a flight and its golden flight give, and the `harm`, or empty."""
+    lost = pc.invert(flown["won"])
+    over, harmed = against_golden(pc.invert(golden["won"]), golden["time_s"], lost, flown["time_s"])
+    harm = pc.if_else(harmed, pc.if_else(lost, LOST, LATE), HARMLESS)
+    return {
+        **{name: flown[name] for name in flown.column_names if name in SCHEMA.names},
+        "golden_outcome": golden["outcome"],
+        "golden_time_s": golden["time_s"],
+        "golden_won": golden["won"],
+        "golden_path": golden["path"],
+        "lengthening": pc.subtract(over, 1.0),
+        "harm": harm,
+    }
+
+
+def _table_of(columns: dict[str, Any], rows: int) -> pa.Table:
+    """A table of SCHEMA; columns that are missing or None are empty."""
+    arrays = []
+    for field in SCHEMA:
+        values = columns.get(field.name)
+        if values is None:
+            arrays.append(pa.nulls(rows, field.type))
+        else:
+            arrays.append(pa.array(values, field.type) if isinstance(values, list)
+                          else values.cast(field.type))  # fmt: skip
+    return pa.table(arrays, SCHEMA)
 
 
 def harmful(faults: pa.Table) -> pa.Table:
-    """The pairs without a detector whose fault was active and did harm."""
-    active = chosen(faults, active=True, detector=NONE)
-    return active.filter(pc.not_equal(active["harm"], HARMLESS))
+    """The pairs without a detector whose fault did harm."""
+    return chosen(faults, detector=NONE, harm=(LOST, LATE))
 
 
-RESAMPLES = 999
-TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick per state message
-ALL = "all"
-GROUPS = (ALL, "world", "stage", "field", "state")  # labels by which faults are grouped
-_NOTHING_SEEN = -math.log(0.025)  # upper 95 % limit of a Poisson count that was 0
-# Harmful faults with their scores, and the scores of error-free flights, for each detector.
-Scored = Callable[[str], tuple[pa.Table, list[float]]]
+# Results of groups --------------------------------------------------------------------------------
 
 
-def found(
+def results(
     detectors: Sequence[str], error_free: pa.Table, faults: pa.Table, scored: Scored
-) -> dict[str, Any]:
-    """Results of the pairs, one row per group and detector, as plain values.
+) -> DetectorResults:
+    """Results of the pairs.
 
     Args:
         detectors: all of them, `none` first.
@@ -223,23 +421,18 @@ def found(
         scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
             and the scores of its error-free flights.
     """
-    return {
-        "error_free": [
-            {"by": by, "value": value, "detector": detector, **_error_free_metrics(part)}
+    return DetectorResults(
+        error_free=[
+            _error_free_row(by, value, detector, part)
             for by, value, detector, part in _grouped(detectors, error_free, (ALL, "world"))
         ],
-        "faults": [
-            {
-                "by": by,
-                "value": value,
-                "detector": detector,
-                **_fault_metrics(_part(faults, by, value, NONE), part),
-            }
+        faults=[
+            _fault_row(by, value, detector, _part(faults, by, value, NONE), part)
             for by, value, detector, part in _grouped(detectors, faults, GROUPS)
         ],
-        "comparisons": _comparisons(detectors, faults),
-        "curves": {name: _curves(*scored(name)) for name in detectors if name != NONE},
-    }
+        comparisons=_comparisons(detectors, faults),
+        curves={name: _curves(*scored(name)) for name in detectors if name != NONE},
+    )
 
 
 def _grouped(
@@ -256,62 +449,62 @@ def _part(pairs: pa.Table, by: str, value: str, detector: str) -> pa.Table:
     return chosen(pairs, detector=detector, **({} if by == ALL else {by: value}))
 
 
-def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[dict[str, Any]]:
+def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorComparison]:
     """Compare every two detectors on the same faults, with p-values corrected over all."""
-    rows: list[dict[str, Any]] = []
-    for first, second in itertools.combinations(detectors, 2):
-        tests = _recoveries_compared(*(chosen(faults, detector=name) for name in (first, second)))
-        row: dict[str, Any] = {"first": first, "second": second}
-        for what, test in zip(("recovered", "undone"), tests, strict=True):
-            row[what] = {**asdict(test), "difference": test.difference}
-        rows.append(row)
-    for what in ("recovered", "undone"):
-        corrected = holm([row[what]["p_value"] for row in rows])
-        for row, p_value in zip(rows, corrected, strict=True):
-            row[what]["corrected_p"] = p_value
-    return rows
+    names = [*itertools.combinations(detectors, 2)]
+    tests = [_recoveries(*(chosen(faults, detector=name) for name in two)) for two in names]
+    recovered, undone = (
+        [
+            CorrectedTest(**asdict(test), difference=test.difference, corrected_p=corrected)
+            for test, corrected in zip(kind, holm([test.p_value for test in kind]), strict=True)
+        ]
+        for kind in ([own[0] for own in tests], [own[1] for own in tests])
+    )
+    return [
+        DetectorComparison(first=two[0], second=two[1], recovered=saved, undone=undid)
+        for two, saved, undid in zip(names, recovered, undone, strict=True)
+    ]
 
 
-def _curves(scores: pa.Table, error_free: Sequence[float]) -> dict[str, Any]:
-    told = ("positives", "area", "area_low", "area_high", "average_precision")
+def _recoveries(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
+    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+    here, there = paired(chosen(first, harm=(LOST, LATE)), second, KEY)
+    lost = pc.equal(here["harm"], LOST)
+    return (
+        McNemar.of(*(flags(table.filter(lost), "won") for table in (here, there))),
+        McNemar.of(*(flags(table, "undone") for table in (here, there))),
+    )
+
+
+def _curves(scores: pa.Table, error_free: Sequence[float]) -> DetectorCurves:
+    names = ("positives", "area", "area_low", "area_high", "average_precision")
     areas = []
     for by in ("stage", "field"):
         for value in pc.unique(scores[by]).to_pylist():
             part = curves(chosen(scores, **{by: value})["score"].to_pylist(), error_free)
-            areas.append({"by": by, "value": value, **{name: part[name] for name in told}})
-    return {**curves(scores["score"].to_pylist(), error_free), "areas": areas}
+            areas.append({"by": by, "value": value, **{name: part[name] for name in names}})
+    return DetectorCurves(**curves(scores["score"].to_pylist(), error_free), areas=areas)
 
 
-# Without faults -------------------------------------------------------------------------------
-
-
-def _error_free_metrics(pairs: pa.Table) -> dict[str, Any]:
-    """A detector on flights without faults, compared with the same flights without it.
-
-    Returns:
-        `hours`: flight time with the detector, from take-over to the end of the mission.
-        `alarms`, `episodes`: all alarms, and consecutive ones as one. `alarms_per_hour`: bootstrap
-        over flights; with no alarm at all, a Poisson upper limit. `with_alarm`: flights with at
-        least one. `lost`: golden successes that failed with the detector; `gained`: the other way
-        round.
-        `success`: McNemar's test, golden first. `lengthening`: median of flight time over golden
-        flight time, minus 1, of both successful.
-    """
+def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> ErrorFreeRow:
     alarms = numbers(pairs, "alarms")
     hours = np.nan_to_num(numbers(pairs, "time_s")) / 3600.0
     test = _ends(pairs, "golden_won")
-    return {
-        "flights": pairs.num_rows,
-        "hours": math.fsum(hours.tolist()),
-        "alarms": int(alarms.sum()),
-        "episodes": int(numbers(pairs, "episodes").sum()),
-        "alarms_per_hour": asdict(_rate_per_hour(alarms, hours)),
-        "with_alarm": asdict(rate(int(np.count_nonzero(alarms)), pairs.num_rows)),
-        "lost": asdict(rate(test.only_first, test.both + test.only_first)),
-        "gained": test.only_second,
-        "success": asdict(test),
-        "lengthening": asdict(_interval(known(numbers(pairs, "lengthening")), median)),
-    }
+    return ErrorFreeRow(
+        by=by,
+        value=value,
+        detector=detector,
+        flights=pairs.num_rows,
+        hours=math.fsum(hours.tolist()),
+        alarms=int(alarms.sum()),
+        episodes=int(numbers(pairs, "episodes").sum()),
+        alarms_per_hour=_rate_per_hour(alarms, hours),
+        with_alarm=rate(int(np.count_nonzero(alarms)), pairs.num_rows),
+        lost=rate(test.only_first, test.both + test.only_first),
+        gained=test.only_second,
+        success=test,
+        lengthening=_interval(known(numbers(pairs, "lengthening")), median),
+    )
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
@@ -327,93 +520,52 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
     )
 
 
-# With faults ----------------------------------------------------------------------------------
-
-
-def _fault_metrics(bare: pa.Table, pairs: pa.Table) -> dict[str, Any]:
-    """A detector on flights with faults.
-
-    Args:
-        bare: the faults without a detector, all of them.
-        pairs: those that were flown with the detector.
-
-    Returns:
-        `planned`: number of faults, divided into `not_injected`, `not_activated` (never read) and
-        `active`. Unless stated otherwise, all other numbers concern the active ones.
-        `crashed`: faults that killed a node, which are noticed without any detector. `harmful`:
-        lost, longer or otherwise; their numbers follow. `flown`: with this detector: all harmful
-        faults, and the harmless ones of complete missions. `not_struck`: those that never struck
-        because the protected flight had diverged; they enter no rate of detection.
-        `detected_harmful`: with an alarm at or after the strike. `detected_active`: the same of all
-        faults of complete missions. `detected_inactive`: the same of faults that were struck but
-        not activated. `by_chance`: flights of complete missions that have an alarm in that time
-        without their fault as well. `latency_s`, `latency_ticks`: median and 95th percentile from
-        strike to alarm, harmful faults. `recovered`: of the lost missions those that succeed with
-        protection. `undone`: of the harmful faults those that do no harm with it. `added`: of the
-        harmless faults those that do harm with it. `golden`, `unprotected`: success rates of all
-        missions with an active fault. `protected`: the same with the detector: harmful and harmless
-        faults, each with its own rate, weighted by how many there are. `success`: McNemar's test on
-        complete missions, unprotected first. `worst`: as `_worst`, of the flown faults.
-    """
+def _fault_row(by: str, value: str, detector: str, bare: pa.Table, pairs: pa.Table) -> FaultRow:
+    """A row of the faults without a detector, and of those that were flown with it."""
     injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
-    active = chosen(injected, active=True)
-    harms = {harm: chosen(active, harm=harm).num_rows for harm in (HARMLESS, LOST, LATE, OTHERWISE)}
-    harmful_count = active.num_rows - harms[HARMLESS]
-    flown = chosen(pairs, active=True)
+    active, judged = chosen(injected, active=True), chosen(injected, judged=True)
+    counts = {harm: chosen(judged, harm=harm).num_rows for harm in (HARMLESS, LOST, LATE)}
+    harmful_count = counts[LOST] + counts[LATE]
+    flown = chosen(pairs, judged=True)
     complete = chosen(flown, complete=True)
-    harmful = flown.filter(pc.not_equal(flown["harm"], HARMLESS))
-    harmless = chosen(complete, harm=HARMLESS)
+    harmful, harmless = chosen(flown, harm=(LOST, LATE)), chosen(complete, harm=HARMLESS)
     latencies_s = known(numbers(harmful, "latency_s"))
-    middle, late = (
-        _interval(latencies_s, median),
-        _interval(latencies_s, lambda drawn: np.quantile(drawn, 0.95, axis=-1)),
+    middle = _interval(latencies_s, median)
+    late = _interval(latencies_s, lambda drawn: np.quantile(drawn, 0.95, axis=-1))
+    inactive = chosen(pairs, active=False, complete=True, struck=True)
+    return FaultRow(
+        by=by,
+        value=value,
+        detector=detector,
+        planned=bare.num_rows,
+        not_injected=bare.num_rows - injected.num_rows,
+        not_activated=injected.num_rows - active.num_rows,
+        golden_failed=active.num_rows - judged.num_rows,
+        active=judged.num_rows,
+        crashed=int(flags(judged, "crashed").sum()),
+        harmful=rate(harmful_count, judged.num_rows),
+        lost=counts[LOST],
+        longer=counts[LATE],
+        flown=flown.num_rows,
+        not_struck=chosen(flown, struck=False).num_rows,
+        latency_s=middle,
+        latency_s_p95=late,
+        latency_ticks=middle.value * TICKS_PER_S,
+        latency_ticks_p95=late.value * TICKS_PER_S,
+        detected_harmful=_share(chosen(harmful, struck=True), "seen"),
+        detected_active=_share(chosen(complete, struck=True), "seen"),
+        detected_inactive=_share(inactive, "seen"),
+        by_chance=_share(chosen(complete, struck=True), "by_chance"),
+        recovered=_share(chosen(harmful, harm=LOST), "won"),
+        undone=_share(harmful, "undone"),
+        added=_share(harmless, "undone", wanted=False),
+        unprotected=_share(judged, "faulty_won"),
+        protected=mixture(
+            [(harmful_count, _share(harmful, "won")), (counts[HARMLESS], _share(harmless, "won"))]
+        ),
+        success=_ends(complete, "faulty_won"),
+        worst=_worst(flown),
     )
-    protected = mixture(
-        [(harmful_count, _share(harmful, "won")), (harms[HARMLESS], _share(harmless, "won"))]
-    )
-    return {
-        "planned": bare.num_rows,
-        "not_injected": bare.num_rows - injected.num_rows,
-        "not_activated": injected.num_rows - active.num_rows,
-        "active": active.num_rows,
-        "crashed": int(flags(active, "crashed").sum()),
-        "harmful": asdict(rate(harmful_count, active.num_rows)),
-        **{harm: harms[harm] for harm in (LOST, LATE, OTHERWISE)},
-        "flown": flown.num_rows,
-        "not_struck": chosen(flown, struck=False).num_rows,
-        "latency_s": asdict(middle),
-        "latency_s_p95": asdict(late),
-        "latency_ticks": middle.value * TICKS_PER_S,
-        "latency_ticks_p95": late.value * TICKS_PER_S,
-        **{name: asdict(share) for name, share in {
-            "detected_harmful": _share(chosen(harmful, struck=True), "seen"),
-            "detected_active": _share(chosen(complete, struck=True), "seen"),
-            "detected_inactive": _share(
-                chosen(pairs, active=False, complete=True, struck=True), "seen"
-            ),
-            "by_chance": _share(chosen(complete, struck=True), "by_chance"),
-            "recovered": _share(chosen(harmful, harm=LOST), "won"),
-            "undone": _share(harmful, "undone"),
-            "added": _share(harmless, "undone", wanted=False),
-            "golden": _share(active, "golden_won"),
-            "unprotected": _share(active, "faulty_won"),
-        }.items()},
-        "protected": protected,
-        "success": asdict(_ends(complete, "faulty_won")),
-        "worst": _worst(flown),
-    }  # fmt: skip
-
-
-def _recoveries_compared(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
-    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
-    here, there = paired(chosen(first, active=True), second, KEY)
-    harm = here["harm"]
-
-    def test(among: pa.Array, column: str) -> McNemar:
-        return McNemar.of(*(flags(each.filter(among), column) for each in (here, there)))
-
-    lost, harmful = pc.equal(harm, LOST), pc.not_equal(harm, HARMLESS)
-    return test(lost, "won"), test(harmful, "undone")
 
 
 def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
@@ -424,19 +576,7 @@ def _ends(pairs: pa.Table, first: str) -> McNemar:
     return McNemar.of(flags(pairs, first), flags(pairs, "won"))
 
 
-def _worst(pairs: pa.Table) -> dict[str, Any]:
-    """The worst successful flight time and its recovery, as in the paper's section VII-A.
-
-    The paper flies one world with one seed. Here every mission has its own seed, so every
-    flight is compared with its own golden flight.
-
-    Returns:
-        `faulty`, `protected`: the largest flight time over golden flight time, minus 1.
-        `recovered`: how much lower the second is, in parts of the golden flight time. Resampled
-        missions never hold a worse case than the worst that was seen, so the interval says how much
-        it hangs on single flights, not how bad it can become. `recovered_share`: of the increase;
-        not a number where no flight was LONGER.
-    """
+def _worst(pairs: pa.Table) -> WorstFlight:
     # A failed flight has no flight time and is never the longest.
     faulty, protected = (
         np.nan_to_num(numbers(pairs, name), nan=-math.inf)
@@ -450,16 +590,17 @@ def _worst(pairs: pa.Table) -> dict[str, Any]:
     def recovered(rows: IntArray) -> FloatArray:
         """Reduction of the worst increase by protection, (k,), for resamples of missions (k, n)."""
         # A resample without a successful flight of a kind counts as having no longer flight.
-        worst = [np.maximum(each[rows].max(axis=-1), 0.0) for each in (faulty, protected)]
+        worst = [np.maximum(times[rows].max(axis=-1), 0.0) for times in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 
     worst = worst_case(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
-    return {
-        "faulty": worst["increase"],
-        "protected": worst["protected_worst"] - 1.0,
-        "recovered": asdict(interval_of_rows(len(faulty), recovered, resamples=RESAMPLES)),
-        "recovered_share": worst["recovered_share"] if worst["increase"] > LONGER else math.nan,
-    }
+    longer = 1.0 + worst["increase"] > LONGER
+    return WorstFlight(
+        faulty=worst["increase"],
+        protected=worst["protected_worst"] - 1.0,
+        recovered=interval_of_rows(len(faulty), recovered, resamples=RESAMPLES),
+        recovered_share=worst["recovered_share"] if longer else math.nan,
+    )
 
 
 def _interval(values: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Interval:

@@ -314,11 +314,7 @@ def _beside_golden(table: pa.Table) -> pa.Table:
     own = _places(partners(table, table, ("pair",), only=golden))
     bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))
     own_lost, own_time = (table[name].take(own) for name in ("lost", "flight_time_s"))
-    succeeds = pc.equal(own_lost, _NO)
-    ratio = pc.divide(table["flight_time_s"], own_time)
-    over_own = pc.if_else(pc.and_not(succeeds, table["lost"]), ratio, pa.scalar(None, ratio.type))
-    harmed = pc.or_(table["lost"], pc.fill_null(pc.greater(over_own, LONGER), _NO))
-    harmed = pc.if_else(succeeds, harmed, pa.scalar(None, pa.bool_()))
+    over_own, harmed = against_golden(own_lost, own_time, table["lost"], table["flight_time_s"])
     added = pc.multiply(own_time, pc.subtract(over_own, 1.0))
     table = _with_columns(
         table,
@@ -333,6 +329,23 @@ def _beside_golden(table: pa.Table) -> pa.Table:
 
 
 _NOTHING_FLOWN = _flown(pa.table({name: pa.nulls(0, kind) for name, kind in _COLUMNS.items()}))
+
+
+def against_golden(
+    own_lost: pa.ChunkedArray, own_time_s: pa.ChunkedArray, lost: pa.ChunkedArray,
+    time_s: pa.ChunkedArray,
+) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:  # fmt: skip
+    """Compare flights with their golden flights, which may be empty; all columns are (n,).
+
+    Returns:
+        Flight time over that of the golden flight, empty if one of the two is lost. Whether the
+        flight is harmed: lost, or longer than LONGER; empty unless the golden flight succeeds.
+    """
+    succeeds = pc.equal(own_lost, _NO)
+    ratio = pc.divide(time_s, own_time_s)
+    over_own = pc.if_else(pc.and_not(succeeds, lost), ratio, pa.scalar(None, ratio.type))
+    harmed = pc.or_(lost, pc.fill_null(pc.greater(over_own, LONGER), _NO))
+    return over_own, pc.if_else(succeeds, harmed, pa.scalar(None, pa.bool_()))
 
 
 # Pairing ------------------------------------------------------------------------------------------

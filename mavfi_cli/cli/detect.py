@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,6 +25,9 @@ from mavfi_cli.cli.parameters import (
     WORLD,
 )
 from mavfi_cli.core.terminal import echo
+
+if TYPE_CHECKING:
+    from mavfi_cli.studies.evaluate import EvaluationPlan
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -118,12 +122,13 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     plan = _plan(options)
     with missions_view(quiet=quiet) as view:
         evaluation, pairs = run(plan, out, Options(jobs=options["jobs"] or 0), view)
-    write_json(out / "evaluation.json", evaluation)
+    contents = plain(asdict(evaluation))
+    write_json(out / "evaluation.json", contents)
     write_text(out / "evaluation.csv", detector_csv(*pairs))
     for name, draw in PICTURES.items():
         write_figure(draw(evaluation), out / name)
     if as_json:
-        echo(json.dumps(plain(evaluation), indent=2, sort_keys=True))
+        echo(json.dumps(contents, indent=2, sort_keys=True))
     elif as_csv:
         echo(detector_csv(*pairs), nl=False)
     else:
@@ -131,7 +136,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
         echo("\n".join([*detector_lines(evaluation), "", f"Files  {out}: {files}"]))
 
 
-def _plan(options: dict[str, Any]) -> Any:
+def _plan(options: dict[str, Any]) -> EvaluationPlan:
     from mavfi_cli.spec.mission import MissionConfig
     from mavfi_cli.studies.evaluate import DETECTORS, WORLDS, EvaluationPlan
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,10 +20,12 @@ from mavfi_cli.analysis.detectors import (
     ERROR_FREE,
     FAULT,
     NONE,
+    EvaluatedPlan,
+    Evaluation,
     Scored,
-    found,
     harmful,
     pairs_of,
+    results,
 )
 from mavfi_cli.analysis.flights import errors, flown
 from mavfi_cli.analysis.scores import scored
@@ -43,7 +45,9 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies import fly
 
-SCHEMA = 1
+SCHEMA = (
+    2  # of evaluation.json; version 1 counted harm from 5 % on, and where the golden flight fails
+)
 BARE, PROTECTED = "bare", "protected"
 WORLDS = ("sparse", "dense", "factory", "farm")
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
@@ -58,6 +62,11 @@ _NODES = {
 }
 SOURCE, INSTRUCTION = "source", "instruction"
 _DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
+
+
+# Parts of a plan that its description has unchanged.
+_DESCRIBED = ("worlds", "protect", "level", "flights", "harmless_flights", "golden_flights",
+              "first_seed", "seed")  # fmt: skip
 
 
 class _Site(NamedTuple):
@@ -150,24 +159,22 @@ class EvaluationPlan:
                         path=path,
                     )
 
-    def told(self) -> dict[str, Any]:
-        """The plan, with descriptions of the detectors, as plain values."""
+    def described(self) -> EvaluatedPlan:
+        """The plan with thresholds and digests of the models."""
         stack = self.base.stack
-        return {
-            "worlds": list(self.worlds),
-            "detectors": {
-                each.name: {
-                    "threshold": each.built(stack).threshold,
-                    "model_sha256": each.model_digest(stack),
+        configs = [self.detector_config(name) for name in self.protectors]
+        return EvaluatedPlan(
+            detectors={
+                config.name: {
+                    "threshold": config.built(stack).threshold,
+                    "model_sha256": config.model_digest(stack),
                 }
-                for each in map(self.detector_config, self.protectors)
+                for config in configs
             },
-            "protect": list(self.protect),
-            "places": [place._asdict() for place in self.places()],
-            "mission": changes_of(self.base),
-            **{name: getattr(self, name) for name in ("level", "flights", "harmless_flights",
-                                                      "golden_flights", "first_seed", "seed")},
-        }  # fmt: skip
+            places=[place._asdict() for place in self.places()],
+            mission=changes_of(self.base),
+            **{name: getattr(self, name) for name in _DESCRIBED},
+        )
 
     def places(self) -> list[_Site]:
         """Stages by bit field at source level, nodes at instruction level."""
@@ -230,13 +237,13 @@ class EvaluationPlan:
 
 def evaluate(
     plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectator
-) -> tuple[dict[str, Any], tuple[pa.Table, pa.Table]]:
+) -> tuple[Evaluation, tuple[pa.Table, pa.Table]]:
     """Fly the missing missions of the folder, and evaluate the detectors.
 
     A larger plan of the same kind extends a smaller one.
 
     Returns:
-        The contents of `evaluation.json`, and its pairs: without faults, and with one.
+        The evaluation, and its pairs: without faults, and with one.
 
     Raises:
         UnknownName, VehicleProcessError: a world or platform that does not exist.
@@ -267,21 +274,22 @@ def evaluate(
     scores = scored(detectors, plan.base.stack, folder, pairs, spectator.on_note)
     spectator.on_note("counting")
     failed = [text for table in tables for text in errors(table, "{labels}: {reason}")]
-    return told(plan, pairs, failed, scores), pairs
+    return evaluation_of(plan, pairs, failed, scores), pairs
 
 
-def told(
+def evaluation_of(
     plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
-) -> dict[str, Any]:
-    """Results of these pairs, as plain values.
+) -> Evaluation:
+    """Results of these pairs.
 
     Args:
-        scored: see `analysis.detectors.found`.
+        scored: see `analysis.detectors.results`.
     """
-    return {
-        "schema": SCHEMA,
-        "plan": plan.told(),
-        "versions": installed_versions(),
-        "errors": list(errors),
-        **found((NONE, *plan.protectors), *pairs, scored),
-    }
+    of_pairs = results((NONE, *plan.protectors), *pairs, scored)
+    return Evaluation(
+        schema=SCHEMA,
+        plan=plan.described(),
+        versions=installed_versions(),
+        errors=[*errors],
+        **{part.name: getattr(of_pairs, part.name) for part in fields(of_pairs)},
+    )

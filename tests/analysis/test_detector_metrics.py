@@ -5,7 +5,6 @@ import math
 import pyarrow as pa
 import pytest
 from evaluation_flights import error_free, flown, pair, struck, table
-from plain_values import named
 
 from mavfi_cli.analysis import detectors as question
 from mavfi_cli.campaigns.missions import Injected
@@ -16,7 +15,7 @@ NO_SCORES = pa.table({"stage": [], "field": [], "score": []})
 def answers(error_free, faults, *detectors):
     """What is found of pairs whose flights have no score."""
     free, struck = table(error_free), table(faults)
-    return named(question.found(detectors, free, struck, lambda _: (NO_SCORES, [])))
+    return question.results(detectors, free, struck, lambda _: (NO_SCORES, []))
 
 
 def row(rows):
@@ -100,7 +99,7 @@ def test_faults_without_effect_are_counted_apart(found):
 
 def test_harm(found):
     assert (found.harmful.count, found.harmful.total) == (3, 5)
-    assert (found.lost, found.longer, found.otherwise) == (2, 1, 0)
+    assert (found.lost, found.longer) == (2, 1)
 
 
 def test_detection(found):
@@ -116,7 +115,7 @@ def test_recovery(found):
     assert (found.undone.count, found.undone.total) == (1, 3)
     assert (found.added.count, found.added.total) == (1, 2)
     assert (found.unprotected.count, found.unprotected.total) == (3, 5)
-    assert found.protected.share == pytest.approx(3 / 5)
+    assert found.protected["share"] == pytest.approx(3 / 5)
     assert (found.success.only_first, found.success.only_second) == (1, 1)
 
 
@@ -145,8 +144,17 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
     assert found.harmful.total == 5
     assert (found.detected_active.count, found.detected_active.total) == (0, 2)
     assert (found.detected_harmful.count, found.detected_harmful.total) == (1, 1)
-    assert found.protected.share == pytest.approx(4 / 5 * 1 / 2 + 1 / 5)
+    assert found.protected["share"] == pytest.approx(4 / 5 * 1 / 2 + 1 / 5)
     assert found.success.pairs == 2  # of the complete missions
+
+
+def test_a_mission_that_fails_without_the_fault_cannot_be_harmed():
+    doomed = [pair(LOST, golden=flown("timeout"), seed=1)]
+    protected = [pair(LOST, struck(), golden=flown("timeout"), seed=1)]
+    found = fault_metrics([pair(LOST), *doomed], [pair(LOST, struck()), *protected])
+    assert (found.planned, found.golden_failed, found.active) == (2, 1, 1)
+    assert (found.harmful.count, found.harmful.total, found.recovered.total) == (1, 1, 1)
+    assert found.success.pairs == 1
 
 
 def test_without_an_active_fault_nothing_is_known():
@@ -155,7 +163,7 @@ def test_without_an_active_fault_nothing_is_known():
     assert math.isnan(nothing.harmful.share)
     assert math.isnan(nothing.latency_s.value)
     assert math.isnan(nothing.worst.recovered_share)
-    assert math.isnan(nothing.protected.share)
+    assert math.isnan(nothing.protected["share"])
 
 
 def test_two_detectors_on_the_same_faults():
@@ -165,5 +173,5 @@ def test_two_detectors_on_the_same_faults():
     second.append(pair(LONGER, struck(), seed=9, detector="aad"))
     (compared,) = answers([], [*first, *second], "gad", "aad").comparisons
     kinds = ("both", "only_first", "only_second", "neither")
-    assert [compared.recovered[kind] for kind in kinds] == [0, 2, 0, 0]
-    assert [compared.undone[kind] for kind in kinds] == [0, 2, 1, 0]
+    assert [getattr(compared.recovered, kind) for kind in kinds] == [0, 2, 0, 0]
+    assert [getattr(compared.undone, kind) for kind in kinds] == [0, 2, 1, 0]

@@ -17,17 +17,16 @@ FAULT = {
 @pytest.mark.parametrize(
     ("golden", "treated", "harm"),
     [
-        (flown(), struck(time_s=104.9), "none"),
-        (flown(), struck(time_s=105.1), "longer"),
+        (flown(), struck(time_s=109.9), "none"),
+        (flown(), struck(time_s=110.1), "longer"),
         (flown(), struck(time_s=90.0), "none"),
         (flown(), struck("collision", 10.0), "lost"),
         (flown(), struck("crash", None), "lost"),
-        (flown("collision"), struck("timeout", 300.0), "otherwise"),
-        (flown("collision"), struck("collision", 300.0), "none"),
-        (flown("collision"), struck(), "none"),  # a fault that saved the mission
+        (flown("collision"), struck("timeout", 300.0), ""),  # nothing can harm this mission
+        (flown("collision"), struck(), ""),
     ],
 )
-def test_harm_is_a_lost_mission_or_more_than_five_per_cent(golden, treated, harm):
+def test_harm_is_a_lost_mission_or_more_than_ten_per_cent(golden, treated, harm):
     assert pair(treated, golden=golden)["harm"] == harm
 
 

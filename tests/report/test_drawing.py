@@ -1,6 +1,7 @@
 """What pictures share: one colour a detector, a scheme, a platform; and only SVG."""
 
 from itertools import combinations
+from types import SimpleNamespace as Namespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mavfi_cli.report.drawing import (
     detector_colours,
     write_figure,
 )
+from mavfi_cli.stats.shares import Share
 from mavfi_cli.vpm.model import SCHEMES, ModelVehicle
 from mavfi_cli.vpm.report import Choices, report
 
@@ -38,11 +40,11 @@ def test_a_detector_of_another_package_takes_none_of_these():
 
 def undone(detector, by, value, total, active, protected):
     share = 0.5 if total else np.nan
-    return {
-        "detector": detector, "by": by, "value": value, "active": active,
-        "undone": {"share": share, "low": 0.2, "high": 0.8, "total": total},
-        "worst": {"protected": protected},
-    }  # fmt: skip
+    return Namespace(
+        detector=detector, by=by, value=value, active=active,
+        undone=Share(share=share, low=0.2, high=0.8, count=0, total=total),
+        worst=Namespace(protected=protected),
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def evaluated():
             undone(detector, "world", "sparse", 4, 0, np.nan),
             undone(detector, "world", "dense", 4, 9, np.nan if detector == "gad" else 1.3),
         ]
-    return {"faults": rows}
+    return Namespace(faults=rows)
 
 
 def test_a_detector_looks_the_same_in_every_picture(evaluated):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import asdict
 
 import pyarrow as pa
 import pytest
@@ -15,7 +16,7 @@ from mavfi_cli.report.detectors import (
     detector_lines,
 )
 from mavfi_cli.report.drawing import write_figure
-from mavfi_cli.studies.evaluate import EvaluationPlan, told
+from mavfi_cli.studies.evaluate import EvaluationPlan, evaluation_of
 
 # The thresholds of the plan are not used: scores are given.
 PLAN = EvaluationPlan(worlds=("dense", "farm"), detectors=("gad",), flights=2, golden_flights=2)
@@ -39,41 +40,46 @@ def pairs():
 @pytest.fixture(scope="module")
 def evaluation(pairs):
     harmful = {"stage": ["control"] * 2, "field": ["exponent"] * 2, "score": [2.0] * 2}
-    return told(PLAN, pairs, ["one could not"], lambda _: (pa.table(harmful), [0.5, 0.5, 0.5, 1.5]))
+    return evaluation_of(
+        PLAN, pairs, ["one could not"], lambda _: (pa.table(harmful), [0.5, 0.5, 0.5, 1.5])
+    )
 
 
-def row(evaluation, by, value, detector, part="faults"):
-    (found,) = [
-        each
-        for each in evaluation[part]
-        if (each["by"], each["value"], each["detector"]) == (by, value, detector)
-    ]
+def row(rows, by, value, detector):
+    (found,) = [row for row in rows if (row.by, row.value, row.detector) == (by, value, detector)]
+    return found
+
+
+def everything(rows, detector):
+    """The row over all flights, of plain values."""
+    (found,) = [row for row in rows if (row["by"], row["detector"]) == ("all", detector)]
     return found
 
 
 def test_groups(evaluation):
-    everything = row(evaluation, "all", "all", "gad")
-    assert (everything["planned"], everything["recovered"]["count"]) == (4, 1)
-    assert row(evaluation, "world", "dense", "gad")["recovered"]["share"] == 1.0
-    assert row(evaluation, "world", "farm", "gad")["recovered"]["share"] == 0.0
-    assert row(evaluation, "state", "command_vx", "gad")["harmful"]["count"] == 2
-    assert row(evaluation, "field", "exponent", "none")["detected_harmful"]["count"] == 0
-    assert row(evaluation, "all", "all", "gad", "error_free")["flights"] == 4
+    faults = evaluation.faults
+    whole = row(faults, "all", "all", "gad")
+    assert (whole.planned, whole.recovered.count) == (4, 1)
+    assert row(faults, "world", "dense", "gad").recovered.share == 1.0
+    assert row(faults, "world", "farm", "gad").recovered.share == 0.0
+    assert row(faults, "state", "command_vx", "gad").harmful.count == 2
+    assert row(faults, "field", "exponent", "none").detected_harmful.count == 0
+    assert row(evaluation.error_free, "all", "all", "gad").flights == 4
 
 
 def test_curves_and_their_parts(evaluation):
-    found = evaluation["curves"]["gad"]
-    assert (found["area"], found["positives"], found["negatives"]) == (1.0, 2, 4)
-    assert found["operating_point"] == (0.25, 1.0)
-    assert [(part["by"], part["value"]) for part in found["areas"]] == [
+    found = evaluation.curves["gad"]
+    assert (found.area, found.positives, found.negatives) == (1.0, 2, 4)
+    assert found.operating_point == (0.25, 1.0)
+    assert [(part["by"], part["value"]) for part in found.areas] == [
         ("stage", "control"), ("field", "exponent"),
     ]  # fmt: skip
 
 
 def test_the_detector_is_compared_with_none(evaluation):
-    (compared,) = evaluation["comparisons"]
-    assert (compared["first"], compared["second"]) == ("none", "gad")
-    assert compared["recovered"]["only_second"] == 1
+    (compared,) = evaluation.comparisons
+    assert (compared.first, compared.second) == ("none", "gad")
+    assert compared.recovered.only_second == 1
 
 
 def test_the_table_fits_and_tells_the_numbers(evaluation):
@@ -86,9 +92,9 @@ def test_the_table_fits_and_tells_the_numbers(evaluation):
 
 
 def test_files(evaluation, pairs, tmp_path):
-    write_json(tmp_path / "evaluation.json", evaluation)
+    write_json(tmp_path / "evaluation.json", asdict(evaluation))
     read = json.loads((tmp_path / "evaluation.json").read_text())
-    assert row(read, "all", "all", "gad")["recovered"]["count"] == 1
+    assert everything(read["faults"], "gad")["recovered"]["count"] == 1
     rows = list(csv.DictReader(detector_csv(*pairs).splitlines()))
     assert len(rows) == 16
     saved = [each for each in rows if each["harm"] == "lost" and each["remaining_harm"] == "none"]
@@ -117,7 +123,7 @@ def test_pictures_show_the_numbers(evaluation, tmp_path):
 def test_an_evaluation_without_harm_has_no_curve():
     free = [error_free(detector=detector) for detector in ("none", "gad")]
     none = pa.table({"stage": [], "field": [], "score": []})
-    empty = told(PLAN, (table(free), table([])), [], lambda _: (none, [0.5]))
+    empty = evaluation_of(PLAN, (table(free), table([])), [], lambda _: (none, [0.5]))
     assert "Faults" not in "\n".join(detector_lines(empty))
     assert not PICTURES["roc.svg"](empty).axes[0].lines[:-1]
     assert flown()["succeeded"]
@@ -139,10 +145,10 @@ def test_real_flights_end_to_end(mavfi, tmp_path):
     first = mavfi(*line, "--detector", "range")
     assert first.returncode == 0, first.stderr
     found = json.loads(first.stdout)
-    everything = row(found, "all", "all", "range")
-    assert everything["planned"] == 11
-    assert everything["active"] + everything["not_activated"] + everything["not_injected"] == 11
-    assert row(found, "all", "all", "range", "error_free")["flights"] == 2
+    faults = everything(found["faults"], "range")
+    parts = ("active", "golden_failed", "not_activated", "not_injected")
+    assert faults["planned"] == sum(faults[part] for part in parts) == 11
+    assert everything(found["error_free"], "range")["flights"] == 2
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "bare", "evaluation.csv", "evaluation.json", "protected", "recovery.svg", "roc.svg",
         "scores.json",
