@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+from mavfi_cli.analysis.pairs import LONGER
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
@@ -23,7 +24,6 @@ from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import wilson
 
 FIRST_SEED = 600_000
-LONGER = 1.05
 
 
 def main() -> None:
