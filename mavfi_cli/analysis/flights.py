@@ -233,8 +233,9 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
         `name` of the campaign, `planned`: missions on its list, `versions` of the programs, and of
         the `host` of the first record `machine`, `cores` and `started`.
     """
-    if isinstance(source, pa.Table):
-        return stored_provenance(source)
+    table = source if isinstance(source, pa.Table) else source.export
+    if table is not None:
+        return stored_provenance(table)
     first = next(source.results(), None)
     record = record_of({} if first is None else first.result)
     return {

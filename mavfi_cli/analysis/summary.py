@@ -60,6 +60,11 @@ class SettingSummary:
     every: Share
     metrics: Mapping[str, Interval]
 
+    @property
+    def faulty(self) -> bool:
+        """Whether any of its flown missions has a fault."""
+        return any(kind != Injected.GOLDEN.value for kind in self.injected)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:

@@ -468,6 +468,7 @@ EXPORT = ".parquet"
 METADATA = b"mavfi"  # key of an export's provenance
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _LABEL = "label_"
+_ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # what an export without the column means
 
 
 def is_export(path: Path) -> bool:
@@ -479,14 +480,21 @@ def stored_export(path: Path) -> pa.Table:
     """Read an export.
 
     Raises:
-        RecordError: the file is missing or damaged, or has other columns.
+        RecordError: the file is missing or damaged, has other columns, or has a mission twice.
     """
+    import pyarrow.compute as pc
+
     if not path.is_file():
         raise RecordError(f"{path}: no such file")
     table = read_parquet(path, "export of a campaign")
     for name in _NEEDED:
         if name not in table.column_names:
             raise _no_export(path, f"it has no column {name!r}")
+    counts = pc.value_counts(table["number"]).to_pylist()
+    twice = next((entry["values"] for entry in counts if entry["counts"] > 1), None)
+    if twice is not None:
+        problem = f"it has mission {twice} twice; exports of two campaigns are two files"
+        raise _no_export(path, problem)
     try:
         stored_provenance(table)
     except (TypeError, ValueError):
@@ -526,7 +534,8 @@ class ExportedLedger(Ledger):
                 raise _no_export(path, error) from None
             missions.append((row["number"], cell, row["pair"], row["changes"]))
         name = str(origin.get("name") or path.stem)
-        self.fill(name, cells, missions, rows)
+        known = ({key: value for key, value in row.items() if value is not None} for row in rows)
+        self.fill(name, cells, missions, (_ABSENT | row for row in known))
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
         """An export has no records of flights.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,6 @@ def _repeat_run(
     path: Path, out: Path, *, with_fault: bool, firmware: str | None, gdb: bool
 ) -> _Comparison:
     from mavfi_cli.core.files import file_digest
-    from mavfi_cli.core.installed import installed_versions, version_differences
     from mavfi_cli.mission.run import fly_again
     from mavfi_cli.mission.run_folder import load_run
     from mavfi_cli.report.summary import difference_lines, outcome_line
@@ -121,8 +121,7 @@ def _repeat_run(
     run = load_run(path)
     if gdb and not (with_fault and run.record.config.get("instruction")):
         raise click.UsageError("--gdb needs an instruction-level fault to stop at")
-    for text in version_differences(run.record.versions, installed_versions()):
-        note(f"warning: another build: {text}")
+    _warn_of_builds(run.record.versions)
     flown: Any = {"with_fault": with_fault, "firmware": firmware}
     config = run.mission(**flown)
     what = "again" if with_fault else "without its fault"
@@ -155,13 +154,16 @@ def _repeat_run(
 def _repeat_mission(
     campaign: Path, number: int, out: Path, *, with_fault: bool, firmware: str | None
 ) -> _Comparison:
-    from mavfi_cli.analysis.flights import differing, mission_of
+    from mavfi_cli.analysis.flights import differing, mission_of, provenance
     from mavfi_cli.campaigns.begin import opened
+    from mavfi_cli.core.files import reading
     from mavfi_cli.mission.run import fly_to_end
     from mavfi_cli.report.summary import outcome_line
 
     with opened(campaign) as ledger:
         config, row = mission_of(ledger, number)
+        with reading(campaign):
+            _warn_of_builds(provenance(ledger).get("versions", {}))
     config.require_firmware(firmware)
     config = config if with_fault else config.golden
     note(f"flying mission {number}: {config.world}, seed {config.seed}")
@@ -178,6 +180,14 @@ def _repeat_mission(
     same = "identical in every measure"
     told = f"DIFFERENT in {', '.join(changed)}" if changed else same
     return comparison, [outcome_line(again.result), told, f"Run folder  {again.folder.path}"]
+
+
+def _warn_of_builds(versions: Mapping[str, str]) -> None:
+    """Name the programs that are others than those of a record; {} if it does not say."""
+    from mavfi_cli.core.installed import installed_versions, version_differences
+
+    for text in version_differences(versions, installed_versions()) if versions else ():
+        note(f"warning: another build: {text}")
 
 
 def _say_where(pid: int) -> None:

@@ -138,6 +138,8 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
         "",
         *settings.lines(["mean time", "mean distance", "mean energy", "mean replans"], means),
     ]
+    if not summary.faults and any(setting.faulty for setting in summary.cells):
+        lines += ["", "nothing to compare: no golden flight of a mission with a fault is there"]
     for title, comparisons in (
         ("against the golden flights of the same missions:", summary.faults),
         ("against the same faults without protection:", summary.protection),

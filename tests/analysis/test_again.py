@@ -12,6 +12,7 @@ import pytest
 from mavfi_cli import library
 from mavfi_cli.analysis.flights import mission_of, read_export
 from mavfi_cli.campaigns.begin import opened
+from mavfi_cli.campaigns.ledger import METADATA
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -57,6 +58,16 @@ def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
 def test_without_the_fault_it_is_the_golden_one(folder, export):
     assert mission(folder, 1)[0].golden == mission(export, 0)[0]
     assert mission(export, 1)[0].fault == FAULT
+
+
+def test_a_mission_that_another_build_flew_is_repeated_with_a_warning(export, mavfi, tmp_path):
+    path, table = tmp_path / "old.parquet", pq.read_table(export)
+    origin = json.loads(table.schema.metadata[METADATA])
+    origin["versions"]["numpy"] = "0.1"
+    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(origin)}), path)
+    done = mavfi("replay", str(path), "--mission", "0", "--out", str(tmp_path))
+    assert done.returncode == 0
+    assert "warning: another build: numpy was 0.1, is " in done.stderr
 
 
 def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):

@@ -1,9 +1,11 @@
 """Which flights of a campaign are drawn together, and under which names."""
 
+import pyarrow.parquet as pq
 import pytest
 
+from mavfi_cli.analysis.flights import exported
 from mavfi_cli.analysis.trajectories import pair
-from mavfi_cli.campaigns.begin import chosen
+from mavfi_cli.campaigns.begin import chosen, opened
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
@@ -51,6 +53,16 @@ def test_a_panel_for_each_fault_with_golden_faulty_and_protected(book):
     assert (faulty.outcome, faulty.flight_time_s) == ("success", 25.0)
     assert faulty.path == book.ledger.folder.absolute() / "runs/000002-dense-1"
     assert drawn.absent == []
+
+
+def test_an_export_has_the_picture_of_its_campaign(book, tmp_path):
+    fly(book, 1, (20.0,) * 5)
+    fly(book, 2, (20.0, 20.0, 24.0, 20.0, 20.0))
+    path = tmp_path / "mine.parquet"
+    pq.write_table(exported(book.ledger), path)
+    with opened(path) as ledger:
+        assert pair(ledger) == pair(book.ledger)
+        assert pair(ledger, 1) == pair(book.ledger, 1) != pair(ledger)
 
 
 def drawn_by_default(book):

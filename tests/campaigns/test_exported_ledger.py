@@ -5,6 +5,7 @@ from collections import Counter
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -90,6 +91,41 @@ def test_a_table_of_other_contents_is_refused_in_one_line(tmp_path, columns):
     pq.write_table(whole, path)
     with pytest.raises(RecordError, match="strange"), opened(path):
         pass
+
+
+def test_exports_of_two_campaigns_in_one_file_are_refused(tmp_path):
+    first = pq.read_table(EXPORT).slice(0, 2)
+    second = first.append_column("label_later", pa.array(["a", "b"]))  # of a later version
+    path = tmp_path / "both.parquet"
+    pq.write_table(pa.concat_tables([first, second], promote_options="default"), path)
+    said = "has mission 0 twice; exports of two campaigns are two"
+    with pytest.raises(RecordError, match=said), opened(path):
+        pass
+
+
+def test_columns_that_an_earlier_version_lacked_are_not_needed(tmp_path):
+    whole, path = pq.read_table(EXPORT), tmp_path / "earlier.parquet"
+    pq.write_table(whole.drop_columns(["reason", "wall_s", "attempts", "replans"]), path)
+    with opened(path) as ledger, opened(EXPORT) as today:
+        (old,), (new,) = (groups(each, ["site"])[:1] for each in (ledger, today))
+    assert old.flights["outcome"].equals(new.flights["outcome"])
+    assert old.flights["replans"].null_count == old.flights.num_rows
+
+
+@pytest.mark.parametrize("change", ["no golden flights", "other pairs"])
+def test_an_export_without_pairs_is_reported_with_a_note(mavfi, tmp_path, change):
+    table, path = pq.read_table(EXPORT), tmp_path / "alone.parquet"
+    if change == "other pairs":
+        pairs = pa.array([f"{number}" for number in range(table.num_rows)])
+        table = table.set_column(table.column_names.index("pair"), "pair", pairs)
+    else:
+        table = table.filter(pc.is_valid(table["level"]))
+    pq.write_table(table, path)
+    run = mavfi("campaign", "status", path, "--full")
+    assert run.returncode == 0, run.stderr
+    assert "nothing to compare: no golden flight of a mission with a fault is there" in run.stdout
+    assert json.loads(mavfi("campaign", "status", path, "--json").stdout)["faults"] == []
+    assert "nothing to compare" not in mavfi("campaign", "status", EXPORT, "--full").stdout
 
 
 @pytest.mark.parametrize("metadata", ["{", "[1]", "3"])
