@@ -1,7 +1,7 @@
 """From kernel to mission, where a bit hurts, failures an hour, and the arms of a campaign."""
 
 import pytest
-from flown import flights, row
+from made_flights import flights, row
 
 from mavfi_cli.paper.beyond import arms, hourly_failures, kernel_flows, state_map
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from flown import flights, row
+from made_flights import flights, row
 
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import WORLDS, Fate, Flights

@@ -1,7 +1,7 @@
 """Lost, harmful and recovered missions, counted by hand."""
 
 import pytest
-from flown import flights, row
+from made_flights import flights, row
 
 from mavfi_cli.paper.claims import MEASURES
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from flown import table
+from made_flights import export_table
 
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import canonical, changes_of
@@ -48,7 +48,7 @@ def export(seed, folder=None):
              "fault_bits": 1, "fault_seed": 1, "changes": canonical(changes),
              "path": None if folder is None else str(folder)}
         )  # fmt: skip
-    return table(rows)
+    return export_table(rows)
 
 
 def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from flown import row, table
+from made_flights import export_table, row
 
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Fate, Flights
@@ -14,7 +14,7 @@ from mavfi_cli.paper.verdicts import Verdict
 
 def evidence(rows, name="mine", problems=()):
     path = Path(f"{name}.parquet")
-    flights = Flights.of(table(rows))
+    flights = Flights.of(export_table(rows))
     source = CampaignSource(path=path, name=name, spec=None, planned=None, flights=flights)
     return Evidence(campaigns=[source], kernels=[], problems=problems)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from flown import row, table
+from made_flights import export_table, row
 
 from mavfi_cli.analysis.flights import exported
 from mavfi_cli.campaigns.ledger import Ledger
@@ -50,7 +50,7 @@ def export(tmp_path):
     def make(name, *rows):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table(rows), path)
+        pq.write_table(export_table(rows), path)
         return path
 
     return make
@@ -128,8 +128,8 @@ def test_what_cannot_be_read_is_told_and_the_rest_is_used(tmp_path, campaign):
     (tmp_path / "torn").mkdir()
     (tmp_path / "torn" / "ledger.sqlite").write_bytes(b"SQLite format 3\0 and no more")
     (tmp_path / "other.parquet").write_bytes(b"PAR1")
-    pq.write_table(table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
-    pq.write_table(table([row() | {"changes": "no json"}]), tmp_path / "odd.parquet")
+    pq.write_table(export_table([row()]).select(["number", "world"]), tmp_path / "foreign.parquet")
+    pq.write_table(export_table([row() | {"changes": "no json"}]), tmp_path / "odd.parquet")
     (tmp_path / "kernels.json").write_text("[]")
     found = Evidence.gather([tmp_path])
     assert len(found.campaigns) == 1
