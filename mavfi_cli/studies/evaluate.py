@@ -172,7 +172,7 @@ class EvaluationPlan:
                 for config in configs
             },
             places=[place._asdict() for place in self.places()],
-            mission=changes_of(self.base),
+            mission=dict(changes_of(self.base)),
             **{name: getattr(self, name) for name in _DESCRIBED},
         )
 
