@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import (
+    IntArray,
     changed,
     chosen,
     flags,
@@ -29,13 +30,14 @@ from mavfi_cli.analysis.flights import (
     known,
     numbers,
 )
-from mavfi_cli.analysis.pairs import paired
+from mavfi_cli.analysis.pairs import against_golden, paired
 from mavfi_cli.analysis.summary import RESAMPLES
+from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, sign_flips, worst_case
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import Interval, Share, rate
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
@@ -67,7 +69,7 @@ SCHEMA = pa.schema(
     {
         "platform": pa.string(), "setting": pa.string(), "target": pa.string(), "seed": pa.int64(),
         "fault_seed": pa.int64(), "outcome": pa.string(), "counted": pa.bool_(),
-        **{each.name: pa.float64() for each in QUANTITIES},
+        **{quantity.name: pa.float64() for quantity in QUANTITIES},
     }
 )  # fmt: skip
 
@@ -83,13 +85,221 @@ def compared(flights: pa.Table) -> pa.Table:
     return table.select(SCHEMA.names).cast(SCHEMA)
 
 
-def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table) -> dict[str, Any]:
-    """All numbers of the flights, as plain values.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlatformSummary:
+    """A platform of a comparison; `platform` is its name or file, `title` its name in tables."""
+
+    platform: str
+    title: str
+    description: str
+    cores: int
+    power_w: float
+    kernel_latency_s: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedPlan:
+    """What a comparison flew."""
+
+    platforms: tuple[PlatformSummary, ...]
+    world: str
+    inject: tuple[str, ...]
+    detectors: tuple[str, ...]
+    missions: int
+    first_seed: int
+    seed: int
+    field: str | None
+    stack: str
+    settings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredQuantity:
+    """A quantity of the flights of a setting."""
+
+    unit: str
+    median: Interval
+    mean: Interval
+    largest: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingRow:
+    """The flights of a setting on a platform."""
+
+    platform: str
+    setting: str
+    flown: int
+    counted: int
+    outcomes: dict[str, int]
+    success: Share
+    quantities: dict[str, MeasuredQuantity]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangedQuantity(Interval):
+    """A quantity on two platforms: mean `ratio` with its interval, or `difference`."""
+
+    kind: str
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RatioRow:
+    """A platform over the reference platform, mission by mission."""
+
+    platform: str
+    setting: str
+    reference: str
+    pairs: int
+    both_succeed: int
+    success: McNemar
+    success_difference: float
+    quantities: dict[str, ChangedQuantity]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostInSeconds:
+    """Flight time beyond that of the golden flight; several faults of a mission count as one."""
+
+    mean: Interval
+    largest: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostRatio:
+    """Flight time over that of the golden flight.
+
+    Attributes:
+        recovered_share: the part of the largest increase without detector that is gone; NaN if
+            there is none.
+    """
+
+    p95: Interval
+    largest: float
+    recovered_share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorstFault:
+    """The fault of a flight."""
+
+    seed: int
+    target: str
+    fault_seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostRow:
+    """The cost of the faults of a setting on a platform.
+
+    Attributes:
+        pairs: faulty flights that reached the goal as their golden flights did.
+        lost: flights that failed where the golden one reached the goal.
+        worst_flight: the one with the largest ratio; the lowest seed of equal ones.
+    """
+
+    platform: str
+    setting: str
+    pairs: int
+    lost: int
+    cost_s: CostInSeconds
+    over_own: CostRatio
+    worst_flight: WorstFault | None
+
+    @property
+    def compared(self) -> int:
+        """Faulty flights whose golden flights reached the goal."""
+        return self.pairs + self.lost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostDifference:
+    """The additional cost of the same faults compared with the reference platform.
+
+    Attributes:
+        pairs: faults that both platforms have a cost of.
+        differ: how many of them have another cost.
+        extra_s: mean difference of costs, and `p_value` of it, by missions.
+        p95_ratio: of the 95th percentiles over own golden.
+        largest_ratio: of the largest over own golden, of all flights of each platform.
+        longest_ratio: of the longest in seconds, of all flights of each platform.
+    """
+
+    platform: str
+    setting: str
+    reference: str
+    pairs: int
+    differ: int
+    extra_s: Interval
+    p_value: float
+    p95_ratio: Interval
+    largest_ratio: float
+    longest_ratio: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LongestFlight:
+    """The longest successful flight of a setting, and its ratio to the mean golden one.
+
+    Attributes:
+        over_mean_recovered_share: NaN if the longest flight with faults is no longer than the
+            longest golden one.
+    """
+
+    platform: str
+    setting: str
+    flights: int
+    golden_mean_s: float
+    worst_s: float
+    over_mean_ratio: float
+    over_mean_recovered_share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlatformFigures:
+    """All numbers of the flights.
 
     `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
-    `cost_differences` have one row per setting and platform other than the first. `flights` has
-    one row per flight. Shares, increases and ratios have no unit; all other names end in the unit
-    or have it in a key of its own.
+    `cost_differences` have one row per setting and platform other than the first. Shares, increases
+    and ratios have no unit; all other names end in the unit or have it in a field of its own.
+
+    Attributes:
+        flights: one row per flight, with the columns of SCHEMA.
+    """
+
+    confidence: float = CONFIDENCE
+    settings: list[SettingRow]
+    ratios: list[RatioRow]
+    costs: list[CostRow]
+    cost_differences: list[CostDifference]
+    worst: list[LongestFlight]
+    flights: list[dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedTimelines:
+    """Timelines of one mission on all platforms that answered."""
+
+    seed: int
+    platforms: list[Timeline]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison(PlatformFigures):
+    """The contents of `compare.json`."""
+
+    schema: int
+    plan: ComparedPlan
+    versions: dict[str, str]
+    errors: list[str]
+    timeline: ComparedTimelines
+
+
+def figures(
+    platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
+) -> PlatformFigures:
+    """Compute all numbers of the flights.
 
     Args:
         flights: with the columns of SCHEMA.
@@ -103,91 +313,86 @@ def figures(platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
     }
     counted = {place: chosen(table, counted=True) for place, table in every.items()}
     won = {place: chosen(table, succeeded=True) for place, table in counted.items()}
-    found = {
+    costs = {
         (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
         for platform, setting in itertools.product(platforms, faulty)
     }
-
-    def at(platform: str, setting: str) -> dict[str, Any]:
-        return {"platform": platform, "setting": setting}
-
-    return {
-        "confidence": CONFIDENCE,
-        "settings": [
-            {**at(p, s), **_setting(every[p, s], counted[p, s])}
+    return PlatformFigures(
+        settings=[
+            _setting(p, s, every[p, s].num_rows, counted[p, s])
             for s, p in itertools.product(settings, platforms)
         ],
-        "ratios": [
-            {**at(p, s), "reference": first, **_ratio(counted[first, s], counted[p, s])}
+        ratios=[
+            _ratio(p, s, first, counted[first, s], counted[p, s])
             for p, s in itertools.product(others, settings)
         ],
-        "costs": [
-            {**at(p, s), **found[p, s].row(found[p, NONE], protected=s != NONE)}
-            for p, s in itertools.product(platforms, faulty)
+        costs=[
+            costs[p, s].row(p, s, costs[p, NONE]) for p, s in itertools.product(platforms, faulty)
         ],
-        "cost_differences": [
-            {**at(p, s), "reference": first, **found[p, s].extra(found[first, s])}
+        cost_differences=[
+            costs[p, s].beyond(costs[first, s], p, s, first)
             for p, s in itertools.product(others, faulty)
         ],
-        "worst": [
-            {**at(p, s), **_worst_row(won[p, GOLDEN], won[p, NONE], won[p, s],
-                                      protected=s not in (GOLDEN, NONE))}
+        worst=[
+            _longest(p, s, won[p, GOLDEN], won[p, NONE], won[p, s])
             for p, s in itertools.product(platforms, settings)
         ],
-        "flights": flights.to_pylist(),
-    }  # fmt: skip
+        flights=flights.to_pylist(),
+    )
 
 
-# One platform and setting ---------------------------------------------------------------------
-
-
-def _setting(every: pa.Table, counted: pa.Table) -> dict[str, Any]:
+def _setting(platform: str, setting: str, flown: int, counted: pa.Table) -> SettingRow:
     ends = pc.value_counts(counted["outcome"]).to_pylist()
-    return {
-        "flown": every.num_rows,
-        "counted": counted.num_rows,
-        "outcomes": dict(sorted((each["values"], each["counts"]) for each in ends)),
-        "success": asdict(rate(int(flags(counted, "succeeded").sum()), counted.num_rows)),
-        "quantities": {each.name: _measured(each, counted) for each in QUANTITIES},
-    }
+    return SettingRow(
+        platform=platform,
+        setting=setting,
+        flown=flown,
+        counted=counted.num_rows,
+        outcomes=dict(sorted((end["values"], end["counts"]) for end in ends)),
+        success=rate(int(flags(counted, "succeeded").sum()), counted.num_rows),
+        quantities={own.name: _measured(own, counted) for own in QUANTITIES},
+    )
 
 
-def _measured(quantity: _Quantity, counted: pa.Table) -> dict[str, Any]:
-    chosen_ones = counted if quantity.any_end else chosen(counted, succeeded=True)
-    values = known(numbers(chosen_ones, quantity.name))
-    return {
-        "unit": quantity.unit,
-        "median": asdict(interval(values, median, resamples=RESAMPLES)),
-        "mean": asdict(interval(values, resamples=RESAMPLES)),
-        "largest": max(values.tolist(), default=math.nan),
-    }
+def _measured(quantity: _Quantity, counted: pa.Table) -> MeasuredQuantity:
+    flights = counted if quantity.any_end else chosen(counted, succeeded=True)
+    values = known(numbers(flights, quantity.name))
+    return MeasuredQuantity(
+        unit=quantity.unit,
+        median=interval(values, median, resamples=RESAMPLES),
+        mean=interval(values, resamples=RESAMPLES),
+        largest=max(values.tolist(), default=math.nan),
+    )
 
 
-# Two platforms --------------------------------------------------------------------------------
-
-
-def _ratio(first: pa.Table, second: pa.Table) -> dict[str, Any]:
+def _ratio(
+    platform: str, setting: str, reference: str, first: pa.Table, second: pa.Table
+) -> RatioRow:
     pairs = paired(second, first, MISSION)[::-1]
-    test = McNemar.of(*(flags(each, "succeeded") for each in pairs))
-    return {
-        "pairs": test.pairs,
-        "both_succeed": test.both,
-        "success": {**asdict(test), "difference": test.difference},
-        "quantities": {each.name: _changed(each, *pairs) for each in QUANTITIES},
-    }
+    test = McNemar.of(*(flags(table, "succeeded") for table in pairs))
+    return RatioRow(
+        platform=platform,
+        setting=setting,
+        reference=reference,
+        pairs=test.pairs,
+        both_succeed=test.both,
+        success=test,
+        success_difference=test.difference,
+        quantities={quantity.name: _changed(quantity, *pairs) for quantity in QUANTITIES},
+    )
 
 
-def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> dict[str, Any]:
+def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQuantity:
     """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
     if not quantity.any_end:
         both = pa.array(flags(first, "succeeded") & flags(second, "succeeded"))
         first, second = first.filter(both), second.filter(both)
-    before, after = (numbers(each, quantity.name).tolist() for each in (first, second))
-    found = changed(
+    before, after = (numbers(table, quantity.name).tolist() for table in (first, second))
+    change = changed(
         first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=RESAMPLES
     )
     kind, unit = ("ratio", "ratio") if quantity.ratio else ("difference", quantity.unit)
-    return {"kind": kind, "unit": unit, **asdict(found)}
+    return ChangedQuantity(kind=kind, unit=unit, **asdict(change))
 
 
 # Costs of faults -------------------------------------------------------------------------------
@@ -211,105 +416,93 @@ class FaultCosts:
     @classmethod
     def of(cls, golden: pa.Table, counted: pa.Table) -> FaultCosts:
         """Compare flights with the golden flights of the same missions."""
-        known, own = paired(counted, golden, ["seed"])
-        won = known["succeeded"]
-        own_s = numbers(own.filter(won), "flight_time_s")
-        pairs = known.filter(won)
-        time_s = numbers(pairs, "flight_time_s")
-        costs = pairs.select([*MISSION, "fault_seed"]).append_column(
-            "cost_s", pa.array(time_s - own_s)
-        )
+        flights, own = paired(counted, golden, ["seed"])
+        own_lost, lost = (pc.invert(table["succeeded"]) for table in (own, flights))
+        time_s, own_s = flights["flight_time_s"], own["flight_time_s"]
+        over_own, _ = against_golden(own_lost, own_s, lost, time_s)
+        costs = flights.select([*MISSION, "fault_seed"])
+        costs = costs.append_column("cost_s", pc.subtract(time_s, own_s))
+        costs = costs.append_column("over_own", over_own)
         longest = numbers(chosen(counted, succeeded=True), "flight_time_s")
         return cls(
-            costs=costs.append_column("over_own", pa.array(time_s / own_s)),
-            lost=known.num_rows - pairs.num_rows,
+            costs=costs.filter(pc.is_valid(over_own)),
+            lost=int(np.count_nonzero(pc.and_(pc.invert(own_lost), lost))),
             longest_s=max(longest.tolist(), default=math.nan),
         )
 
     def _largest(self, measure: str) -> float:
-        found = pc.max(self.costs[measure]).as_py()
-        return math.nan if found is None else float(found)
+        return max(numbers(self.costs, measure).tolist(), default=math.nan)
 
-    def row(self, bare: FaultCosts, *, protected: bool) -> dict[str, Any]:
+    def row(self, platform: str, setting: str, bare: FaultCosts) -> CostRow:
         """The cost of a setting's faults on a platform.
+
+        Several faults of one mission are no independent samples: intervals draw missions.
 
         Args:
             bare: the same without a detector on this platform, the reference of recovery.
-
-        Returns:
-            `cost_s`: mean with its interval and the largest; `over_own`: the 95th percentile with
-            its interval and the largest. Several faults of one mission are no independent samples:
-            intervals draw missions. `recovered_share` is the part of the largest increase without
-            detector that is gone, not a number where there is none. `worst_flight`: the one with
-            the largest ratio to its golden flight; the lowest seed of equal ones.
         """
         cost_s, over_own = (_by_mission(self.costs, name) for name in ("cost_s", "over_own"))
         worst, count = self._largest("over_own"), len(cost_s)
         recovered = worst_case(OWN, [bare._largest("over_own")], [worst])["recovered_share"]
         rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
-        flight = rows.select([*MISSION, "fault_seed"]).slice(0, 1).to_pylist()
-        return {
-            "pairs": self.costs.num_rows,
-            "lost": self.lost,
-            "cost_s": {
-                "mean": _over(count, lambda drawn: _mean(cost_s[drawn])),
-                "largest": self._largest("cost_s"),
-            },
-            "over_own": {
-                "p95": _over(count, lambda drawn: _late(over_own[drawn])),
-                "largest": worst,
-                "recovered_share": recovered if protected else math.nan,
-            },
-            "worst_flight": flight[0] if flight else None,
-        }
+        flights = rows.select([*MISSION, "fault_seed"]).slice(0, 1).to_pylist()
+        return CostRow(
+            platform=platform,
+            setting=setting,
+            pairs=self.costs.num_rows,
+            lost=self.lost,
+            cost_s=CostInSeconds(
+                mean=_over(count, lambda drawn: _mean(cost_s[drawn])),
+                largest=self._largest("cost_s"),
+            ),
+            over_own=CostRatio(
+                p95=_over(count, lambda drawn: _late(over_own[drawn])),
+                largest=worst,
+                recovered_share=math.nan if setting == NONE else recovered,
+            ),
+            worst_flight=WorstFault(**flights[0]) if flights else None,
+        )
 
-    def extra(self, first: FaultCosts) -> dict[str, Any]:
-        """The additional cost of the same faults compared with the reference platform.
-
-        Returns:
-            `extra_s`: the mean difference of costs; `differ`: how many of them are not zero;
-            `p_value`: of the mean, by missions; `p95_ratio`: of the 95th percentiles over own
-            golden; all are over the faults that both platforms have a cost of. Of all flights of
-            each platform: `largest_ratio` of the largest over own golden, `longest_ratio` of the
-            longest in seconds.
-        """
+    def beyond(
+        self, first: FaultCosts, platform: str, setting: str, reference: str
+    ) -> CostDifference:
+        """The additional cost compared with the reference platform, `first`."""
         here, there = paired(self.costs, first.costs, MISSION)
         extra = _by_mission(here, "cost_s") - _by_mission(there, "cost_s")
         extra[np.abs(extra) < _SAME_S] = 0.0
         before, after = _by_mission(there, "over_own"), _by_mission(here, "over_own")
         count = len(extra)
-        return {
-            "pairs": here.num_rows,
-            "differ": int(np.count_nonzero(np.nan_to_num(extra))),
-            "extra_s": _over(count, lambda drawn: _mean(extra[drawn])),
-            "p_value": sign_flips(np.nansum(extra, axis=1).tolist()) if count else math.nan,
-            "p95_ratio": _over(count, lambda drawn: _late(after[drawn]) / _late(before[drawn])),
-            "largest_ratio": self._largest("over_own") / first._largest("over_own"),
-            "longest_ratio": self.longest_s / first.longest_s,
-        }
+        return CostDifference(
+            platform=platform,
+            setting=setting,
+            reference=reference,
+            pairs=here.num_rows,
+            differ=int(np.count_nonzero(np.nan_to_num(extra))),
+            extra_s=_over(count, lambda drawn: _mean(extra[drawn])),
+            p_value=sign_flips(np.nansum(extra, axis=1).tolist()) if count else math.nan,
+            p95_ratio=_over(count, lambda drawn: _late(after[drawn]) / _late(before[drawn])),
+            largest_ratio=self._largest("over_own") / first._largest("over_own"),
+            longest_ratio=self.longest_s / first.longest_s,
+        )
 
 
-def _worst_row(
-    golden: pa.Table, faulty: pa.Table, flights: pa.Table, *, protected: bool
-) -> dict[str, Any]:
-    """The longest successful flight of a setting, and its ratio to the mean golden one.
-
-    Args:
-        flights: flights of the setting. The recovery is NaN if the longest flight with faults
-            is no longer than the longest golden one.
-    """
+def _longest(
+    platform: str, setting: str, golden: pa.Table, faulty: pa.Table, flights: pa.Table
+) -> LongestFlight:
     golden_s, faulty_s, times_s = (
-        numbers(each, "flight_time_s").tolist() for each in (golden, faulty, flights)
+        numbers(table, "flight_time_s").tolist() for table in (golden, faulty, flights)
     )
-    found = worst_case(golden_s, times_s)
-    case = worst_case(golden_s, faulty_s, times_s if protected else ())
-    return {
-        "flights": len(times_s),
-        "golden_mean_s": found["golden"],
-        "worst_s": found["faulty_worst"],
-        "over_mean_ratio": 1.0 + found["increase"],
-        "over_mean_recovered_share": case["recovered_share"],
-    }
+    own = worst_case(golden_s, times_s)
+    protected_s = () if setting in (GOLDEN, NONE) else times_s
+    return LongestFlight(
+        platform=platform,
+        setting=setting,
+        flights=len(times_s),
+        golden_mean_s=own["golden"],
+        worst_s=own["faulty_worst"],
+        over_mean_ratio=1.0 + own["increase"],
+        over_mean_recovered_share=worst_case(golden_s, faulty_s, protected_s)["recovered_share"],
+    )
 
 
 # Missions as the resampled unit ---------------------------------------------------------------
@@ -324,9 +517,9 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
     return table
 
 
-def _over(count: int, statistic: Any) -> dict[str, Any]:
+def _over(count: int, statistic: Callable[[IntArray], FloatArray]) -> Interval:
     """A statistic over missions with its interval; `statistic` takes (..., missions) indices."""
-    return asdict(interval_of_rows(count, statistic, resamples=RESAMPLES))
+    return interval_of_rows(count, statistic, resamples=RESAMPLES)
 
 
 def _mean(values: FloatArray) -> FloatArray:
@@ -351,20 +544,20 @@ def _late(values: FloatArray) -> FloatArray:
 # Descriptions of the platforms ----------------------------------------------------------------
 
 
-def platforms_told(platforms: Sequence[str]) -> list[dict[str, Any]]:
-    """One row of plain values per platform."""
+def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
+    """Describe platforms, which are names or files."""
     names, profiles = titles(platforms), {name: load_platform(name) for name in platforms}
-    return [
-        {
-            "platform": name,
-            "title": names[name],
-            "description": profile.description or profile.name,
-            "cores": profile.cores,
-            "power_w": profile.power_w,
-            "kernel_latency_s": {k: each.latency_s for k, each in profile.kernels.items()},
-        }
+    return tuple(
+        PlatformSummary(
+            platform=name,
+            title=names[name],
+            description=profile.description or profile.name,
+            cores=profile.cores,
+            power_w=profile.power_w,
+            kernel_latency_s={key: own.latency_s for key, own in profile.kernels.items()},
+        )
         for name, profile in profiles.items()
-    ]
+    )
 
 
 def titles(platforms: Sequence[str]) -> dict[str, str]:

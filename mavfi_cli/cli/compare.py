@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,6 +25,9 @@ from mavfi_cli.cli.parameters import (
     WORLD,
 )
 from mavfi_cli.core.terminal import echo
+
+if TYPE_CHECKING:
+    from mavfi_cli.studies.compare import ComparePlan
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")
 _settings = partial(click.option, cls=GroupedOption, group="Faults and detectors")
@@ -77,21 +81,22 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
         raise click.UsageError("--json and --csv exclude each other")
     plan = _plan(options)
     with missions_view(quiet=quiet) as view:
-        told = run(plan, out, Options(jobs=options["jobs"] or 0), view)
-    write_json(out / "compare.json", told)
-    write_text(out / "compare.csv", platform_csv(told))
+        comparison = run(plan, out, Options(jobs=options["jobs"] or 0), view)
+    contents = plain(asdict(comparison))
+    write_json(out / "compare.json", contents)
+    write_text(out / "compare.csv", platform_csv(comparison))
     for name, draw in PICTURES.items():
-        write_figure(draw(told), out / name)
+        write_figure(draw(comparison), out / name)
     if as_json:
-        echo(json.dumps(plain(told), indent=2, sort_keys=True))
+        echo(json.dumps(contents, indent=2, sort_keys=True))
     elif as_csv:
-        echo(platform_csv(told), nl=False)
+        echo(platform_csv(comparison), nl=False)
     else:
         files = "compare.json, compare.csv, compare.svg, timeline.svg, timeline/"
-        echo("\n".join([*platform_lines(told), "", f"Files  {out}: {files}"]))
+        echo("\n".join([*platform_lines(comparison), "", f"Files  {out}: {files}"]))
 
 
-def _plan(options: dict[str, Any]) -> Any:
+def _plan(options: dict[str, Any]) -> ComparePlan:
     from mavfi_cli.core.errors import ConfigError
     from mavfi_cli.studies.compare import ComparePlan
 

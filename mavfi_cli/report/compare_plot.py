@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from mavfi_cli.analysis.platforms import Comparison, CostRow, PlatformSummary, SettingRow
+from mavfi_cli.analysis.timeline import Span, Timeline
 from mavfi_cli.report.drawing import (
     GRID,
     INK,
@@ -34,17 +37,16 @@ _RATIOS = (
     ("energy_propeller_j", "energy\n(propellers)"),
 )
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
-Row = Mapping[str, Any]
 
 
-def _draw_comparison(comparison: Row) -> Figure:
+def _draw_comparison(comparison: Comparison) -> Figure:
     """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
     figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
     colours = {
-        row["platform"]: PLATFORMS[place % len(PLATFORMS)]
-        for place, row in enumerate(comparison["plan"]["platforms"])
+        row.platform: PLATFORMS[place % len(PLATFORMS)]
+        for place, row in enumerate(comparison.plan.platforms)
     }
     _times(panels["T"], comparison, colours)
     _success(panels["S"], comparison, colours)
@@ -52,24 +54,24 @@ def _draw_comparison(comparison: Row) -> Figure:
     _ratios(panels["M"], comparison, colours)
     _costs(panels["W"], comparison, colours)
     handles = [
-        panels["S"].plot([], [], "s", color=colours[row["platform"]], markersize=9,
-                               label=f"{row['title']}: {row['description']}")[0]
-        for row in comparison["plan"]["platforms"]
+        panels["S"].plot([], [], "s", color=colours[row.platform], markersize=9,
+                               label=f"{row.title}: {row.description}")[0]
+        for row in comparison.plan.platforms
     ]  # fmt: skip
     legend_above(figure, handles=handles, ncols=min(3, len(handles)), fontsize=9.5)
     figure.supxlabel(_caption(comparison), fontsize=8, color=NOTE)
     return figure
 
 
-def _caption(comparison: Row) -> str:
-    plan, share = comparison["plan"], 100 * comparison["confidence"]
+def _caption(comparison: Comparison) -> str:
+    plan, share = comparison.plan, 100 * comparison.confidence
     struck = "no faults"
-    if plan["inject"]:
-        bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
-        struck = f"{bits} in {', '.join(plan['inject'])}"
+    if plan.inject:
+        bits = "one bit" if plan.field is None else f"one bit of the {plan.field}"
+        struck = f"{bits} in {', '.join(plan.inject)}"
     return (
-        f"{plan['missions']} {'mission' if plan['missions'] == 1 else 'missions'} in "
-        f"{plan['world']} from seed {plan['first_seed']} on, the "
+        f"{plan.missions} {'mission' if plan.missions == 1 else 'missions'} in "
+        f"{plan.world} from seed {plan.first_seed} on, the "
         f"same on each platform; {struck}; whiskers: {share:g} % intervals"
     )
 
@@ -79,8 +81,10 @@ def _frame(axes: Axes, title: str, grid: str) -> None:
     axes.tick_params(labelsize=8.5)
 
 
-def _places(comparison: Row, settings: Sequence[str]) -> tuple[dict[tuple[str, str], float], float]:
-    platforms = [row["platform"] for row in comparison["plan"]["platforms"]]
+def _places(
+    comparison: Comparison, settings: Sequence[str]
+) -> tuple[dict[tuple[str, str], float], float]:
+    platforms = [row.platform for row in comparison.plan.platforms]
     width = 0.76 / len(platforms)
     return {
         (platform, setting): group + width * (number - (len(platforms) - 1) / 2)
@@ -95,27 +99,28 @@ def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
     axes.set_xlim(-0.55, len(settings) - 0.45)
 
 
-def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
-    settings = comparison["plan"]["settings"]
+def _times(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+    settings = comparison.plan.settings
     places, width = _places(comparison, settings)
-    flown = [f["flight_time_s"] for f in comparison["flights"] if _shown(f)] or [1.0]
+    shown: dict[tuple[str, str], list[float]] = {}
+    for flight in comparison.flights:
+        if flight["counted"] and flight["outcome"] == "success":
+            place = flight["platform"], flight["setting"]
+            shown.setdefault(place, []).append(flight["flight_time_s"])
+    flown = [*itertools.chain(*shown.values())] or [1.0]
     room = 0.16 * max(max(flown) - min(flown), 0.1 * max(flown))
-    for row in comparison["settings"]:
-        key = row["platform"], row["setting"]
-        x, colour = places[key], colours[row["platform"]]
-        times = [
-            f["flight_time_s"]
-            for f in comparison["flights"]
-            if _shown(f) and (f["platform"], f["setting"]) == key
-        ]
+    for row in comparison.settings:
+        key = row.platform, row.setting
+        x, colour = places[key], colours[row.platform]
+        times = shown.get(key, [])
         _foot(axes, x, row, len(times), colour)
         if not times:
             continue
         spread = [x + 0.62 * width * ((0.5 + n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
         axes.plot(spread, times, "o", color=colour, markersize=4.2, alpha=0.45, markeredgewidth=0.0)
-        middle = row["quantities"]["flight_time_s"]["median"]
-        axes.hlines(middle["value"], x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)
-        whisker(axes, x, middle["value"], (middle["low"], middle["high"]))
+        middle = row.quantities["flight_time_s"].median
+        axes.hlines(middle.value, x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)
+        whisker(axes, x, middle.value, (middle.low, middle.high))
         worst = times.index(max(times))
         axes.plot(
             spread[worst], times[worst], "o", markersize=8, markerfacecolor="none",
@@ -128,8 +133,8 @@ def _times(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
     _frame(axes, "Flight time of each successful mission; bar: median; ring: the worst", "y")
 
 
-def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
-    replans, failed = row["quantities"]["replans"]["mean"]["value"], row["counted"] - succeeded
+def _foot(axes: Axes, x: float, row: SettingRow, succeeded: int, colour: str) -> None:
+    replans, failed = row.quantities["replans"].mean.value, row.counted - succeeded
     lines = [f"{failed} failed"] if failed else []
     if not math.isnan(replans):
         lines.append(f"{replans:.1f} replans")
@@ -139,21 +144,17 @@ def _foot(axes: Axes, x: float, row: Row, succeeded: int, colour: str) -> None:
         note_at(axes, text, (x, 0.0), height, **foot)
 
 
-def _shown(flight: Row) -> bool:
-    return bool(flight["counted"] and flight["outcome"] == "success")
-
-
-def _success(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
-    settings = comparison["plan"]["settings"]
+def _success(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+    settings = comparison.plan.settings
     places, width = _places(comparison, settings)
-    for row in comparison["settings"]:
-        share, x = row["success"], places[row["platform"], row["setting"]]
-        if not share["total"]:
+    for row in comparison.settings:
+        share, x = row.success, places[row.platform, row.setting]
+        if not share.total:
             continue
-        axes.bar(x, 100 * share["share"], width=0.9 * width, color=colours[row["platform"]])
-        whisker(axes, x, 100 * share["share"], (100 * share["low"], 100 * share["high"]))
+        axes.bar(x, 100 * share.share, width=0.9 * width, color=colours[row.platform])
+        whisker(axes, x, 100 * share.share, (100 * share.low, 100 * share.high))
         axes.text(
-            x, 3.0, f"{share['count']}/{share['total']}", ha="center", va="bottom", fontsize=7.5,
+            x, 3.0, f"{share.count}/{share.total}", ha="center", va="bottom", fontsize=7.5,
             color="white", rotation=90,
         )  # fmt: skip
     axes.set_ylim(0.0, 104.0)
@@ -164,20 +165,18 @@ def _success(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
     _frame(axes, "Success", "y")
 
 
-def _response(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+def _response(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
     """Draw the response time of golden flights, divided into kernels and waiting."""
-    rows = {
-        r["platform"]: r["quantities"] for r in comparison["settings"] if r["setting"] == _GOLDEN
-    }
-    platforms = comparison["plan"]["platforms"]
+    rows = {r.platform: r.quantities for r in comparison.settings if r.setting == _GOLDEN}
+    platforms = comparison.plan.platforms
     for place, platform in enumerate(platforms):
-        name, left = platform["platform"], 0.0
+        name, left = platform.platform, 0.0
         found = rows[name]
         middle_ms, late_ms = (
-            1e3 * found[key]["median"]["value"] for key in ("response_median_s", "response_p95_s")
+            1e3 * found[key].median.value for key in ("response_median_s", "response_p95_s")
         )
         for kernel in _CHAIN:
-            length = 1e3 * platform["kernel_latency_s"][kernel]
+            length = 1e3 * platform.kernel_latency_s[kernel]
             axes.barh(place, length, left=left, height=0.46, color=KERNELS[kernel][1],
                       label=KERNELS[kernel][0] if place == 0 else None)  # fmt: skip
             left += length
@@ -190,7 +189,7 @@ def _response(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
         axes.plot(late_ms, place, "D", color=INK, markersize=5,
                   label="95th percentile" if place == 0 else None)  # fmt: skip
         axes.text(
-            0.0, place - 0.35, f"{platform['title']}: {middle_ms:.0f} ms, {late_ms:.0f} ms",
+            0.0, place - 0.35, f"{platform.title}: {middle_ms:.0f} ms, {late_ms:.0f} ms",
             fontsize=9, color=colours[name], va="bottom", weight="bold",
         )  # fmt: skip
     axes.set_ylim(len(platforms) - 0.4, -0.75)
@@ -204,43 +203,43 @@ def _response(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _ratios(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+def _ratios(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
     """Draw the paired ratios of each platform to the first: golden full, faulty open."""
-    drawn = [row for row in comparison["ratios"] if row["setting"] in (_GOLDEN, _NONE)]
-    titles = {row["platform"]: row["title"] for row in comparison["plan"]["platforms"]}
-    first = comparison["plan"]["platforms"][0]["title"]
+    drawn = [row for row in comparison.ratios if row.setting in (_GOLDEN, _NONE)]
+    titles = {row.platform: row.title for row in comparison.plan.platforms}
+    first = comparison.plan.platforms[0].title
     step = 0.8 / max(1, len(drawn))
     for place, (quantity, _) in enumerate(_RATIOS):
         for number, row in enumerate(drawn):
-            each, y = row["quantities"][quantity], place + step * (number - (len(drawn) - 1) / 2)
-            if math.isnan(each["value"]):
+            each, y = row.quantities[quantity], place + step * (number - (len(drawn) - 1) / 2)
+            if math.isnan(each.value):
                 continue
-            colour = colours[row["platform"]]
-            if not math.isnan(each["low"]):
-                axes.hlines(y, each["low"], each["high"], color=colour, linewidth=1.6)
+            colour = colours[row.platform]
+            if not math.isnan(each.low):
+                axes.hlines(y, each.low, each.high, color=colour, linewidth=1.6)
             axes.plot(
-                each["value"], y, "o", color=colour, markersize=6, markeredgewidth=1.4,
-                markerfacecolor=colour if row["setting"] == _GOLDEN else "white",
+                each.value, y, "o", color=colour, markersize=6, markeredgewidth=1.4,
+                markerfacecolor=colour if row.setting == _GOLDEN else "white",
             )  # fmt: skip
             axes.text(
-                1.01, y, f"{each['value']:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
+                1.01, y, f"{each.value:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
                 va="center", color=colour,
             )  # fmt: skip
     axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
     axes.set_ylim(len(_RATIOS) - 0.45, -0.55)
     axes.set_yticks(range(len(_RATIOS)), [title for _, title in _RATIOS], fontsize=8.5)
-    others = ", ".join(dict.fromkeys(titles[row["platform"]] for row in drawn)) or "one platform"
+    others = ", ".join(dict.fromkeys(titles[row.platform] for row in drawn)) or "one platform"
     axes.set_xlabel("ratio; full: golden, open: faults", fontsize=9)
     _frame(axes, f"{others} over {first}, mission by mission", "x")
     if not drawn:
         axes.text(1.0, 1.5, "nothing to compare with", ha="center", fontsize=9, color=NOTE)
 
 
-def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
+def _costs(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
     """Draw the extra flight time over the golden run with faults: worst and 95th percentile."""
-    settings = [name for name in comparison["plan"]["settings"] if name != _GOLDEN]
+    settings = [name for name in comparison.plan.settings if name != _GOLDEN]
     places, width = _places(comparison, settings)
-    rows = [row for row in comparison["costs"] if row["pairs"]]
+    rows = [row for row in comparison.costs if row.pairs]
     _frame(axes, "Worst case and recovery (paper, Fig. 16)", "y")
     if not rows:
         axes.text(0.5, 0.5, "no faults", ha="center", color=NOTE, transform=axes.transAxes)
@@ -249,18 +248,19 @@ def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
         return
     ends = [0.0]
     for number, row in enumerate(rows):
-        x, late = places[row["platform"], row["setting"]], row["over_own"]["p95"]
-        height = 100 * (row["over_own"]["largest"] - 1.0)
-        axes.bar(x, height, width=0.9 * width, color=colours[row["platform"]])
-        percent = {key: 100 * (late[key] - 1.0) for key in ("value", "low", "high")}
-        top = max(0.0, height, *(end for end in percent.values() if not math.isnan(end)))
-        note_at(axes, f"{height:+.1f}", (x, top), 6 if percent["value"] >= 0.9 * top else 2)
+        x, late = places[row.platform, row.setting], row.over_own.p95
+        height = 100 * (row.over_own.largest - 1.0)
+        axes.bar(x, height, width=0.9 * width, color=colours[row.platform])
+        middle, *whiskers = (100 * (end - 1.0) for end in (late.value, late.low, late.high))
+        known = [end for end in (height, middle, *whiskers) if not math.isnan(end)]
+        top = max(0.0, *known)
+        note_at(axes, f"{height:+.1f}", (x, top), 6 if middle >= 0.9 * top else 2)
         axes.plot(
-            x, percent["value"], "D", markersize=5, color="white", markeredgecolor=INK,
+            x, middle, "D", markersize=5, color="white", markeredgecolor=INK,
             label="95th percentile" if number == 0 else None,
         )  # fmt: skip
-        whisker(axes, x, percent["value"], (percent["low"], percent["high"]))
-        ends += [height, *(value for value in percent.values() if not math.isnan(value))]
+        whisker(axes, x, middle, (whiskers[0], whiskers[1]))
+        ends += known
     _recovered(axes, rows, settings, colours)
     low, high = min(ends), max(1.0, *ends)
     axes.set_ylim(1.1 * low, 1.45 * high)
@@ -273,20 +273,20 @@ def _costs(axes: Axes, comparison: Row, colours: Mapping[str, str]) -> None:
 
 
 def _recovered(
-    axes: Axes, rows: Sequence[Row], settings: Sequence[str], colours: Mapping[str, str]
+    axes: Axes, rows: Sequence[CostRow], settings: Sequence[str], colours: Mapping[str, str]
 ) -> None:
     lines = {name: place for place, name in enumerate(colours)}
     style: dict[str, Any] = {
         "transform": axes.get_xaxis_transform(), "va": "top", "fontsize": 8.5, "ha": "center",
     }  # fmt: skip
     for row in rows:
-        if row["setting"] == _NONE:
+        if row.setting == _NONE:
             continue
-        share = row["over_own"]["recovered_share"]
+        share = row.over_own.recovered_share
         axes.text(
-            settings.index(row["setting"]), 0.985 - 0.055 * lines[row["platform"]],
+            settings.index(row.setting), 0.985 - 0.055 * lines[row.platform],
             "-" if math.isnan(share) else f"{100 * share:.0f} %",
-            color=colours[row["platform"]], weight="bold", **style,
+            color=colours[row.platform], weight="bold", **style,
         )  # fmt: skip
     if len(settings) > 1:
         axes.text(0, 0.985, "recovered:", color=NOTE, **style)
@@ -311,47 +311,45 @@ _ROOM = 0.085  # minimum bar length for a text inside, as a fraction of the wind
 _LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go to the left
 
 
-def _draw_timeline(comparison: Row) -> Figure:
+def _draw_timeline(comparison: Comparison) -> Figure:
     """Draw a figure with simulated time since the frame on x and a lane per kernel.
 
     All platforms share the time axis, so equal lengths are equal times.
     """
-    rows = comparison["timeline"]["platforms"]
-    known = {row["platform"]: row for row in comparison["plan"]["platforms"]}
+    rows = comparison.timeline.platforms
+    known = {row.platform: row for row in comparison.plan.platforms}
     figure = new_figure(11.0, 0.9 + 2.9 * max(1, len(rows)))
     panels = figure.subplots(max(1, len(rows)), 1, squeeze=False, sharex=True)[:, 0]
     if not rows:
         panels[0].set_axis_off()
         panels[0].text(0.5, 0.5, "no flight answered a depth frame", ha="center", color=NOTE)
         return figure
-    shown = rows[0]["shown_s"]
+    shown = rows[0].shown_s
     for axes, row in zip(panels, rows, strict=True):
-        _panel(axes, row, known[row["platform"]], shown)
+        _panel(axes, row, known[row.platform], shown)
     panels[-1].set_xlabel("simulated time since the depth frame, s", fontsize=9)
     figure.supxlabel(_timeline_caption(comparison), fontsize=7.5, color=NOTE)
     return figure
 
 
-def _timeline_caption(comparison: Row) -> str:
+def _timeline_caption(comparison: Comparison) -> str:
     return (
-        f"golden flights in {comparison['plan']['world']}, seed {comparison['timeline']['seed']}; "
+        f"golden flights in {comparison.plan.world}, seed {comparison.timeline.seed}; "
         "full colour: what led from the frame to its setpoint, and to the new plan;\n"
         "an output takes effect at the end of its bar; setpoints go out every control tick"
     )
 
 
-def _panel(axes: Axes, row: Row, platform: Row, shown: list[float]) -> None:
+def _panel(axes: Axes, row: Timeline, platform: PlatformSummary, shown: Span) -> None:
     width_s = shown[1] - shown[0]
     axes.set_xlim(*shown)
     for lane, (kernel, (_, strong, pale)) in enumerate(_LANES.items()):
         axes.axhspan(lane - 0.5, lane + 0.5, color="#f7f8fa" if lane % 2 else "white", zorder=0)
-        _others(axes, lane, row["lanes_s"][kernel], pale, width_s)
-        if kernel in row["chain_s"]:
-            _bar(axes, lane, row["chain_s"][kernel], strong, width_s)
-            _duration(axes, lane, row["chain_s"][kernel], strong, width_s)
-    axes.vlines(
-        row["setpoints_s"], _SETPOINT - 0.16, _SETPOINT + 0.16, color="#b9c0ca", linewidth=0.7
-    )
+        _others(axes, lane, row.lanes_s[kernel], pale, width_s)
+        if kernel in row.chain_s:
+            _bar(axes, lane, row.chain_s[kernel], strong, width_s)
+            _duration(axes, lane, row.chain_s[kernel], strong, width_s)
+    axes.vlines(row.setpoints_s, _SETPOINT - 0.16, _SETPOINT + 0.16, color="#b9c0ca", linewidth=0.7)
     _steps(axes, row)
     _answers(axes, row, width_s)
     axes.set_ylim(_SETPOINT + 1.5, -1.25)
@@ -362,15 +360,15 @@ def _panel(axes: Axes, row: Row, platform: Row, shown: list[float]) -> None:
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6, zorder=1)
     axes.set_axisbelow(True)
     axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.set_title(f"{platform['title']}: {platform['description']}", fontsize=10, loc="left",
+    axes.set_title(f"{platform.title}: {platform.description}", fontsize=10, loc="left",
                    color=INK)  # fmt: skip
 
 
-def _length(span: list[float], width_s: float) -> float:
+def _length(span: Span, width_s: float) -> float:
     return max(span[1] - span[0], _THINNEST * width_s)
 
 
-def _others(axes: Axes, lane: int, spans: list[list[float]], colour: str, width_s: float) -> None:
+def _others(axes: Axes, lane: int, spans: Sequence[Span], colour: str, width_s: float) -> None:
     low = lane - _HEIGHT / 2
     axes.broken_barh(
         [(span[0], _length(span, width_s)) for span in spans], (low, _HEIGHT), color=colour,
@@ -380,11 +378,11 @@ def _others(axes: Axes, lane: int, spans: list[list[float]], colour: str, width_
     axes.vlines(long, low, low + _HEIGHT, color="white", linewidth=0.8, zorder=3)
 
 
-def _bar(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
+def _bar(axes: Axes, lane: int, span: Span, colour: str, width_s: float) -> None:
     axes.barh(lane, _length(span, width_s), left=span[0], height=_HEIGHT, color=colour, zorder=4)
 
 
-def _duration(axes: Axes, lane: int, span: list[float], colour: str, width_s: float) -> None:
+def _duration(axes: Axes, lane: int, span: Span, colour: str, width_s: float) -> None:
     text = _time(span[1] - span[0])
     if span[1] - span[0] >= _ROOM * width_s:
         axes.text(
@@ -405,21 +403,21 @@ def _time(seconds: float) -> str:
     return f"{ms:.0f} ms" if ms >= 10.0 else f"{ms:.1f} ms" if ms >= 1.0 else f"{ms:.2f} ms"
 
 
-def _steps(axes: Axes, row: Row) -> None:
+def _steps(axes: Axes, row: Timeline) -> None:
     """Draw lines from each end to the start that it triggered, level while a message waited."""
     places = {kernel: lane for lane, kernel in enumerate(_LANES)}
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip
     for first, second in links:
-        if first in row["chain_s"] and second in row["chain_s"]:
-            _step(axes, places[first], row["chain_s"][first][1], places[second],
-                  row["chain_s"][second][0], INK)  # fmt: skip
-    if "control" in row["chain_s"]:
-        _step(axes, places["control"], row["chain_s"]["control"][1], _SETPOINT, row["response_s"],
+        if first in row.chain_s and second in row.chain_s:
+            _step(axes, places[first], row.chain_s[first][1], places[second],
+                  row.chain_s[second][0], INK)  # fmt: skip
+    if "control" in row.chain_s:
+        _step(axes, places["control"], row.chain_s["control"][1], _SETPOINT, row.response_s,
               INK)  # fmt: skip
-    if row["plan_setpoint_s"] is not None:
-        _step(axes, places["planner"], row["chain_s"]["planner"][1], _SETPOINT,
-              row["plan_setpoint_s"], _LANES["planner"][1])  # fmt: skip
+    if row.plan_setpoint_s is not None:
+        _step(axes, places["planner"], row.chain_s["planner"][1], _SETPOINT,
+              row.plan_setpoint_s, _LANES["planner"][1])  # fmt: skip
 
 
 def _step(axes: Axes, upper: int, end_s: float, lower: int, start_s: float, colour: str) -> None:
@@ -430,8 +428,8 @@ def _step(axes: Axes, upper: int, end_s: float, lower: int, start_s: float, colo
     )  # fmt: skip
 
 
-def _answers(axes: Axes, row: Row, width_s: float) -> None:
-    answer_s, plan_s = row["response_s"], row["plan_setpoint_s"]
+def _answers(axes: Axes, row: Timeline, width_s: float) -> None:
+    answer_s, plan_s = row.response_s, row.plan_setpoint_s
     axes.vlines(0.0, -1.1, _SETPOINT + 0.3, color=INK, linewidth=0.9, zorder=1)
     axes.vlines(answer_s, -1.1, _SETPOINT, color=_ANSWER, linewidth=0.9, zorder=1)
     axes.annotate(
@@ -447,7 +445,7 @@ def _answers(axes: Axes, row: Row, width_s: float) -> None:
         bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
     )  # fmt: skip
     axes.plot(answer_s, _SETPOINT, marker="D", color=_ANSWER, markersize=6, zorder=7)
-    _acts(axes, answer_s, row["answer"], _ANSWER, 0.68, width_s)
+    _acts(axes, answer_s, row.answer, _ANSWER, 0.68, width_s)
     if plan_s is not None:
         colour = _LANES["planner"][1]
         axes.plot(plan_s, _SETPOINT, marker="D", color=colour, markersize=6, zorder=7)
@@ -464,7 +462,7 @@ def _acts(axes: Axes, stamp_s: float, text: str, colour: str, below: float, widt
     )  # fmt: skip
 
 
-PICTURES: Mapping[str, Callable[[Row], Figure]] = {
+PICTURES: Mapping[str, Callable[[Comparison], Figure]] = {
     "compare.svg": _draw_comparison,
     "timeline.svg": _draw_timeline,
 }

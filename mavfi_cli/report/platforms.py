@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import attrgetter
+from typing import TypeVar
 
-from mavfi_cli.analysis.platforms import GOLDEN, NONE, QUANTITIES
+from mavfi_cli.analysis.platforms import (
+    GOLDEN,
+    NONE,
+    QUANTITIES,
+    ChangedQuantity,
+    ComparedPlan,
+    Comparison,
+    CostDifference,
+    CostRow,
+    LongestFlight,
+    MeasuredQuantity,
+    PlatformSummary,
+    RatioRow,
+    SettingRow,
+    WorstFault,
+)
 from mavfi_cli.report.table import Table, number, p_value, percent, rate, spread
 from mavfi_cli.spec.stack import DEFAULT
 from mavfi_cli.stats.bootstrap import FEW
+from mavfi_cli.stats.shares import Interval, Share
 
-Row = Mapping[str, Any]
 # The paper, section VII-E: on the TX2, a single bit flip in an inter-kernel state.
 PAPER = "paper, Fig. 16: worst case x 2.8 on the TX2, of which GAD recovers 79.3 %, AAD 88.0 %"
 
@@ -21,91 +37,113 @@ def _setting_title(setting: str) -> str:
     return {GOLDEN: "golden", NONE: "faults"}.get(setting, f"faults, {setting}")
 
 
-def _titles_of(told: Row) -> dict[str, str]:
-    return {row["platform"]: row["title"] for row in told["plan"]["platforms"]}
+def _titles_of(plan: ComparedPlan) -> dict[str, str]:
+    return {row.platform: row.title for row in plan.platforms}
 
 
-def platform_lines(told: Row) -> list[str]:
+def platform_lines(comparison: Comparison) -> list[str]:
     """The comparison in words and columns."""
-    others = told["plan"]["platforms"][1:]
-    lines = _head(told)
+    plan, settings = comparison.plan, comparison.settings
+    lines = _head(plan)
     lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
-    lines += _beside(told, "settings", "setting", _FLIGHTS, _flight_cells)
-    lines += ["", *_beside(told, "settings", "setting", _WORK, _work_cells)]
-    for platform in others:
-        lines += ["", *_against(told, "ratios", platform, _RATIOS, _ratio_cells)]
-    if told["costs"]:
+    lines += _side_by_side(plan, settings, _FLIGHTS, _flight_cells, by_setting=True)
+    lines += ["", *_side_by_side(plan, settings, _WORK, _work_cells, by_setting=True)]
+    for platform in plan.platforms[1:]:
+        lines += _against(plan, platform, comparison.ratios, _RATIOS, _ratio_cells)
+    if comparison.costs:
         lines += [
             "",
             "What faults cost (Fig. 16), over the mission's golden flight; both successful",
-            *_beside(told, "costs", "platform", _COSTS, _cost_cells),
+            *_side_by_side(plan, comparison.costs, _COSTS, _cost_cells),
         ]
-        for platform in others:
-            lines += ["", *_against(told, "cost_differences", platform, _EXTRA, _extra_cells)]
+        for platform in plan.platforms[1:]:
+            lines += _against(plan, platform, comparison.cost_differences, _EXTRA, _extra_cells)
     lines += ["", "The longest successful flights"]
-    lines += _beside(told, "worst", "platform", _WORST, _worst_cells)
-    lines += [*_again(told), ""]
-    if told["errors"]:
-        lines.append(f"{len(told['errors'])} missions could not be flown.")
+    lines += _side_by_side(plan, comparison.worst, _WORST, _worst_cells)
+    lines += [*_again(comparison), ""]
+    if comparison.errors:
+        lines.append(f"{len(comparison.errors)} missions could not be flown.")
     return [
         *lines,
-        f"In brackets: {100 * told['confidence']:g} % intervals, Wilson for success, bootstrap for "
-        "the rest.",
+        f"In brackets: {100 * comparison.confidence:g} % intervals, Wilson for success, bootstrap "
+        "for the rest.",
         "Energy: the paper's regression; that of the propellers is in compare.json.",
         "Response, depth frame to setpoint: each flight's median and 95th percentile; here the",
         "median over the flights.",
-        *_few(told),
+        *_few(settings),
     ]
 
 
-def _few(told: Row) -> list[str]:
-    counts = [row["quantities"]["flight_time_s"]["mean"]["count"] for row in told["settings"]]
+def _few(settings: Sequence[SettingRow]) -> list[str]:
+    counts = [row.quantities["flight_time_s"].mean.count for row in settings]
     if not any(1 < count < FEW for count in counts):
         return []
     return [f"Bootstrap intervals of fewer than {FEW} flights are too narrow to be believed."]
 
 
-def _head(told: Row) -> list[str]:
-    plan = told["plan"]
-    last = plan["first_seed"] + plan["missions"] - 1
+def _head(plan: ComparedPlan) -> list[str]:
+    last = plan.first_seed + plan.missions - 1
     faults = "none"
-    if plan["inject"]:
-        bits = "one bit" if plan["field"] is None else f"one bit of the {plan['field']}"
-        struck = ", ".join(plan["inject"])
-        faults = f"{bits} in {struck}: one a flight; fault seed {plan['seed']}"
+    if plan.inject:
+        bits = "one bit" if plan.field is None else f"one bit of the {plan.field}"
+        struck = ", ".join(plan.inject)
+        faults = f"{bits} in {struck}: one a flight; fault seed {plan.seed}"
     lines = [
-        f"Missions    {plan['missions']} in {plan['world']}, seeds {plan['first_seed']} to {last}, "
+        f"Missions    {plan.missions} in {plan.world}, seeds {plan.first_seed} to {last}, "
         "the same on each platform",
-        f"Stack       {plan['stack']}",
+        f"Stack       {plan.stack}",
         f"Faults      {faults}",
     ]
-    heads = ["Platforms", *[""] * len(plan["platforms"])]
-    for head, row in zip(heads, plan["platforms"], strict=False):
-        lines.append(f"{head:<11} {row['title']}: {row['description']}, {row['cores']} cores")
+    heads = ["Platforms", *[""] * len(plan.platforms)]
+    for head, row in zip(heads, plan.platforms, strict=False):
+        lines.append(f"{head:<11} {row.title}: {row.description}, {row.cores} cores")
     return lines
 
 
 # Tables ---------------------------------------------------------------------------------------
 
-
-def _beside(told: Row, name: str, first: str, head: Sequence[str], cells: Any) -> list[str]:
-    titles, last, rows = _titles_of(told), "", []
-    for row in told[name]:
-        labels = [titles[row["platform"]], _setting_title(row["setting"])]
-        labels = labels if first == "platform" else labels[::-1]
-        rows.append([labels[0] if labels[0] != last else "", labels[1], *cells(row)])
-        last = labels[0]
-    return Table([["", "", *head], *rows], labels=2).lines()
+OwnRow = TypeVar("OwnRow", bound=SettingRow | CostRow | LongestFlight)
+PairedRow = TypeVar("PairedRow", bound=RatioRow | CostDifference)
 
 
-def _against(told: Row, name: str, platform: Row, head: Sequence[str], cells: Any) -> list[str]:
-    rows = [row for row in told[name] if row["platform"] == platform["platform"]]
+def _side_by_side(
+    plan: ComparedPlan,
+    rows: Iterable[OwnRow],
+    head: Sequence[str],
+    cells: Callable[[OwnRow], list[str]],
+    *,
+    by_setting: bool = False,
+) -> list[str]:
+    """One line per platform and setting, grouped by platform or by setting."""
+    titles, last = _titles_of(plan), ""
+    lines: list[list[str]] = []
+    for row in rows:
+        group, other = titles[row.platform], _setting_title(row.setting)
+        if by_setting:
+            group, other = other, group
+        lines.append([group if group != last else "", other, *cells(row)])
+        last = group
+    return Table([["", "", *head], *lines], labels=2).lines()
+
+
+def _against(
+    plan: ComparedPlan,
+    platform: PlatformSummary,
+    rows: Iterable[PairedRow],
+    head: Sequence[str],
+    cells: Callable[[PairedRow], list[str]],
+) -> list[str]:
+    """One line per setting of a platform, compared with the reference."""
     title, *names = head
-    told_rows = [[_setting_title(row["setting"]), *cells(row)] for row in rows]
-    reference = _titles_of(told)[rows[0]["reference"]]
+    lines = [
+        [_setting_title(row.setting), *cells(row)]
+        for row in rows
+        if row.platform == platform.platform
+    ]
     return [
-        title.format(platform["title"], reference),
-        *Table([["", *names], *told_rows], labels=1).lines(),
+        "",
+        title.format(platform.title, plan.platforms[0].title),
+        *Table([["", *names], *lines], labels=1).lines(),
     ]
 
 
@@ -123,173 +161,148 @@ _EXTRA = (
 _WORST = ("longest, s", "over mean golden, x", "recovered")
 
 
-def _flight_cells(row: Row) -> list[str]:
-    found = row["quantities"]
-    medians = (spread(found[name]["median"], 1) for name in ("flight_time_s", "distance_m"))
-    return [f"{row['counted']} of {row['flown']}", rate(row["success"]), *medians]
+def _flight_cells(row: SettingRow) -> list[str]:
+    medians = (row.quantities[name].median for name in ("flight_time_s", "distance_m"))
+    counts = f"{row.counted} of {row.flown}"
+    return [counts, rate(row.success), *(spread(value, 1) for value in medians)]
 
 
-def _work_cells(row: Row) -> list[str]:
-    found = row["quantities"]
+def _work_cells(row: SettingRow) -> list[str]:
+    own = row.quantities
     return [
-        spread(found["energy_regression_j"]["median"], 1, 1e-3),
-        spread(found["replans"]["mean"], 1),
-        spread(found["response_median_s"]["median"], 0, 1e3),
-        spread(found["response_p95_s"]["median"], 0, 1e3),
+        spread(own["energy_regression_j"].median, 1, 1e-3),
+        spread(own["replans"].mean, 1),
+        spread(own["response_median_s"].median, 0, 1e3),
+        spread(own["response_p95_s"].median, 0, 1e3),
     ]
 
 
-def _ratio_cells(row: Row) -> list[str]:
-    found, test = row["quantities"], row["success"]
-    points = number(test["difference"], "+.1f", 100.0, f" ({p_value(test['p_value'])})")
+def _ratio_cells(row: RatioRow) -> list[str]:
+    own, chance = row.quantities, p_value(row.success.p_value)
     return [
-        f"{row['both_succeed']}",
-        spread(found["flight_time_s"], 3),
-        spread(found["energy_regression_j"], 2),
-        spread(found["response_median_s"], 2),
-        points,
+        f"{row.both_succeed}",
+        spread(own["flight_time_s"], 3),
+        spread(own["energy_regression_j"], 2),
+        spread(own["response_median_s"], 2),
+        number(row.success_difference, "+.1f", 100.0, f" ({chance})"),
     ]
 
 
-def _cost_cells(row: Row) -> list[str]:
-    over = row["over_own"]
+def _cost_cells(row: CostRow) -> list[str]:
+    over = row.over_own
     return [
-        f"{row['pairs']}", f"{row['lost']}", spread(row["cost_s"]["mean"], 2),
-        spread(over["p95"], 3), number(over["largest"], ".3f"), percent(over["recovered_share"]),
+        f"{row.pairs}", f"{row.lost}", spread(row.cost_s.mean, 2),
+        spread(over.p95, 3), number(over.largest, ".3f"), percent(over.recovered_share),
     ]  # fmt: skip
 
 
-def _extra_cells(row: Row) -> list[str]:
+def _extra_cells(row: CostDifference) -> list[str]:
     return [
-        f"{row['pairs']}", f"{row['differ']}", spread(row["extra_s"], 2, chance=row["p_value"]),
-        spread(row["p95_ratio"], 3), number(row["largest_ratio"], ".3f"),
-        number(row["longest_ratio"], ".3f"),
+        f"{row.pairs}", f"{row.differ}", spread(row.extra_s, 2, chance=row.p_value),
+        spread(row.p95_ratio, 3), number(row.largest_ratio, ".3f"),
+        number(row.longest_ratio, ".3f"),
     ]  # fmt: skip
 
 
-def _worst_cells(row: Row) -> list[str]:
-    over = number(row["over_mean_ratio"], ".3f")
-    return [number(row["worst_s"], ".1f"), over, percent(row["over_mean_recovered_share"])]
+def _worst_cells(row: LongestFlight) -> list[str]:
+    over = number(row.over_mean_ratio, ".3f")
+    return [number(row.worst_s, ".1f"), over, percent(row.over_mean_recovered_share)]
 
 
-def _again(told: Row) -> list[str]:
-    titles, lines = _titles_of(told), []
-    for row in told["costs"]:
-        if row["setting"] != NONE or row["worst_flight"] is None:
+def _again(comparison: Comparison) -> list[str]:
+    plan, lines = comparison.plan, []
+    titles = _titles_of(plan)
+    for row in comparison.costs:
+        if row.setting != NONE or row.worst_flight is None:
             continue
-        if row["over_own"]["largest"] > 1.0:
-            lines.append(f"the fault that costs most on {titles[row['platform']]}:")
-            lines.append(f"  {_command_of(told['plan'], row)}")
+        if row.over_own.largest > 1.0:
+            lines.append(f"the fault that costs most on {titles[row.platform]}:")
+            lines.append(f"  {_command_of(plan, row.platform, row.worst_flight)}")
         else:
-            lines.append(f"no fault made a flight longer on {titles[row['platform']]}")
-    return [*lines, *([PAPER] if told["plan"]["inject"] else [])]
+            lines.append(f"no fault made a flight longer on {titles[row.platform]}")
+    return [*lines, *([PAPER] if plan.inject else [])]
 
 
-def _command_of(plan: Row, row: Row) -> str:
-    flight = row["worst_flight"]
-    words = ["mavfi", "fly", "--world", plan["world"], "--seed", f"{flight['seed']}"]
-    words += ["--platform", row["platform"]]
-    if plan["stack"] != DEFAULT:
-        words += ["--stack", plan["stack"]]
-    if flight["target"]:
-        words += ["--inject", flight["target"], "--fault-seed", f"{flight['fault_seed']}"]
-        words += [] if plan["field"] is None else ["--field", plan["field"]]
+def _command_of(plan: ComparedPlan, platform: str, flight: WorstFault) -> str:
+    words = ["mavfi", "fly", "--world", plan.world, "--seed", f"{flight.seed}"]
+    words += ["--platform", platform]
+    if plan.stack != DEFAULT:
+        words += ["--stack", plan.stack]
+    if flight.target:
+        words += ["--inject", flight.target, "--fault-seed", f"{flight.fault_seed}"]
+        words += [] if plan.field is None else ["--field", plan.field]
     return shlex.join(words)
 
 
-# Rows -----------------------------------------------------------------------------------------
+# CSV ------------------------------------------------------------------------------------------
+
+_NAMES = ["table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
+          "low", "high", "count"]  # fmt: skip
+_OVER, _COST = "flight time over own golden", "cost of a fault"
+# Of a kind of row: quantity, statistic, unit, name of the number, name of the sample size of a
+# number without its own.
+_NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
+    "settings": (("success", "share", "1", "success", ""),),
+    "ratios": (("success", "difference", "1", "success_difference", "pairs"),),
+    "costs": (
+        ("lost by faults", "flights", "count", "lost", "compared"),
+        (_COST, "mean", "s", "cost_s.mean", ""),
+        (_COST, "largest", "s", "cost_s.largest", "pairs"),
+        (_OVER, "95th percentile", "1", "over_own.p95", ""),
+        (_OVER, "largest", "1", "over_own.largest", "pairs"),
+        (_OVER, "share of the largest increase recovered", "1", "over_own.recovered_share",
+         "pairs"),
+    ),
+    "cost_differences": (
+        (_COST, "mean difference", "s", "extra_s", ""),
+        (_COST, "pairs that differ", "count", "differ", "pairs"),
+        (_COST, "p-value of the mean difference", "1", "p_value", "pairs"),
+        (_OVER, "ratio of 95th percentiles", "1", "p95_ratio", ""),
+        (_OVER, "ratio of the largest", "1", "largest_ratio", ""),
+        ("flight time", "ratio of the longest", "1", "longest_ratio", ""),
+    ),
+    "worst": (
+        ("flight time", "largest", "s", "worst_s", "flights"),
+        ("flight time", "largest over mean golden", "1", "over_mean_ratio", "flights"),
+        ("flight time", "share of the increase over mean golden recovered", "1",
+         "over_mean_recovered_share", "flights"),
+    ),
+}  # fmt: skip
 
 
-_NAMES = ("table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
-          "low", "high", "count")  # fmt: skip
-# Quantity, statistic and unit of a number, and its path in the row.
-_OF_COSTS = (
-    ("lost by faults", "flights", "count", ("lost",)),
-    ("cost of a fault", "mean", "s", ("cost_s", "mean")),
-    ("cost of a fault", "largest", "s", ("cost_s", "largest")),
-    ("flight time over own golden", "95th percentile", "1", ("over_own", "p95")),
-    ("flight time over own golden", "largest", "1", ("over_own", "largest")),
-    ("flight time over own golden", "share of the largest increase recovered", "1",
-     ("over_own", "recovered_share")),
-)  # fmt: skip
-_OF_DIFFERENCES = (
-    ("cost of a fault", "mean difference", "s", ("extra_s",)),
-    ("cost of a fault", "pairs that differ", "count", ("differ",)),
-    ("cost of a fault", "p-value of the mean difference", "1", ("p_value",)),
-    ("flight time over own golden", "ratio of 95th percentiles", "1", ("p95_ratio",)),
-    ("flight time over own golden", "ratio of the largest", "1", ("largest_ratio",)),
-    ("flight time", "ratio of the longest", "1", ("longest_ratio",)),
-)
-_OF_WORST = (
-    ("flight time", "largest", "s", ("worst_s",)),
-    ("flight time", "largest over mean golden", "1", ("over_mean_ratio",)),
-    ("flight time", "share of the increase over mean golden recovered", "1",
-     ("over_mean_recovered_share",)),
-)  # fmt: skip
-
-
-def platform_csv(told: Row) -> str:
+def platform_csv(comparison: Comparison) -> str:
     """One row per number: quantity, platform, setting, unit, value and interval."""
-    rows = [*_setting_numbers(told["settings"]), *_ratio_numbers(told["ratios"])]
-    for row in told["costs"]:
-        counts = {"lost": row["pairs"] + row["lost"]}
-        rows += _numbers("costs", row, _OF_COSTS, counts, row["pairs"])
-    for row in told["cost_differences"]:
-        counts = dict.fromkeys(("differ", "p_value"), row["pairs"])
-        rows += _numbers("costs", row, _OF_DIFFERENCES, counts)
-    for row in told["worst"]:
-        rows += _numbers("worst", row, _OF_WORST, {}, row["flights"])
-    blank = (
-        {key: "" if isinstance(cell, float) and math.isnan(cell) else cell
-         for key, cell in row.items()}
-        for row in rows
-    )  # fmt: skip
-    return Table.of_records(blank, _NAMES).csv()
+    rows = [_NAMES]
+    for table, numbers in _NUMBERS.items():
+        title = "costs" if table == "cost_differences" else table
+        for row in getattr(comparison, table):
+            places = [title, row.platform, getattr(row, "reference", ""), row.setting]
+            for quantity, statistic, unit, name, count in numbers:
+                size = attrgetter(count)(row) if count else None
+                cells = _number_cells(attrgetter(name)(row), size)
+                rows.append([*places, quantity, statistic, unit, *cells])
+            for own in QUANTITIES if table in ("settings", "ratios") else ():
+                for statistic, unit, value in _statistics(row.quantities[own.name]):
+                    cells = _number_cells(value, None)
+                    rows.append([*places, own.title, statistic, unit, *cells])
+    return Table(rows).csv()
 
 
-def _at(table: str, row: Row, quantity: str, statistic: str, unit: str) -> dict[str, Any]:
-    labels = {name: row[name] for name in ("platform", "reference", "setting") if name in row}
-    return {"table": table, **labels, "quantity": quantity, "statistic": statistic, "unit": unit}
+def _statistics(
+    quantity: MeasuredQuantity | ChangedQuantity,
+) -> Iterable[tuple[str, str, Interval]]:
+    """Name, unit and value of each statistic of a quantity."""
+    if isinstance(quantity, ChangedQuantity):
+        return [(quantity.kind, "1" if quantity.kind == "ratio" else quantity.unit, quantity)]
+    return [("median", quantity.unit, quantity.median), ("mean", quantity.unit, quantity.mean)]
 
 
-def _setting_numbers(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
-    for row in rows:
-        success = row["success"]
-        yield {**_at("settings", row, "success", "share", "1"), "value": success["share"],
-               "low": success["low"], "high": success["high"],
-               "count": success["total"]}  # fmt: skip
-        for each in QUANTITIES:
-            found = row["quantities"][each.name]
-            for statistic in ("median", "mean"):
-                told = _at("settings", row, each.title, statistic, each.unit)
-                yield {**told, **found[statistic]}
-
-
-def _ratio_numbers(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
-    for row in rows:
-        yield {**_at("ratios", row, "success", "difference", "1"),
-               "value": row["success"]["difference"], "count": row["pairs"]}  # fmt: skip
-        for each in QUANTITIES:
-            found = dict(row["quantities"][each.name])
-            kind, unit = found.pop("kind"), found.pop("unit")
-            told = _at("ratios", row, each.title, kind, "1" if kind == "ratio" else unit)
-            yield {**told, **found}
-
-
-def _numbers(
-    table: str, row: Row, listed: Any, counts: Mapping[str, int], count: int | None = None
-) -> Iterator[dict[str, Any]]:
-    """The listed numbers of a row.
-
-    Args:
-        counts: sample sizes, by the first word of a number's path.
-        count: sample size of numbers without their own.
-    """
-    for quantity, statistic, unit, place in listed:
-        found: Any = row
-        for name in place:
-            found = found[name]
-        values = dict(found) if isinstance(found, Mapping) else {"value": found}
-        if "count" not in values and (of := counts.get(place[0], count)) is not None:
-            values["count"] = of
-        yield {**_at(table, row, quantity, statistic, unit), **values}
+def _number_cells(value: Interval | Share | float, count: int | None) -> list[str]:
+    """Value, ends of the interval and sample size, empty if there are none."""
+    if isinstance(value, Share):
+        value = value.effect
+    if isinstance(value, Interval):
+        numbers: tuple[float | None, ...] = (value.value, value.low, value.high, value.count)
+    else:
+        numbers = (value, None, None, count)
+    return ["" if cell is None or math.isnan(cell) else f"{cell}" for cell in numbers]

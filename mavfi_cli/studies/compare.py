@@ -6,12 +6,21 @@ with the whole record.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.analysis.flights import errors, flights
-from mavfi_cli.analysis.platforms import GOLDEN, NONE, compared, figures, platforms_told
+from mavfi_cli.analysis.platforms import (
+    GOLDEN,
+    NONE,
+    ComparedPlan,
+    ComparedTimelines,
+    Comparison,
+    compared,
+    figures,
+    summaries,
+)
 from mavfi_cli.analysis.timeline import timeline_seed, timelines
 from mavfi_cli.campaigns.begin import begin, resumed
 from mavfi_cli.campaigns.missions import PlannedMission
@@ -30,7 +39,7 @@ FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
 STAGES = tuple(stage.value for stage in Stage)
 MOST = 100_000  # missions
-SCHEMA = 2  # of compare.json; version 1 listed the costs of faults with the worst cases
+SCHEMA = 3  # of compare.json; version 2 had the difference of success in `success`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +76,7 @@ class ComparePlan:
             raise ConfigError(f"must be at {limit}, got {self.missions}", key="missions")
         for key in ("first_seed", "seed"):
             if getattr(self, key) < 0:
-                raise ConfigError(f"must not be negative, got {getattr(self, key)}", key=key)
+                raise ConfigError(f"must be at least 0, got {getattr(self, key)}", key=key)
         if self.field is not None and not self.inject:
             raise ConfigError(f"{self.field}: there is no fault", key="field")
 
@@ -77,10 +86,11 @@ class ComparePlan:
         protectors = tuple(name for name in self.detectors if name != NONE)
         return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
 
-    def told(self) -> dict[str, Any]:
-        """The plan, with descriptions of the platforms, as plain values."""
-        platforms = platforms_told(self.platforms)
-        return {**asdict(self), "platforms": platforms, "settings": list(self.settings)}
+    def described(self) -> ComparedPlan:
+        """The plan with descriptions of the platforms."""
+        own = {part.name: getattr(self, part.name) for part in fields(self)}
+        return ComparedPlan(**{**own, "platforms": summaries(self.platforms)},
+                            settings=self.settings)  # fmt: skip
 
     def spec(self) -> Spec:
         """The specification of the campaign."""
@@ -91,8 +101,8 @@ class ComparePlan:
         settings = [Setting(name=GOLDEN)]
         for name in self.settings[1:]:
             detector = {} if name == NONE else {"detector": (name,)}
-            told = FAULTY if name == NONE else f"D&R({_SHORT.get(name, name)})"
-            settings.append(Setting(name=told, axes={**faults, **detector}))
+            title = FAULTY if name == NONE else f"D&R({_SHORT.get(name, name)})"
+            settings.append(Setting(name=title, axes={**faults, **detector}))
         return Spec(
             name="compare",
             about="The same missions on several computers",
@@ -106,13 +116,8 @@ class ComparePlan:
         )
 
 
-def compare(
-    plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
-) -> dict[str, Any]:
+def compare(plan: ComparePlan, folder: Path, options: Options, spectator: Spectator) -> Comparison:
     """Fly the missing missions of the folder, and compare the platforms.
-
-    Returns:
-        Plain values, the contents of `compare.json`.
 
     Raises:
         ConfigError: the folder holds another comparison.
@@ -123,21 +128,21 @@ def compare(
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
         table = flights(ledger)
     flown = compared(table)
-    found = figures(plan.platforms, plan.settings, flown)
+    numbers = figures(plan.platforms, plan.settings, flown)
     seed = timeline_seed(flown, plan.platforms) or plan.first_seed
-    return {
-        "schema": SCHEMA,
-        "plan": plan.told(),
-        "versions": installed_versions(),
-        "errors": errors(table, "mission {number}: {reason}"),
-        **found,
-        "timeline": _timelines(plan, seed, folder / "timeline", options, spectator),
-    }
+    return Comparison(
+        schema=SCHEMA,
+        plan=plan.described(),
+        versions=installed_versions(),
+        errors=errors(table, "mission {number}: {reason}"),
+        timeline=_timelines(plan, seed, folder / "timeline", options, spectator),
+        **{part.name: getattr(numbers, part.name) for part in fields(numbers)},
+    )
 
 
 def _timelines(
     plan: ComparePlan, seed: int, folder: Path, options: Options, spectator: Spectator
-) -> dict[str, Any]:
+) -> ComparedTimelines:
     spectator.on_note(f"the golden flights of seed {seed} again, for the timeline")
     golden = MissionConfig(world=plan.world, stack=plan.stack, seed=seed)
     missions = [
@@ -147,4 +152,4 @@ def _timelines(
     table = fly(missions, folder, Keep.ALL, options, spectator)
     paths = dict(zip(table["platform"].to_pylist(), table["path"].to_pylist(), strict=True))
     runs = {name: load_run(Path(paths[name])) for name in plan.platforms if paths.get(name)}
-    return {"seed": seed, "platforms": [asdict(line) for line in timelines(runs)]}
+    return ComparedTimelines(seed=seed, platforms=timelines(runs))

@@ -1,10 +1,13 @@
 """Flights of a comparison, made up."""
 
+from dataclasses import fields
+
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from mavfi_cli.analysis.platforms import SCHEMA, figures
+from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, Comparison, figures
+from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.studies.compare import ComparePlan
 
 PLAN = ComparePlan(inject=("planning",), missions=10)
@@ -57,42 +60,41 @@ def made_up():
     return flights
 
 
-def lane(*spans):
-    return [list(span) for span in spans]
-
-
 def panel(platform, factor):
     """A frame's way through kernels that take so many times as long as on x86."""
     octomap, check = 0.3 * factor, 0.02 * factor
     answer = round(octomap + check + 0.04, 2)
     chain = {
-        "point_cloud": [0.0, 0.002],
-        "octomap": [0.02, 0.02 + octomap],
-        "collision_check": [0.02 + octomap, 0.02 + octomap + check],
-        "control": [answer, answer + 0.0005],
-        "planner": [answer, answer + 0.08 * factor],
+        "point_cloud": (0.0, 0.002),
+        "octomap": (0.02, 0.02 + octomap),
+        "collision_check": (0.02 + octomap, 0.02 + octomap + check),
+        "control": (answer, answer + 0.0005),
+        "planner": (answer, answer + 0.08 * factor),
     }
-    return {
-        "platform": platform,
-        "frame_stamp_s": 12.0,
-        "response_s": answer,
-        "answer": "stops before an obstacle",
-        "plan_setpoint_s": answer + 0.1 * factor,
-        "shown_s": [-0.05, 2.5],
-        "chain_s": chain,
-        "lanes_s": {name: lane(span) for name, span in chain.items()},
-        "setpoints_s": [0.02 * tick for tick in range(125)],
-    }
+    return Timeline(
+        platform=platform,
+        frame_stamp_s=12.0,
+        response_s=answer,
+        answer="stops before an obstacle",
+        plan_setpoint_s=answer + 0.1 * factor,
+        shown_s=(-0.05, 2.5),
+        chain_s=chain,
+        lanes_s={name: [span] for name, span in chain.items()},
+        setpoints_s=[0.02 * tick for tick in range(125)],
+    )
+
+
+def comparison(plan, flights, *, errors=(), timelines=()):
+    """All that `mavfi compare` would compute of these flights."""
+    own = figures_of(plan, flights)
+    return Comparison(
+        schema=1, plan=plan.described(), versions={}, errors=[*errors],
+        timeline=ComparedTimelines(seed=4, platforms=[*timelines]),
+        **{part.name: getattr(own, part.name) for part in fields(own)},
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")
 def whole():
-    """All that compare.json holds, of made-up flights; do not change it."""
-    return {
-        "schema": 1,
-        "plan": PLAN.told(),
-        "versions": {},
-        "errors": [],
-        **figures_of(PLAN, made_up()),
-        "timeline": {"seed": 4, "platforms": [panel("x86", 1.0), panel("tx2", 4.0)]},
-    }
+    """A comparison of made-up flights."""
+    return comparison(PLAN, made_up(), timelines=[panel("x86", 1.0), panel("tx2", 4.0)])

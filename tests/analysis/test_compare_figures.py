@@ -7,11 +7,11 @@ import shlex
 from dataclasses import replace
 
 import pytest
-from flown_twice import PLAN, SEEDS, figures_of, flight
+from flown_twice import PLAN, SEEDS, comparison, figures_of, flight
 
-from mavfi_cli.analysis.platforms import QUANTITIES
+from mavfi_cli.analysis.platforms import QUANTITIES, ChangedQuantity
 from mavfi_cli.report.platforms import platform_csv, platform_lines
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import Share, rate
 from mavfi_cli.studies.compare import ComparePlan
 
 
@@ -21,53 +21,53 @@ def told(whole):
 
 
 def row(told, table, **wanted):
-    (found,) = [r for r in told[table] if all(r[k] == v for k, v in wanted.items())]
+    (found,) = [
+        r for r in getattr(told, table) if all(getattr(r, k) == v for k, v in wanted.items())
+    ]
     return found
 
 
 def test_a_row_a_platform_and_setting_with_medians_means_and_largest(told):
-    assert len(told["settings"]) == 2 * 4
+    assert len(told.settings) == 2 * 4
     golden = row(told, "settings", platform="tx2", setting="golden")
-    found = golden["quantities"]["flight_time_s"]
-    assert found["median"]["value"] == pytest.approx(1.5 * 25.5)
-    assert found["mean"]["value"] == pytest.approx(1.5 * 25.5)
-    assert found["largest"] == pytest.approx(45.0)
-    assert found["median"]["low"] < found["median"]["value"] < found["median"]["high"]
-    assert golden["quantities"]["response_median_s"]["median"]["value"] == 1.6
-    assert golden["quantities"]["response_p95_s"]["median"]["value"] == 2.0
+    found = golden.quantities["flight_time_s"]
+    assert found.median.value == pytest.approx(1.5 * 25.5)
+    assert found.mean.value == pytest.approx(1.5 * 25.5)
+    assert found.largest == pytest.approx(45.0)
+    assert found.median.low < found.median.value < found.median.high
+    assert golden.quantities["response_median_s"].median.value == 1.6
+    assert golden.quantities["response_p95_s"].median.value == 2.0
 
 
 def test_success_is_counted_with_wilsons_interval():
     flights = [flight("x86", s, 20.0, outcome="success" if s > 3 else "collision") for s in SEEDS]
     told = figures_of(ComparePlan(platforms=("x86",), inject=()), flights)
-    (golden,) = told["settings"]
+    (golden,) = told.settings
     wilson = rate(7, 10)
-    assert golden["success"] == {
-        "count": 7, "total": 10, "share": 0.7, "low": wilson.low, "high": wilson.high,
-    }  # fmt: skip
-    assert golden["outcomes"] == {"collision": 3, "success": 7}
-    assert golden["quantities"]["flight_time_s"]["median"]["count"] == 7
-    assert golden["quantities"]["response_median_s"]["median"]["count"] == 10  # failed ones too
+    assert golden.success == Share(count=7, total=10, share=0.7, low=wilson.low, high=wilson.high)
+    assert golden.outcomes == {"collision": 3, "success": 7}
+    assert golden.quantities["flight_time_s"].median.count == 7
+    assert golden.quantities["response_median_s"].median.count == 10  # failed ones too
 
 
 def test_faults_that_did_nothing_are_in_no_number():
     flights = [flight("x86", 1, 20.0, "none"), flight("x86", 2, 90.0, "none", counted=False)]
     found = row(figures_of(PLAN, flights), "settings", platform="x86", setting="none")
-    assert (found["flown"], found["counted"]) == (2, 1)
-    assert found["quantities"]["flight_time_s"]["largest"] == 20.0
+    assert (found.flown, found.counted) == (2, 1)
+    assert found.quantities["flight_time_s"].largest == 20.0
 
 
 def test_platforms_are_compared_mission_by_mission(told):
     golden = row(told, "ratios", platform="tx2", setting="golden")
-    time = golden["quantities"]["flight_time_s"]
-    assert (golden["reference"], golden["pairs"], time["count"]) == ("x86", 10, 10)
-    assert time["value"] == pytest.approx(1.5)
-    assert time["low"] == time["high"] == pytest.approx(1.5)  # the same in every mission
-    assert golden["quantities"]["response_median_s"]["value"] == pytest.approx(4.0)
-    assert golden["quantities"]["distance_m"]["value"] == pytest.approx(1.0)
-    assert golden["quantities"]["replans"] == {
-        "kind": "difference", "unit": "count", "value": 0.0, "low": 0.0, "high": 0.0, "count": 10,
-    }  # fmt: skip
+    time = golden.quantities["flight_time_s"]
+    assert (golden.reference, golden.pairs, time.count) == ("x86", 10, 10)
+    assert time.value == pytest.approx(1.5)
+    assert time.low == time.high == pytest.approx(1.5)  # the same in every mission
+    assert golden.quantities["response_median_s"].value == pytest.approx(4.0)
+    assert golden.quantities["distance_m"].value == pytest.approx(1.0)
+    assert golden.quantities["replans"] == ChangedQuantity(
+        kind="difference", unit="count", value=0.0, low=0.0, high=0.0, count=10
+    )
 
 
 def test_the_ratio_is_of_missions_that_both_platforms_fly_and_win():
@@ -77,11 +77,11 @@ def test_the_ratio_is_of_missions_that_both_platforms_fly_and_win():
         flight("tx2", 4, 99.0),
     ]  # fmt: skip
     golden = row(figures_of(PLAN, flights), "ratios", platform="tx2", setting="golden")
-    assert (golden["pairs"], golden["both_succeed"]) == (2, 1)
-    assert golden["quantities"]["flight_time_s"]["count"] == 1
-    assert golden["quantities"]["flight_time_s"]["value"] == pytest.approx(2.0)
-    assert golden["success"]["only_first"] == 1
-    assert golden["success"]["difference"] == pytest.approx(-0.5)
+    assert (golden.pairs, golden.both_succeed) == (2, 1)
+    assert golden.quantities["flight_time_s"].count == 1
+    assert golden.quantities["flight_time_s"].value == pytest.approx(2.0)
+    assert golden.success.only_first == 1
+    assert golden.success.difference == pytest.approx(-0.5)
 
 
 def test_the_ratio_is_geometric_so_that_it_turns_round_with_the_platforms():
@@ -90,12 +90,12 @@ def test_the_ratio_is_geometric_so_that_it_turns_round_with_the_platforms():
 
     def of(*platforms):
         told = figures_of(ComparePlan(platforms=platforms, inject=()), flights)
-        (found,) = told["ratios"]
-        return found["quantities"]["flight_time_s"]
+        (found,) = told.ratios
+        return found.quantities["flight_time_s"]
 
     there, back = of("x86", "tx2"), of("tx2", "x86")
-    assert there["value"] == pytest.approx((2.0 * 1.0 * 2.25) ** (1.0 / 3.0))
-    assert back["value"] == pytest.approx(1.0 / there["value"])
+    assert there.value == pytest.approx((2.0 * 1.0 * 2.25) ** (1.0 / 3.0))
+    assert back.value == pytest.approx(1.0 / there.value)
 
 
 def test_several_faults_of_one_mission_count_as_one():
@@ -107,20 +107,20 @@ def test_several_faults_of_one_mission_count_as_one():
                                        ("tx2", 2, 40.0))
     ]  # fmt: skip
     found = row(figures_of(plan, flights), "ratios", platform="tx2", setting="none")
-    assert found["pairs"] == 4
-    assert found["quantities"]["flight_time_s"]["count"] == 2
-    assert found["quantities"]["flight_time_s"]["value"] == pytest.approx(math.sqrt(8.0))
+    assert found.pairs == 4
+    assert found.quantities["flight_time_s"].count == 2
+    assert found.quantities["flight_time_s"].value == pytest.approx(math.sqrt(8.0))
 
 
 def test_the_longest_flights_over_the_mean_golden_one(told):
     golden = row(told, "worst", platform="x86", setting="golden")
     faulty = row(told, "worst", platform="x86", setting="none")
     aad = row(told, "worst", platform="x86", setting="aad")
-    assert golden["worst_s"] == 30.0
-    assert faulty["worst_s"] == 44.0
-    assert faulty["over_mean_ratio"] == pytest.approx(44.0 / 25.5)
+    assert golden.worst_s == 30.0
+    assert faulty.worst_s == 44.0
+    assert faulty.over_mean_ratio == pytest.approx(44.0 / 25.5)
     # Against the mean, what remains is the longest mission, not the fault.
-    assert aad["over_mean_recovered_share"] == pytest.approx((44.0 - 30.0) / (44.0 - 25.5))
+    assert aad.over_mean_recovered_share == pytest.approx((44.0 - 30.0) / (44.0 - 25.5))
 
 
 def test_faults_no_longer_than_the_longest_golden_flight_leave_nothing_to_recover():
@@ -128,19 +128,17 @@ def test_faults_no_longer_than_the_longest_golden_flight_leave_nothing_to_recove
     told = figures_of(PLAN, flights)
     for setting in ("gad", "aad"):
         assert math.isnan(
-            row(told, "worst", platform="x86", setting=setting)["over_mean_recovered_share"]
+            row(told, "worst", platform="x86", setting=setting).over_mean_recovered_share
         )
         assert math.isnan(
-            row(told, "costs", platform="x86", setting=setting)["over_own"]["recovered_share"]
+            row(told, "costs", platform="x86", setting=setting).over_own.recovered_share
         )
 
 
 def test_a_fault_that_cost_nothing_is_not_recommended():
     flights = [flight(p, s, 20.0, setting) for p in PLAN.platforms for s in SEEDS
                for setting in PLAN.settings]  # fmt: skip
-    text = "\n".join(
-        platform_lines({"plan": PLAN.told(), "errors": [], **figures_of(PLAN, flights)})
-    )
+    text = "\n".join(platform_lines(comparison(PLAN, flights)))
     assert "no fault made a flight longer on tx2" in text
     assert "mavfi fly" not in text
 
@@ -149,7 +147,7 @@ def test_the_command_that_repeats_the_worst_flight_can_be_pasted():
     plan = replace(PLAN, world="my worlds/a b.toml")
     flights = [flight(p, s, 21.0 if setting == "none" else 20.0, setting) for p in PLAN.platforms
                for s in SEEDS for setting in PLAN.settings]  # fmt: skip
-    lines = platform_lines({"plan": plan.told(), "errors": [], **figures_of(PLAN, flights)})
+    lines = platform_lines(comparison(plan, flights))
     again = next(line for line in lines if "mavfi fly" in line)
     words = ["mavfi", "fly", "--world", "my worlds/a b.toml", "--seed"]
     assert shlex.split(again)[:5] == words
@@ -157,11 +155,11 @@ def test_the_command_that_repeats_the_worst_flight_can_be_pasted():
 
 def test_nothing_flown_gives_no_number_and_no_error():
     told = figures_of(PLAN, [])
-    assert all(r["success"]["total"] == 0 for r in told["settings"])
-    assert all(math.isnan(r["worst_s"]) for r in told["worst"])
-    assert all(r["pairs"] == 0 and r["worst_flight"] is None for r in told["costs"])
-    assert all(math.isnan(r["extra_s"]["value"]) for r in told["cost_differences"])
-    assert all(math.isnan(r["quantities"]["flight_time_s"]["value"]) for r in told["ratios"])
+    assert all(r.success.total == 0 for r in told.settings)
+    assert all(math.isnan(r.worst_s) for r in told.worst)
+    assert all(r.pairs == 0 and r.worst_flight is None for r in told.costs)
+    assert all(math.isnan(r.extra_s.value) for r in told.cost_differences)
+    assert all(math.isnan(r.quantities["flight_time_s"].value) for r in told.ratios)
 
 
 def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
@@ -171,7 +169,7 @@ def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
                outcome="collision" if platform == "tx2" and seed % 4 == 0 else "success")
         for platform in plan.platforms for seed in range(200) for setting in plan.settings
     ]  # fmt: skip
-    told = {"plan": plan.told(), "errors": ["mission 3: no"], **figures_of(plan, flights)}
+    told = comparison(plan, flights, errors=["mission 3: no"])
     text = platform_lines(told)
     assert "-25.0 (p<.001)" in "\n".join(text)
     assert [line for line in text if len(line) > 100 and not line.startswith("  mavfi fly")] == []
@@ -184,7 +182,7 @@ def test_intervals_of_too_few_flights_are_said_to_be_too_narrow(missions, said):
         flight(platform, seed, 20.0 + seed) for platform in plan.platforms
         for seed in range(1, missions + 1)
     ]  # fmt: skip
-    told = {"plan": plan.told(), "errors": [], **figures_of(plan, flights)}
+    told = comparison(plan, flights)
     assert ("fewer than 10 flights are too narrow" in "\n".join(platform_lines(told))) is said
 
 
@@ -196,7 +194,7 @@ def test_text_and_csv_say_every_number_with_its_unit(whole):
         line
         == "  mavfi fly --world sparse --seed 2 --platform tx2 --inject planning --fault-seed 14"
     )
-    hardened = {**whole, "plan": {**whole["plan"], "stack": "hardened"}}
+    hardened = replace(whole, plan=replace(whole.plan, stack="hardened"))
     (line,) = [line for line in platform_lines(hardened) if "--seed 2 --platform tx2" in line]
     assert line.endswith("--platform tx2 --stack hardened --inject planning --fault-seed 14")
     rows = list(csv.DictReader(io.StringIO(platform_csv(whole))))
@@ -211,5 +209,5 @@ def test_text_and_csv_say_every_number_with_its_unit(whole):
     assert float(ratio["value"]) == pytest.approx(1.5)
     largest = {r["setting"]: float(r["value"]) for r in rows if r["statistic"] == "ratio of the "
                "largest"}  # fmt: skip
-    assert largest == {r["setting"]: r["largest_ratio"] for r in whole["cost_differences"]}
+    assert largest == {r.setting: r.largest_ratio for r in whole.cost_differences}
     assert len(largest) == 3

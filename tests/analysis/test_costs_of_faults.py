@@ -1,12 +1,14 @@
 """What faults cost on each platform, against numbers made by hand and by NumPy."""
 
 import math
+from dataclasses import astuple
 
 import numpy as np
 import pytest
 from flown_twice import SEEDS, flight, table
 
-from mavfi_cli.analysis.platforms import FaultCosts
+from mavfi_cli.analysis.platforms import FaultCosts, WorstFault
+from mavfi_cli.stats.shares import Interval
 
 
 def struck(golden, counted):
@@ -14,7 +16,11 @@ def struck(golden, counted):
 
 
 def cost_row(setting, found, faults):
-    return found.row(faults, protected=setting != "none")
+    return found.row("x86", setting, faults)
+
+
+def beyond(found, first):
+    return found.beyond(first, "tx2", "none", "x86")
 
 
 def of(platform, costs, *, golden_s=20.0, target="planning", lost=()):
@@ -30,39 +36,37 @@ def test_the_cost_is_held_against_the_own_golden_flight():
     counted = [flight("x86", 1, 25.0, "none"), flight("x86", 2, 44.0, "none")]
     bare = struck(golden, counted)
     told = cost_row("none", bare, bare)
-    assert told["pairs"] == 2
-    assert told["cost_s"]["mean"]["value"] == pytest.approx(4.5)
-    assert told["cost_s"]["largest"] == pytest.approx(5.0)
-    assert told["over_own"]["largest"] == pytest.approx(1.25)
-    assert told["worst_flight"] == {"seed": 1, "target": "planning", "fault_seed": 7}
-    assert math.isnan(told["over_own"]["recovered_share"])  # there is no detector
+    assert told.pairs == 2
+    assert told.cost_s.mean.value == pytest.approx(4.5)
+    assert told.cost_s.largest == pytest.approx(5.0)
+    assert told.over_own.largest == pytest.approx(1.25)
+    assert told.worst_flight == WorstFault(seed=1, target="planning", fault_seed=7)
+    assert math.isnan(told.over_own.recovered_share)  # there is no detector
 
 
 def test_a_flight_that_only_the_fault_lost_is_counted_as_lost_and_costs_nothing():
     found = of("x86", {1: 0.0, 2: 1.0}, lost=(3, 4))
     told = cost_row("none", found, found)
-    assert (told["pairs"], told["lost"]) == (2, 2)
+    assert (told.pairs, told.lost) == (2, 2)
     golden_lost = struck([flight("x86", 1, 20.0)], [flight("x86", 2, 5.0, "none", outcome="crash")])
-    assert cost_row("none", golden_lost, golden_lost)["lost"] == 0
+    assert cost_row("none", golden_lost, golden_lost).lost == 0
 
 
 def test_a_detector_recovers_a_share_of_the_largest_increase():
     bare, protected = of("x86", {1: 0.0, 2: 10.0}), of("x86", {1: 2.5, 2: 1.0})
-    assert cost_row("gad", protected, bare)["over_own"]["recovered_share"] == 0.75
+    assert cost_row("gad", protected, bare).over_own.recovered_share == 0.75
     worse = of("x86", {1: 15.0, 2: 0.0})
-    assert cost_row("gad", worse, bare)["over_own"]["recovered_share"] == -0.5
+    assert cost_row("gad", worse, bare).over_own.recovered_share == -0.5
 
 
 def test_the_95th_percentile_is_numpys_and_lies_in_its_interval():
     rng = np.random.default_rng(4)
     costs = dict(enumerate(rng.exponential(1.0, 150).tolist()))
     found = of("x86", costs)
-    late = cost_row("none", found, found)["over_own"]["p95"]
-    assert late["value"] == pytest.approx(
-        np.quantile([1.0 + c / 20.0 for c in costs.values()], 0.95)
-    )
-    assert late["low"] < late["value"] < late["high"]
-    assert late["count"] == 150
+    late = cost_row("none", found, found).over_own.p95
+    assert late.value == pytest.approx(np.quantile([1.0 + c / 20.0 for c in costs.values()], 0.95))
+    assert late.low < late.value < late.high
+    assert late.count == 150
 
 
 def test_faults_of_one_mission_are_drawn_together():
@@ -72,9 +76,9 @@ def test_faults_of_one_mission_are_drawn_together():
     once = [flight("x86", s, 20.0 + c, "none", target="planning") for s, c in costs.items()]
     again = [flight("x86", s, 20.0 + c, "none", target="control") for s, c in costs.items()]
     one, two = struck(golden, once), struck(golden, once + again)
-    single, double = (cost_row("none", each, each)["cost_s"]["mean"] for each in (one, two))
-    assert single == pytest.approx(double)
-    assert single["low"] < single["high"]
+    single, double = (cost_row("none", each, each).cost_s.mean for each in (one, two))
+    assert astuple(single) == pytest.approx(astuple(double))
+    assert single.low < single.high
 
 
 def test_missing_flights_of_a_mission_leave_the_others():
@@ -84,50 +88,51 @@ def test_missing_flights_of_a_mission_leave_the_others():
     found = struck(golden, counted)
     told = cost_row("none", found, found)
     values = [1.0] * 10 + [3.0] * 2
-    assert told["pairs"] == 12
-    assert told["cost_s"]["mean"]["value"] == pytest.approx(np.mean(values))
+    assert told.pairs == 12
+    assert told.cost_s.mean.value == pytest.approx(np.mean(values))
     over = [1.0 + value / 20.0 for value in values]
-    assert told["over_own"]["p95"]["value"] == pytest.approx(np.quantile(over, 0.95))
+    assert told.over_own.p95.value == pytest.approx(np.quantile(over, 0.95))
 
 
 def test_platforms_are_compared_over_the_faults_that_both_have_a_cost_of():
     first = of("x86", {1: 0.0, 2: 1.0, 3: 0.0, 4: 99.0})
     second = of("tx2", {1: 0.5, 2: 3.0, 3: 0.5, 5: 99.0})
-    told = second.extra(first)
-    assert told["pairs"] == 3
-    assert told["extra_s"]["value"] == pytest.approx(1.0)
-    assert told["extra_s"]["low"] >= 0.5
-    assert told["extra_s"]["high"] <= 2.0
+    told = beyond(second, first)
+    assert told.pairs == 3
+    assert told.extra_s.value == pytest.approx(1.0)
+    assert told.extra_s.low >= 0.5
+    assert told.extra_s.high <= 2.0
     here, there = (np.quantile([1.0 + c / 20.0 for c in costs], 0.95) for costs in (
         (0.0, 1.0, 0.0), (0.5, 3.0, 0.5)))  # fmt: skip
-    assert told["p95_ratio"]["value"] == pytest.approx(there / here)
+    assert told.p95_ratio.value == pytest.approx(there / here)
     # A worst case is that of all flights of its platform.
-    assert told["largest_ratio"] == pytest.approx(1.0)
-    assert told["longest_ratio"] == pytest.approx(1.0)
+    assert told.largest_ratio == pytest.approx(1.0)
+    assert told.longest_ratio == pytest.approx(1.0)
 
 
 def test_the_longest_flight_counts_where_its_golden_one_failed_too():
     first = struck([flight("x86", 1, 20.0)], [flight("x86", s, 20.0 * s, "none") for s in (1, 2)])
     second = struck([flight("tx2", 1, 20.0)], [flight("tx2", s, 30.0 * s, "none") for s in (1, 2)])
     assert (second.costs.num_rows, second.longest_s) == (1, 60.0)
-    told = second.extra(first)
-    assert (told["pairs"], told["longest_ratio"]) == (1, 1.5)
+    told = beyond(second, first)
+    assert (told.pairs, told.longest_ratio) == (1, 1.5)
 
 
 def test_equal_costs_differ_by_nothing_with_no_width():
     costs = {seed: float(seed % 3) for seed in SEEDS}
-    told = of("tx2", costs).extra(of("x86", costs))
-    assert told["extra_s"] == {"value": 0.0, "low": 0.0, "high": 0.0, "count": 10}
-    assert told["p95_ratio"] == {"value": 1.0, "low": 1.0, "high": 1.0, "count": 10}
+    told = beyond(of("tx2", costs), of("x86", costs))
+    assert told.extra_s == Interval(value=0.0, low=0.0, high=0.0, count=10)
+    assert told.p95_ratio == Interval(value=1.0, low=1.0, high=1.0, count=10)
 
 
 def test_three_faults_that_cost_more_are_no_difference_whatever_the_interval():
     """A bootstrap of zeros and a few positive costs never falls below zero; chance is 2 in 8."""
     costs = dict.fromkeys(range(1, 51), 0.0)
-    told = of("tx2", costs | {3: 1.84, 14: 0.38, 15: 0.5}).extra(of("x86", costs))
-    assert (told["pairs"], told["differ"]) == (50, 3)
-    assert told["extra_s"]["low"] > 0.0
-    assert told["p_value"] == pytest.approx(0.25)
+    slower = of("tx2", costs | {3: 1.84, 14: 0.38, 15: 0.5})
+    told = beyond(slower, of("x86", costs))
+    assert (told.pairs, told.differ) == (50, 3)
+    assert told.extra_s.low > 0.0
+    assert told.p_value == pytest.approx(0.25)
 
 
 def test_the_chance_takes_the_faults_of_one_mission_as_one():
@@ -138,5 +143,5 @@ def test_the_chance_takes_the_faults_of_one_mission_as_one():
         return struck(own, [flight(platform, s, 20.0 + cost_s, "none", target=target)
                             for s in (1, 2, 3) for target in ("planning", "control")])  # fmt: skip
 
-    told = found("tx2", 1.0).extra(found("x86", 0.0))
-    assert (told["pairs"], told["differ"], told["p_value"]) == (6, 6, 0.25)
+    told = beyond(found("tx2", 1.0), found("x86", 0.0))
+    assert (told.pairs, told.differ, told.p_value) == (6, 6, 0.25)

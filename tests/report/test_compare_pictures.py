@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 
 import matplotlib as mpl
 import pytest
-from flown_twice import PLAN, figures_of
+from flown_twice import PLAN, comparison
 from matplotlib.patches import Rectangle
 
 from mavfi_cli.report.compare_plot import PICTURES
@@ -50,14 +50,14 @@ def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
 
 def test_the_replans_stand_below_the_flights(whole):
     said = [text.get_text() for text in PICTURES["compare.svg"](whole).axes[0].texts]
-    means = [row["quantities"]["replans"]["mean"]["value"] for row in whole["settings"]]
+    means = [row.quantities["replans"].mean.value for row in whole.settings]
     assert [text for text in said if "replans" in text] == [f"{m:.1f} replans" for m in means]
 
 
 def test_the_worst_case_bars_are_as_high_as_the_numbers(whole):
     worst = PICTURES["compare.svg"](whole).axes[4]
     heights = [bar.get_height() for bar in bars(worst)]
-    told = [row["over_own"]["largest"] for row in whole["costs"]]
+    told = [row.over_own.largest for row in whole.costs]
     assert heights == pytest.approx([100.0 * (ratio - 1.0) for ratio in told])
 
 
@@ -70,7 +70,7 @@ def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
     response = PICTURES["compare.svg"](whole).axes[2]
     of_tx2 = [bar for bar in bars(response) if bar.get_y() > 0.5]
     assert sum(bar.get_width() for bar in of_tx2) == pytest.approx(1600.0)
-    latency_s = whole["plan"]["platforms"][1]["kernel_latency_s"]
+    latency_s = whole.plan.platforms[1].kernel_latency_s
     assert of_tx2[1].get_width() == pytest.approx(1e3 * latency_s["octomap"])
 
 
@@ -80,8 +80,7 @@ def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
      "tx2"))],
 )  # fmt: skip
 def test_nothing_flown_and_other_numbers_of_platforms_are_drawn_all_the_same(plan, tmp_path):
-    told = {"plan": plan.told(), "errors": [], **figures_of(plan, []),
-            "timeline": {"seed": 1, "platforms": []}}  # fmt: skip
+    told = comparison(plan, [])
     write_figure(PICTURES["compare.svg"](told), tmp_path / "compare.svg")
     write_figure(PICTURES["timeline.svg"](told), tmp_path / "timeline.svg")
     assert "Success" in texts(tmp_path / "compare.svg")
@@ -102,9 +101,9 @@ def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp
 
 def test_bars_lie_where_the_kernels_ran_on_one_axis_for_all(whole):
     panels = PICTURES["timeline.svg"](whole).axes
-    for axes, row in zip(panels, whole["timeline"]["platforms"], strict=True):
+    for axes, row in zip(panels, whole.timeline.platforms, strict=True):
         assert axes.get_xlim() == (-0.05, 2.5)
-        start, end = row["chain_s"]["octomap"]
+        start, end = row.chain_s["octomap"]
         (octomap,) = bars(axes, "#1b4965")
         assert octomap.get_x() == pytest.approx(start)
         assert octomap.get_x() + octomap.get_width() == pytest.approx(end)

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import xml.etree.ElementTree as ET
+from dataclasses import asdict
 
 import pytest
 from missions import POSTS
@@ -131,7 +132,7 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
     compare(plan, folder, options, Spectator())
     whole = ComparePlan(world="posts.toml", inject=("waypoint_position",),
                         detectors=("none", "gad"), missions=2, first_seed=2)  # fmt: skip
-    assert plain(compare(whole, folder, options, Spectator())) == told
+    assert plain(asdict(compare(whole, folder, options, Spectator()))) == told
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_a_stack_is_that_of_every_mission_and_of_the_preset_with_it():
     assert {mission.config.stack for mission in plan.spec().missions()} == {"hardened"}
     preset = replaced(load_spec("fig16"), ["stack=hardened"])
     assert plan.spec().missions() == preset.missions()
-    assert plan.told()["stack"] == "hardened"
+    assert plan.described().stack == "hardened"
 
 
 def test_one_platform_and_no_faults_is_a_comparison_too():
@@ -75,8 +75,8 @@ def test_a_bit_field_reaches_every_fault():
         ({"platforms": ("x86", "x86")}, "platform: x86 is named twice"),
         ({"detectors": ("gad", "none", "gad")}, "detector: gad is named twice"),
         ({"inject": ("control", "control")}, "inject: control is named twice"),
-        ({"first_seed": -1}, "first_seed: must not be negative, got -1"),
-        ({"seed": -3}, "seed: must not be negative, got -3"),
+        ({"first_seed": -1}, "first_seed: must be at least 0, got -1"),
+        ({"seed": -3}, "seed: must be at least 0, got -3"),
         ({"inject": (), "field": "sign"}, "field: sign: there is no fault"),
     ],
 )
@@ -116,5 +116,5 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):
     path = tmp_path / "board.toml"
     path.write_text('name = "mine"\ncores = 4\nbase = "tx2"\n')
-    (told,) = ComparePlan(platforms=(str(path),), inject=()).told()["platforms"]
-    assert (told["title"], told["description"]) == ("board", "mine")
+    (told,) = ComparePlan(platforms=(str(path),), inject=()).described().platforms
+    assert (told.title, told.description) == ("board", "mine")
