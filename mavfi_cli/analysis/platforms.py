@@ -124,7 +124,7 @@ class MeasuredQuantity:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SettingRow:
+class SettingFlights:
     """The flights of a setting on a platform."""
 
     platform: str
@@ -269,7 +269,7 @@ class PlatformFigures:
     """
 
     confidence: float = CONFIDENCE
-    settings: list[SettingRow]
+    settings: list[SettingFlights]
     ratios: list[RatioRow]
     costs: list[CostRow]
     cost_differences: list[CostDifference]
@@ -286,7 +286,7 @@ class ComparedTimelines:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison(PlatformFigures):
+class PlatformComparison(PlatformFigures):
     """The contents of `compare.json`."""
 
     schema: int
@@ -341,9 +341,9 @@ def figures(
     )
 
 
-def _setting(platform: str, setting: str, flown: int, counted: pa.Table) -> SettingRow:
+def _setting(platform: str, setting: str, flown: int, counted: pa.Table) -> SettingFlights:
     ends = pc.value_counts(counted["outcome"]).to_pylist()
-    return SettingRow(
+    return SettingFlights(
         platform=platform,
         setting=setting,
         flown=flown,

@@ -7,7 +7,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.platforms import Comparison, CostRow, PlatformSummary, SettingRow
+from mavfi_cli.analysis.platforms import (
+    CostRow,
+    PlatformComparison,
+    PlatformSummary,
+    SettingFlights,
+)
 from mavfi_cli.analysis.timeline import Span, Timeline
 from mavfi_cli.report.drawing import (
     GRID,
@@ -39,7 +44,7 @@ _RATIOS = (
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 
 
-def _draw_comparison(comparison: Comparison) -> Figure:
+def _draw_comparison(comparison: PlatformComparison) -> Figure:
     """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
     figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
@@ -63,7 +68,7 @@ def _draw_comparison(comparison: Comparison) -> Figure:
     return figure
 
 
-def _caption(comparison: Comparison) -> str:
+def _caption(comparison: PlatformComparison) -> str:
     plan, share = comparison.plan, 100 * comparison.confidence
     struck = "no faults"
     if plan.inject:
@@ -82,7 +87,7 @@ def _frame(axes: Axes, title: str, grid: str) -> None:
 
 
 def _places(
-    comparison: Comparison, settings: Sequence[str]
+    comparison: PlatformComparison, settings: Sequence[str]
 ) -> tuple[dict[tuple[str, str], float], float]:
     platforms = [row.platform for row in comparison.plan.platforms]
     width = 0.76 / len(platforms)
@@ -99,7 +104,7 @@ def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
     axes.set_xlim(-0.55, len(settings) - 0.45)
 
 
-def _times(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+def _times(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     settings = comparison.plan.settings
     places, width = _places(comparison, settings)
     shown: dict[tuple[str, str], list[float]] = {}
@@ -133,7 +138,7 @@ def _times(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> No
     _frame(axes, "Flight time of each successful mission; bar: median; ring: the worst", "y")
 
 
-def _foot(axes: Axes, x: float, row: SettingRow, succeeded: int, colour: str) -> None:
+def _foot(axes: Axes, x: float, row: SettingFlights, succeeded: int, colour: str) -> None:
     replans, failed = row.quantities["replans"].mean.value, row.counted - succeeded
     lines = [f"{failed} failed"] if failed else []
     if not math.isnan(replans):
@@ -144,7 +149,7 @@ def _foot(axes: Axes, x: float, row: SettingRow, succeeded: int, colour: str) ->
         note_at(axes, text, (x, 0.0), height, **foot)
 
 
-def _success(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+def _success(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     settings = comparison.plan.settings
     places, width = _places(comparison, settings)
     for row in comparison.settings:
@@ -165,7 +170,7 @@ def _success(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> 
     _frame(axes, "Success", "y")
 
 
-def _response(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+def _response(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     """Draw the response time of golden flights, divided into kernels and waiting."""
     rows = {r.platform: r.quantities for r in comparison.settings if r.setting == _GOLDEN}
     platforms = comparison.plan.platforms
@@ -203,7 +208,7 @@ def _response(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) ->
     axes.spines["left"].set_visible(False)
 
 
-def _ratios(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     """Draw the paired ratios of each platform to the first: golden full, faulty open."""
     drawn = [row for row in comparison.ratios if row.setting in (_GOLDEN, _NONE)]
     titles = {row.platform: row.title for row in comparison.plan.platforms}
@@ -235,7 +240,7 @@ def _ratios(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> N
         axes.text(1.0, 1.5, "nothing to compare with", ha="center", fontsize=9, color=NOTE)
 
 
-def _costs(axes: Axes, comparison: Comparison, colours: Mapping[str, str]) -> None:
+def _costs(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     """Draw the extra flight time over the golden run with faults: worst and 95th percentile."""
     settings = [name for name in comparison.plan.settings if name != _GOLDEN]
     places, width = _places(comparison, settings)
@@ -311,7 +316,7 @@ _ROOM = 0.085  # minimum bar length for a text inside, as a fraction of the wind
 _LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go to the left
 
 
-def _draw_timeline(comparison: Comparison) -> Figure:
+def _draw_timeline(comparison: PlatformComparison) -> Figure:
     """Draw a figure with simulated time since the frame on x and a lane per kernel.
 
     All platforms share the time axis, so equal lengths are equal times.
@@ -332,7 +337,7 @@ def _draw_timeline(comparison: Comparison) -> Figure:
     return figure
 
 
-def _timeline_caption(comparison: Comparison) -> str:
+def _timeline_caption(comparison: PlatformComparison) -> str:
     return (
         f"golden flights in {comparison.plan.world}, seed {comparison.timeline.seed}; "
         "full colour: what led from the frame to its setpoint, and to the new plan;\n"
@@ -462,7 +467,7 @@ def _acts(axes: Axes, stamp_s: float, text: str, colour: str, below: float, widt
     )  # fmt: skip
 
 
-PICTURES: Mapping[str, Callable[[Comparison], Figure]] = {
+PICTURES: Mapping[str, Callable[[PlatformComparison], Figure]] = {
     "compare.svg": _draw_comparison,
     "timeline.svg": _draw_timeline,
 }

@@ -14,14 +14,14 @@ from mavfi_cli.analysis.platforms import (
     QUANTITIES,
     ChangedQuantity,
     ComparedPlan,
-    Comparison,
     CostDifference,
     CostRow,
     LongestFlight,
     MeasuredQuantity,
+    PlatformComparison,
     PlatformSummary,
     RatioRow,
-    SettingRow,
+    SettingFlights,
     WorstFault,
 )
 from mavfi_cli.report.table import Table, number, p_value, percent, rate, spread
@@ -41,7 +41,7 @@ def _titles_of(plan: ComparedPlan) -> dict[str, str]:
     return {row.platform: row.title for row in plan.platforms}
 
 
-def platform_lines(comparison: Comparison) -> list[str]:
+def platform_lines(comparison: PlatformComparison) -> list[str]:
     """The comparison in words and columns."""
     plan, settings = comparison.plan, comparison.settings
     lines = _head(plan)
@@ -74,7 +74,7 @@ def platform_lines(comparison: Comparison) -> list[str]:
     ]
 
 
-def _few(settings: Sequence[SettingRow]) -> list[str]:
+def _few(settings: Sequence[SettingFlights]) -> list[str]:
     counts = [row.quantities["flight_time_s"].mean.count for row in settings]
     if not any(1 < count < FEW for count in counts):
         return []
@@ -102,7 +102,7 @@ def _head(plan: ComparedPlan) -> list[str]:
 
 # Tables ---------------------------------------------------------------------------------------
 
-OwnRow = TypeVar("OwnRow", bound=SettingRow | CostRow | LongestFlight)
+OwnRow = TypeVar("OwnRow", bound=SettingFlights | CostRow | LongestFlight)
 PairedRow = TypeVar("PairedRow", bound=RatioRow | CostDifference)
 
 
@@ -161,13 +161,13 @@ _EXTRA = (
 _WORST = ("longest, s", "over mean golden, x", "recovered")
 
 
-def _flight_cells(row: SettingRow) -> list[str]:
+def _flight_cells(row: SettingFlights) -> list[str]:
     medians = (row.quantities[name].median for name in ("flight_time_s", "distance_m"))
     counts = f"{row.counted} of {row.flown}"
     return [counts, rate(row.success), *(spread(value, 1) for value in medians)]
 
 
-def _work_cells(row: SettingRow) -> list[str]:
+def _work_cells(row: SettingFlights) -> list[str]:
     own = row.quantities
     return [
         spread(own["energy_regression_j"].median, 1, 1e-3),
@@ -209,7 +209,7 @@ def _worst_cells(row: LongestFlight) -> list[str]:
     return [number(row.worst_s, ".1f"), over, percent(row.over_mean_recovered_share)]
 
 
-def _again(comparison: Comparison) -> list[str]:
+def _again(comparison: PlatformComparison) -> list[str]:
     plan, lines = comparison.plan, []
     titles = _titles_of(plan)
     for row in comparison.costs:
@@ -270,7 +270,7 @@ _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
 }  # fmt: skip
 
 
-def platform_csv(comparison: Comparison) -> str:
+def platform_csv(comparison: PlatformComparison) -> str:
     """One row per number: quantity, platform, setting, unit, value and interval."""
     rows = [_NAMES]
     for table, numbers in _NUMBERS.items():

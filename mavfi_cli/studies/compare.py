@@ -16,7 +16,7 @@ from mavfi_cli.analysis.platforms import (
     NONE,
     ComparedPlan,
     ComparedTimelines,
-    Comparison,
+    PlatformComparison,
     compared,
     figures,
     summaries,
@@ -116,7 +116,9 @@ class ComparePlan:
         )
 
 
-def compare(plan: ComparePlan, folder: Path, options: Options, spectator: Spectator) -> Comparison:
+def compare(
+    plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
+) -> PlatformComparison:
     """Fly the missing missions of the folder, and compare the platforms.
 
     Raises:
@@ -130,7 +132,7 @@ def compare(plan: ComparePlan, folder: Path, options: Options, spectator: Specta
     flown = compared(table)
     numbers = figures(plan.platforms, plan.settings, flown)
     seed = timeline_seed(flown, plan.platforms) or plan.first_seed
-    return Comparison(
+    return PlatformComparison(
         schema=SCHEMA,
         plan=plan.described(),
         versions=installed_versions(),

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, Comparison, figures
+from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, PlatformComparison, figures
 from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.studies.compare import ComparePlan
 
@@ -87,7 +87,7 @@ def panel(platform, factor):
 def comparison(plan, flights, *, errors=(), timelines=()):
     """All that `mavfi compare` would compute of these flights."""
     own = figures_of(plan, flights)
-    return Comparison(
+    return PlatformComparison(
         schema=1, plan=plan.described(), versions={}, errors=[*errors],
         timeline=ComparedTimelines(seed=4, platforms=[*timelines]),
         **{part.name: getattr(own, part.name) for part in fields(own)},
