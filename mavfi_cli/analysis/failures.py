@@ -140,9 +140,11 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
 
 
 def _require_same_faults(config: MissionConfig, plan: Mapping[str, Any], path: Path) -> None:
+    from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
+
     fault = config.instruction
     assert fault is not None
-    drawn = fault.strategy()
+    drawn = mission_strategy(fault)
     ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
     theirs = {name: plan[name] for name in ours}
     if ours != theirs:

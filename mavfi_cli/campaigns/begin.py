@@ -321,7 +321,9 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     if config.fault is not None:
         config.fault.check()
     if config.instruction is not None:
-        config.instruction.strategy()
+        from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
+
+        mission_strategy(config.instruction)
         config.instruction.node()
     if config.detector is not None:
         config.detector.built(config.stack)

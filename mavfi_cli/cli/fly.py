@@ -320,6 +320,7 @@ def _faults(
     base: MissionConfig, given: dict[str, Any]
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
+    from mavfi_cli.attack.strategy import mission_strategy
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
     source = given.get("level", "source" if base.instruction is None else "instruction") == "source"
@@ -337,8 +338,12 @@ def _faults(
         asked["seed"] = asked.pop("fault_seed")
     kind: Any = FaultConfig if source else InstructionConfig
     fault: Any = replace(prior or kind(target=target), target=target, **asked)
-    fault.check()
-    return (fault, None) if source else (None, fault)
+    if source:
+        fault.check()
+        return fault, None
+    mission_strategy(fault)  # reports wrong names now
+    fault.node()
+    return None, fault
 
 
 def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig | None:

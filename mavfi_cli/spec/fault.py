@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
@@ -21,9 +20,6 @@ from mavfi_cli.fi.fault import (
     draw_fault,
 )
 from mavfi_cli.spec.platform import KERNELS
-
-if TYPE_CHECKING:
-    from mavfi_cli.fi.tracer.fault import Strategy
 
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
@@ -278,31 +274,6 @@ class InstructionConfig:
             raise UnknownName("node or stage", self.target, _NODES)
         nodes = _NODES[self.target]
         return nodes[int(Stream.FAULT.generator(self.seed, "node").integers(len(nodes)))]
-
-    def strategy(self) -> Strategy:
-        """Return the sampling strategy.
-
-        Raises:
-            UnknownName: A name does not exist.
-            FaultSpecError: The rule is not repeatable.
-        """
-        from mavfi_cli.fi.tracer.fault import FaultModel, Rule, Strategy
-
-        model = FaultModel.named(
-            sites=self.sites, roles=self.roles, field=self.field, bits=self.bits
-        )
-        chosen = Strategy.of(self.sampling, model, compat=self.compat)
-        if self.compat is None and chosen.rule is not Rule.INSTRUCTION:
-            raise FaultSpecError(
-                f"sampling by {self.sampling} cannot be repeated; missions take "
-                f"{UNIFORM}, `mavfi kernels` takes both"
-            )
-        return chosen
-
-    def check(self) -> None:
-        """Validate the configuration. Raises as `strategy` and `node`."""
-        self.strategy()
-        self.node()
 
     def sampling_name(self) -> str:
         """Return the name of the population, which every report states."""

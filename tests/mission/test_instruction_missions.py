@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.strategy import mission_strategy
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.runs import replay
 from mavfi_cli.core.config import structure
@@ -199,9 +200,9 @@ def test_what_makes_no_sense_is_refused(fly_short, short_config):
     with pytest.raises(UnknownName, match="octomap"):
         InstructionConfig(target="octmap").node()
     with pytest.raises(UnknownName, match="vector"):
-        InstructionConfig(target="octomap", sites=("vektor",)).strategy()
+        mission_strategy(InstructionConfig(target="octomap", sites=("vektor",)))
     with pytest.raises(FaultSpecError, match="cannot be repeated"):
-        InstructionConfig(target="octomap", sampling="wall-clock").strategy()
+        mission_strategy(InstructionConfig(target="octomap", sampling="wall-clock"))
     link = MissionConfig(link="udpin:127.0.0.1:1", goal=(20.0, 0.0, 5.0))
     config = replace(link, instruction=InstructionConfig(target="control"))
     with pytest.raises(FaultError, match="leave out --link"):
@@ -210,13 +211,13 @@ def test_what_makes_no_sense_is_refused(fly_short, short_config):
 
 def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
     config = InstructionConfig(target="control", compat="rosfi-2021")
-    assert config.strategy().imitates is not None
+    assert mission_strategy(config).imitates is not None
     assert config.sampling_name().startswith("instruction-uniform with")
     pinfi = InstructionConfig(target="control", compat="pinfi")
-    assert pinfi.strategy().rule is Rule.INSTRUCTION
+    assert mission_strategy(pinfi).rule is Rule.INSTRUCTION
     assert pinfi.sampling_name() == "instruction-uniform with the operands and bits of pinfi"
     with pytest.raises(FaultSpecError, match="pinfi chooses sites, roles, field and bits by its"):
-        InstructionConfig(target="control", compat="pinfi", bits=3).strategy()
+        mission_strategy(InstructionConfig(target="control", compat="pinfi", bits=3))
 
 
 @pytest.fixture
@@ -266,7 +267,8 @@ def test_the_nodes_of_a_pair_get_the_same_bytes(short_config):
         for told in (briefing, pickle.loads(pickle.dumps(briefing)))
     ]
     assert len(set(messages)) == 1
-    assert pickle.loads(messages[0]).config == short_config
+    own_m = short_config.loaded_stack().goal_tolerance_m  # the node gets the value itself
+    assert pickle.loads(messages[0]).config == replace(short_config, goal_tolerance_m=own_m)
 
 
 def test_a_node_that_has_filled_a_cache_is_started_again(short_config):

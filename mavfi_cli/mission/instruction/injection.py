@@ -24,6 +24,7 @@ from mavfi_cli.attack.attacker import EntryCounter, LiveAttack, TracerThread, at
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
 from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
 from mavfi_cli.attack.served import ServedProcess
+from mavfi_cli.attack.strategy import mission_strategy
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
@@ -96,7 +97,7 @@ def _plan_fault(
     """Draw the fault of a mission, and the entries of _CONTEXT."""
     request = config.instruction
     assert request is not None
-    strategy, node = request.strategy(), request.node()
+    strategy, node = mission_strategy(request), request.node()
     kernel = kernel_of_node(node, config.planner)
     golden = config.golden
     folder = own_folder(kept_in(own_folder(profiles), golden))
