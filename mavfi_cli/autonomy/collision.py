@@ -187,8 +187,8 @@ class _SphereProbe:
     def touches(self, point_enu_m: FloatArray) -> bool:
         """Return True if the sphere centred on the point (3,) meets an occupied voxel."""
         self._sphere.setTranslation(point_enu_m)
-        found = fcl.collide(self._sphere, self._map, self._request, fcl.CollisionResult())
-        return bool(found)
+        result = fcl.CollisionResult()
+        return bool(fcl.collide(self._sphere, self._map, self._request, result))
 
 
 def _first_contact(
@@ -207,9 +207,7 @@ def _first_contact(
         if not probe.touches(point):
             escaping = False
             continue
-        if not escaping:
-            return index
-        if norm(point - points[0]) > 2.0 * params.radius_m:
+        if not escaping or norm(point - points[0]) > 2.0 * params.radius_m:
             return index
         body = body or _SphereProbe(snapshot, math.hypot(params.body_radius_m, padding_m))
         if body.touches(point):

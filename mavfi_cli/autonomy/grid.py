@@ -38,7 +38,6 @@ class ObstacleGrid:
     origin_enu_m: FloatArray  # (3,) lower corner of voxel (0, 0, 0)
     resolution_m: float
     bounds_enu_m: FloatArray  # (6,) xmin ymin zmin xmax ymax zmax; outside is blocked
-    radius_m: float
 
     @classmethod
     def build(cls, snapshot: MapSnapshot, bounds_enu_m: FloatArray, radius_m: float) -> Self:
@@ -61,7 +60,6 @@ class ObstacleGrid:
             origin_enu_m=low.astype(np.float64) * resolution,
             resolution_m=resolution,
             bounds_enu_m=np.asarray(bounds_enu_m, np.float64),
-            radius_m=radius_m,
         )
 
     def blended(self, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float) -> Self:
@@ -74,9 +72,9 @@ class ObstacleGrid:
         near = sum((indices[axis] - centre[axis]) ** 2 for axis in range(3))
         chosen = np.argwhere(near <= (radius_m / resolution) ** 2)
         inside = chosen + to_inner
-        known = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)
+        covered = ((inside >= 0) & (inside < inner.blocked.shape)).all(axis=1)
         values = np.zeros(len(chosen), np.uint8)
-        values[known] = inner.blocked[tuple(inside[known].T)]
+        values[covered] = inner.blocked[tuple(inside[covered].T)]
         blocked[tuple(chosen.T)] = values
         return replace(self, blocked=blocked)
 
@@ -92,13 +90,11 @@ class ObstacleGrid:
     def segment_free(self, start_enu_m: FloatArray, end_enu_m: FloatArray) -> bool:
         """Return True if the vehicle's centre may fly straight from start to end, each (3,)."""
         ends = *start_enu_m.tolist(), *end_enu_m.tolist()
-        free: bool = segment_free(*self.arguments, *ends)
-        return free
+        return segment_free(*self.arguments, *ends)
 
     def path_free(self, points_enu_m: FloatArray) -> bool:
         """Return True if every segment between consecutive points (n, 3) is free."""
-        free: bool = path_free(*self.arguments, np.ascontiguousarray(points_enu_m))
-        return free
+        return path_free(*self.arguments, np.ascontiguousarray(points_enu_m))
 
 
 def _extent(
@@ -126,12 +122,8 @@ def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
     reach = math.ceil(radius_m / resolution_m) + 1
     offsets = np.abs(np.arange(-reach, reach + 1))
     gap = np.maximum(offsets - 1, 0) * resolution_m
-    widths = np.full((len(offsets), len(offsets)), -1, np.int64)
-    for i, gap_x in enumerate(gap):
-        for j, gap_y in enumerate(gap):
-            reached = np.hypot(np.hypot(gap, gap_y), gap_x) < radius_m
-            if reached.any():
-                widths[i, j] = offsets[reached].max()
+    distances = np.hypot(np.hypot(gap, gap[:, None]), gap[:, None, None])  # of x, y, z
+    widths: NDArray[np.int64] = np.where(distances < radius_m, offsets, -1).max(axis=2)
     widths[reach, reach] = max(0, widths[reach, reach])  # the occupied voxel itself
     return widths
 

@@ -42,7 +42,7 @@ class OccupancyParams:
     z_max_m: float = 100.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapSnapshot:
     """The occupied voxels of the map at one moment, in OctoMap's `.bt` format."""
 
@@ -130,8 +130,7 @@ class OccupancyMap:
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
         """Return True for coordinates in the octree's range less a ray's length; False for NaN."""
         limit = HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
-        inside: NDArray[np.bool_] = np.abs(coordinates) < limit
-        return inside
+        return np.abs(coordinates) < limit
 
     def _remember(self, ends: FloatArray) -> None:
         """Add the voxels of ray ends (n, 3) to the voxels that may be occupied."""
@@ -231,7 +230,7 @@ def _encode(codes: Codes, stream: NDArray[np.uint8]) -> int:
             begin = last
         stream[position], stream[position + 1] = children & 255, children >> 8
         position += 2
-        for child in range(7, -1, -1):  # last first: the stack gives the first back first
+        for child in range(7, -1, -1):  # reversed, as the stack returns its last entry first
             if (children >> (2 * child)) & 3 == 3:
                 stack[depth, 0] = ends[child - 1] if child > 0 else first
                 stack[depth, 1], stack[depth, 2] = ends[child], height

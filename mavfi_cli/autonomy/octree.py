@@ -47,7 +47,7 @@ def decode_leaves(stream: NDArray[np.uint8], leaves: NDArray[np.int64]) -> int:
             break
         children = int(stream[position]) | (int(stream[position + 1]) << 8)
         position += 2
-        for child in range(7, -1, -1):  # last first: the stack gives the first back first
+        for child in range(7, -1, -1):  # reversed, as the stack returns its last entry first
             kind = (children >> (2 * child)) & 3
             cx = x + half * (child & 1)
             cy = y + half * ((child >> 1) & 1)

@@ -25,7 +25,7 @@ from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, Vehicl
 class PilotMode(Enum):
     """Mode of the pilot."""
 
-    TURNING = "turning"  # hovers and turns once round before the first plan
+    TURNING = "turning"  # hovers and makes one full turn before the first plan
     WAITING = "waiting"  # hovers and waits for a plan
     FLYING = "flying"  # follows a trajectory without a predicted collision
     EVADING = "evading"  # follows a blocked trajectory at full speed while a new one is planned
@@ -45,7 +45,7 @@ class PlanRequest:
     yaw_rad: float
     goal_enu_m: FloatArray  # (3,)
     attempt: int  # number of the plan in the mission; seeds the planner
-    trajectory_seq: int = 0  # newest known number; the planner's node takes the next
+    trajectory_seq: int = 0  # newest number; the planner's node takes the next
     future_collision_seq: int = 0
 
 
@@ -81,7 +81,7 @@ class PilotParams:
     slow_rate: float = 0.5  # fraction of the planned speed while slowing
     attempts_max: int = 40  # consecutive failed plans before the mission is given up
     retry_s: float = 0.1  # pause after a failed plan
-    look_round_after: int = 3  # consecutive failed plans before the vehicle turns once round
+    look_round_after: int = 3  # consecutive failed plans before the vehicle makes one full turn
     guards_tracking: bool = True
     tracking_error_max_m: float = 2.0  # larger distance from the reference: stop and replan
     stops_on_report: bool = False  # a predicted collision ends the plan
@@ -100,8 +100,6 @@ class PilotParams:
 
 @dataclass(slots=True)
 class _Counters:
-    """Counters of the mission's record."""
-
     plans_requested: int = 0
     plans_failed: int = 0
     plans_ignored: int = 0  # stale, late, or out of order
@@ -187,8 +185,6 @@ class _ActivePlan:
 
     def _planned_speed_mps(self) -> float:
         """Return the planned speed at the present point at rate 1, limited to v_max."""
-        if self.trajectory is None:
-            return 0.0
         speed, limit = norm(self.reference()[4:7]), self._params.v_max_mps
         return min(speed, limit) if math.isfinite(speed) else limit
 
@@ -216,8 +212,8 @@ class Pilot:
         self._trajectory_seq = 0
         self._collision_seq = 0
         self._awaiting_plan = False
-        self._asked_s = 0.0  # start of the requested plan
-        self._asked_rate = 1.0  # rate of the clock at the request
+        self._requested_s = 0.0  # start of the requested plan
+        self._requested_rate = 1.0  # rate of the clock at the request
         self._abandoned: set[float] = set()  # starts of requested plans that are no longer needed
         self._adopted = False  # True once any plan has been adopted
         self._wanted = True
@@ -231,7 +227,7 @@ class Pilot:
     def on_report(self, report: CollisionReport) -> bool:
         """Handle a report of the collision check. Return True if its time to collision was used.
 
-        A report with a future_collision_seq older than the newest known is ignored.
+        A report with a future_collision_seq older than the newest is ignored.
         """
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
@@ -279,8 +275,7 @@ class Pilot:
             self.mode = mode
 
     def _brake(self) -> None:
-        if self.mode is not PilotMode.STOPPING:
-            self.counters.stops += 1
+        self.counters.stops += self.mode is not PilotMode.STOPPING
         self.mode = PilotMode.STOPPING
 
     def _plan_anew(self) -> None:
@@ -288,14 +283,14 @@ class Pilot:
         self._wanted = True
         if self._awaiting_plan:
             self._awaiting_plan = False
-            self._abandoned.add(self._asked_s)
+            self._abandoned.add(self._requested_s)
 
     def on_plan(self, result: Trajectory | PlanFailure) -> None:
         """Handle a plan or a failure to plan.
 
-        A trajectory is ignored if it is out of order, does not know of the newest predicted
+        A trajectory is ignored if it is out of order, was planned before the newest predicted
         collision, begins at another time than requested, or arrives too late for its own start.
-        An answer to an abandoned request is ignored, too.
+        The result of an abandoned request is ignored, too.
         """
         if not self.expects(result):
             self._abandoned.discard(result.stamp_s)
@@ -306,7 +301,7 @@ class Pilot:
             self._plan_failed()
             return
         p = self.params
-        stale = not self._is_new(result) or result.stamp_s != self._asked_s
+        stale = not self._is_new(result) or result.stamp_s != self._requested_s
         late = self.active.rate > 0.0 and self._stamp_s - result.stamp_s > p.late_plan_s
         if stale or late:
             self.counters.plans_ignored += 1
@@ -322,7 +317,7 @@ class Pilot:
         self._next = result
 
     def _is_new(self, plan: Trajectory) -> bool:
-        """Return True if a plan's numbers show that it is new and knows of the newest collision.
+        """Return True if a plan's numbers are new and include the newest predicted collision.
 
         A pilot that owns its numbers stores a plan's trajectory_seq before it checks the other
         number, as the released follow_trajectory.cpp does.
@@ -418,16 +413,13 @@ class Pilot:
 
     @property
     def _look_s(self) -> float:
-        """Time since the vehicle began to turn once round."""
+        """Time since the vehicle began to make one full turn."""
         return 0.0 if self._look_started_s is None else self._stamp_s - self._look_started_s
 
     def _has_arrived(self, state: VehicleState) -> bool:
-        distance_m = norm(state.position_enu_m - self.goal_enu_m)
-        if not distance_m <= self.params.goal_tolerance_m:
-            return False
-        return not self.params.arrives_at_rest or (
-            self.active.trajectory is None and self._at_rest(state)
-        )
+        at_goal = norm(state.position_enu_m - self.goal_enu_m) <= self.params.goal_tolerance_m
+        rests = self.active.trajectory is None and self._at_rest(state)
+        return at_goal and (rests or not self.params.arrives_at_rest)
 
     def _at_rest(self, state: VehicleState) -> bool:
         return norm(state.velocity_enu_mps) <= self.params.rest_mps
@@ -458,14 +450,17 @@ class Pilot:
             self._next,
             time_s=max(0.0, late_s) if moving else 0.0,
             # The plan departs at the velocity of its request, so the clock keeps that rate.
-            rate=min(1.0, self.active.rate / self._asked_rate) if moving else 1.0,
+            rate=min(1.0, self.active.rate / self._requested_rate) if moving else 1.0,
         )
         self._next = None
         self._stop_s = math.inf
         self.mode = PilotMode.FLYING
 
     def _advance(self, step_s: float, state: VehicleState) -> None:
-        """Run the trajectory's clock at the rate of the mode. Hover at the trajectory's end."""
+        """Run the trajectory's clock at the rate of the mode.
+
+        Once the trajectory is over or its clock has stopped, hover and request a plan.
+        """
         if self.active.trajectory is None:
             return
         slower = {PilotMode.STOPPING: 0.0, PilotMode.SLOWING: self.params.slow_rate}
@@ -476,11 +471,14 @@ class Pilot:
         stopped = self.mode is PilotMode.STOPPING and self.active.rate <= 0.0
         if not (stopped or (self.active.over and self._next is None)):
             return
-        if self.params.plans_in_motion:
-            self._stop_here()
-        else:
-            self.want_plan()
+        self.want_plan()
+        if not self.params.plans_in_motion:
             self._hover(state)
+            return
+        reference = self.active.reference()
+        self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
+        self.active.stand()
+        self.mode = PilotMode.WAITING
 
     def _flies_blind(self, state: VehicleState) -> bool:
         """Return True if the trajectory leaves the camera's field of view."""
@@ -493,8 +491,7 @@ class Pilot:
         """Stop and replan from here if the vehicle is too far from the reference."""
         if self.active.trajectory is None or not self.params.guards_tracking:
             return
-        reference_enu_m = self.active.reference()[0:3]
-        error_m = norm(state.position_enu_m - reference_enu_m)
+        error_m = norm(state.position_enu_m - self.active.reference()[0:3])
         if not error_m <= self.params.tracking_error_max_m:
             self.abandon(state)
 
@@ -513,14 +510,6 @@ class Pilot:
         self._plan_anew()
         self.counters.stops += 1
 
-    def _stop_here(self) -> None:
-        """Hover and request a plan when the trajectory is over or its clock has stopped."""
-        reference = self.active.reference()
-        self._hold, self._hold_yaw = reference[0:3].copy(), float(reference[3])
-        self.active.stand()
-        self.want_plan()
-        self.mode = PilotMode.WAITING
-
     def _hold_here(self, state: VehicleState) -> None:
         self._hold = state.position_enu_m.copy()
         self._hold_yaw = state.yaw_rad
@@ -536,11 +525,11 @@ class Pilot:
         self._awaiting_plan = True
         self.counters.plans_requested += 1
         flying = self.active.trajectory is not None
-        self._asked_s = self._stamp_s + (self.params.plan_lead_s if flying else 0.0)
-        self._asked_rate = self.active.rate or 1.0
+        self._requested_s = self._stamp_s + (self.params.plan_lead_s if flying else 0.0)
+        self._requested_rate = self.active.rate or 1.0
         position, velocity, yaw_rad = self._start_of_plan(state)
         return PlanRequest(
-            stamp_s=self._asked_s,
+            stamp_s=self._requested_s,
             position_enu_m=position.copy(),
             velocity_enu_mps=velocity,
             yaw_rad=yaw_rad,
@@ -563,5 +552,4 @@ class Pilot:
 
     def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
         """Return True if a position (3,), possibly corrupted, is near enough to begin a plan."""
-        distance_m = norm(place_enu_m - state.position_enu_m)
-        return distance_m <= self.params.start_error_max_m
+        return norm(place_enu_m - state.position_enu_m) <= self.params.start_error_max_m

@@ -1,7 +1,7 @@
 """The planning stage: search a path, shorten it, smooth it into a trajectory.
 
-Planners are ours, and those that other packages register under the entry points `mavfi.planners`.
-Ours are OMPL's: RRT* (Karaman and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
+Other packages register planners as entry points `mavfi.planners`. Ours are OMPL's: RRT* (Karaman
+and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
 
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
 search resets that sequence first and creates its generators afterwards, so its result depends on
@@ -117,7 +117,7 @@ class Planner(Protocol):
 
     @property
     def name(self) -> str:
-        """Name by which the planner is found."""
+        """Name of the planner in settings and records."""
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
         """Find a path from the problem's start to its goal.
@@ -189,8 +189,6 @@ def _subdivided(path_enu_m: FloatArray, spacing_m: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Search:
-    """One search of a planner."""
-
     iterations: int
     range_m: float  # longest step of the tree
     optimise: bool = False  # continue after the first solution until the iterations are used up
@@ -198,7 +196,7 @@ class _Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _OmplPlanner:
-    """One of OMPL's planners. It searches again, as the next search says, while there is no path.
+    """One of OMPL's planners. It runs its searches in order until one returns a path.
 
     A straight line from start to goal is the path if it is free.
     """
@@ -210,9 +208,8 @@ class _OmplPlanner:
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
         """See `Planner.plan`."""
-        result = problem.refused()
-        if result is not None:
-            return result
+        if (refusal := problem.refused()) is not None:
+            return refusal
         start, goal = problem.start_enu_m, problem.goal_enu_m
         if problem.grid.segment_free(start, goal):
             return PlanResult(found=True, path_enu_m=np.vstack([start, goal]))
@@ -220,7 +217,6 @@ class _OmplPlanner:
             result = self._search(problem, seed, search)
             if result.found:
                 break
-        assert result is not None
         return result
 
     def _search(self, problem: PlanningProblem, seed: int, search: _Search) -> PlanResult:
@@ -243,9 +239,9 @@ class _OmplPlanner:
             getattr(planner, setter)(value)
         planner.setProblemDefinition(definition)
         planner.setup()
-        asked = itertools.count(1)
-        planner.solve(ob.PlannerTerminationCondition(lambda: next(asked) > search.iterations))
-        return _result(problem, definition, next(asked) - 1)
+        begun = itertools.count(1)
+        planner.solve(ob.PlannerTerminationCondition(lambda: next(begun) > search.iterations))
+        return _result(problem, definition, next(begun) - 1)
 
 
 class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
@@ -257,8 +253,7 @@ class _GridMotions(ob.MotionValidator):  # type: ignore[misc]
 
     def checkMotion(self, a: Any, b: Any) -> bool:  # noqa: N802
         """Return True if the straight motion from state a to state b is free."""
-        free: bool = segment_free(*self._arguments, a[0], a[1], a[2], b[0], b[1], b[2])
-        return free
+        return segment_free(*self._arguments, a[0], a[1], a[2], b[0], b[1], b[2])
 
 
 def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
@@ -272,10 +267,8 @@ def _space(grid: ObstacleGrid) -> tuple[Any, Any]:
     arguments = grid.arguments
 
     def valid(state: Any) -> bool:
-        """Return True if a state (east, north, up, m) lies in free space."""
         x, y, z = state[0], state[1], state[2]
-        free: bool = segment_free(*arguments, x, y, z, x, y, z)
-        return free
+        return segment_free(*arguments, x, y, z, x, y, z)
 
     information.setStateValidityChecker(valid)
     information.setMotionValidator(_GridMotions(information, grid))

@@ -147,21 +147,15 @@ class _Polyline:
         steps = np.diff(self.vertices, axis=0)
         self.lengths = np.linalg.norm(steps, axis=1)  # (n - 1,)
         self.directions = steps / self.lengths[:, None]  # (n - 1, 3)
-        caps = [_speed_cap(float(u[2]), params) for u in self.directions]
-        self.speed_caps = np.array(caps)  # (n - 1,) m/s
+        rises = self.directions[:, 2]
+        with np.errstate(divide="ignore"):  # a level segment has no vertical limit
+            vertical = np.where(rises < 0.0, params.descent_max_mps, params.climb_max_mps)
+            caps = vertical / np.abs(rises)
+        # (n - 1,) highest speed along each segment, m/s
+        self.speed_caps = np.minimum(caps, params.speed_share * params.v_max_mps)
         # (n,) sin of half the turn at each vertex, 0 at the ends; |u_2 - u_1| = 2 sin(theta / 2)
         self.half_sines = np.zeros(len(self.vertices))
         self.half_sines[1:-1] = 0.5 * np.linalg.norm(np.diff(self.directions, axis=0), axis=1)
-
-
-def _speed_cap(rise: float, params: SmoothingParams) -> float:
-    """Return the speed that keeps the vertical limits along a direction of vertical part `rise`."""
-    cap = params.speed_share * params.v_max_mps
-    if rise > 0.0:
-        cap = min(cap, params.climb_max_mps / rise)
-    elif rise < 0.0:
-        cap = min(cap, params.descent_max_mps / -rise)
-    return cap
 
 
 def _squared_corner_speeds(
@@ -211,9 +205,8 @@ def _dwells(
         if q[i] == 0.0:
             # Two control points on a corner keep the spline on the two segments.
             dwells[i] = 2.0 * params.sample_period_s if i > 0 else 0.0
-            turn = (
-                0.0 if steep or not math.isfinite(yaw_rad) else abs(wrap_angle(azimuth - yaw_rad))
-            )
+            undefined = steep or not math.isfinite(yaw_rad)
+            turn = 0.0 if undefined else abs(wrap_angle(azimuth - yaw_rad))
             if turn > params.turn_first_rad:
                 dwells[i] = max(turn / params.yaw_rate_max_radps, dwells[i])
         if not steep:
@@ -276,9 +269,9 @@ def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _
 
     `dwells_s` (n,) is the waiting time at each vertex. It must be 0 unless the speed there is 0.
     """
-    found = _Motion(line.vertices[0])
+    motion = _Motion(line.vertices[0])
     zero = np.zeros(3)
-    found.add(dwells_s[0], zero, zero, 0)
+    motion.add(dwells_s[0], zero, zero, 0)
     speeds = np.sqrt(q)
     trims = q * line.half_sines / a
     for i, direction in enumerate(line.directions):
@@ -288,22 +281,22 @@ def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _
         peak = math.sqrt(max(0.0, a * distance + 0.5 * (first * first + last * last)))
         peak = max(min(peak, line.speed_caps[i]), last)
         used = (abs(peak * peak - first * first) + abs(peak * peak - last * last)) / (2.0 * a)
-        found.change_speed(direction, first, peak, a)
+        motion.change_speed(direction, first, peak, a)
         if peak > 0.0:
-            found.add((distance - used) / peak, peak * direction, zero)
-        found.change_speed(direction, peak, last, a)
+            motion.add((distance - used) / peak, peak * direction, zero)
+        motion.change_speed(direction, peak, last, a)
         if i + 1 < len(line.directions):
             if q[i + 1] > 0.0:
                 turn = speeds[i + 1] * (line.directions[i + 1] - direction)
                 lasting = norm(turn) / a
                 if lasting > 0.0:
-                    found.add(lasting, speeds[i + 1] * direction, turn / lasting, i + 1)
+                    motion.add(lasting, speeds[i + 1] * direction, turn / lasting, i + 1)
             else:
-                found.end = line.vertices[i + 1]  # drops accumulated rounding errors
-                found.add(dwells_s[i + 1], zero, zero, i + 1)
-    found.end = line.vertices[-1]
-    found.add(1e-3, zero, zero)
-    return found
+                motion.end = line.vertices[i + 1]  # drops accumulated rounding errors
+                motion.add(dwells_s[i + 1], zero, zero, i + 1)
+    motion.end = line.vertices[-1]
+    motion.add(1e-3, zero, zero)
+    return motion
 
 
 def _blocked_corners(
@@ -321,9 +314,8 @@ def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]
     """Return a flag for each spline piece (m - 2,): True if its four chords are free."""
     first, second, third = spline[:-2, None], spline[1:-1, None], spline[2:, None]
     u = np.linspace(0.0, 1.0, 5)[:, None]
-    points = (
-        0.5 * (1.0 - u) ** 2 * first + (0.5 + u - u * u) * second + 0.5 * u * u * third
-    )  # (m - 2, 5, 3)
+    # (m - 2, 5, 3)
+    points = 0.5 * (1.0 - u) ** 2 * first + (0.5 + u - u * u) * second + 0.5 * u * u * third
     return np.array([grid.path_free(piece) for piece in points], np.bool_)
 
 

@@ -38,11 +38,11 @@ def warm_up() -> None:
     )  # fmt: skip
     trajectory: Trajectory | None = None
     for name in OUR_PLANNERS:
-        found = planners.plan(
+        result = planners.plan(
             planners.find(name), request, snapshot,
             bounds_enu_m=_BOUNDS, seed=1, params=planners.PlanningParams(),
         )  # fmt: skip
-        trajectory = found if isinstance(found, Trajectory) else None
+        trajectory = result if isinstance(result, Trajectory) else None
     checked = collision.CollisionInputs(
         stamp_s=0.0, snapshot=snapshot, trajectory=trajectory, time_s=0.0
     )

@@ -46,13 +46,13 @@ def list_(models: Path | None, as_json: bool) -> None:
 
     rows = listing(models)
     if as_json:
-        echo(json.dumps(rows, indent=2))
+        echo(json.dumps([asdict(row) for row in rows], indent=2))
         return
     for row in rows:
-        threshold = "-" if row["threshold"] is None else f"{row['threshold']:.6g}"
-        stack = f"{row['stack']}: " if row["stack"] else ""
-        echo(f"{row['name']:<9} threshold {threshold:<9} {stack}{row['model'] or 'no model file'}")
-        echo(f"{'':<9} {row['told']}")
+        threshold = "-" if row.threshold is None else f"{row.threshold:.6g}"
+        stack = f"{row.stack}: " if row.stack else ""
+        echo(f"{row.name:<9} threshold {threshold:<9} {stack}{row.model or 'no model file'}")
+        echo(f"{'':<9} {row.description}")
 
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")

@@ -5,9 +5,9 @@ invocation that starts at `t` occupies the node and one core of the platform unt
 latency. Its output takes effect at that time. The computation itself happens at any host time in
 between, so the vehicle's simulation need not wait for it.
 
-What is done with the outputs is written down in turns. A turn is a coroutine that awaits one node
-after the other: `cloud = await point_cloud.run(frame)` continues when the cloud takes effect. It
-never continues if its input was replaced or lost.
+A turn uses the outputs. It is a coroutine that awaits one node after the other:
+`cloud = await point_cloud.run(frame)` continues when the cloud takes effect, and never if its input
+was replaced or lost.
 
 Nodes that share a process run one after the other in the listed order, each with its newest input.
 They end together, and all their waiting inputs are lost.
@@ -20,7 +20,6 @@ host noticed it, so they are repeatable.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import heapq
 import math
@@ -140,22 +139,19 @@ class _Job:
             self.order = process.order(self.node.name, self.input, self.start_s)
         self.input = None
 
-    def settle(self, wall: WallClock) -> None:
-        """Wait until the node's process has answered or died."""
-        if self.order is not None and not self.done:
-            with contextlib.suppress(NodeLost):
-                self.result(wall)
-
-    def result(self, wall: WallClock) -> Any:
-        """Return the output and wait for it if necessary."""
+    def settle(self, wall: WallClock) -> NodeLost | None:
+        """Wait for the output. If the node's process is lost, return the loss."""
         self.begin(wall)
         if not self.done:
             assert self.node.process is not None
             assert self.order is not None
-            self.output, host_s = self.node.process.take(self.order)
+            try:
+                self.output, host_s = self.node.process.take(self.order)
+            except NodeLost as loss:
+                return loss
             wall.add(self.node.name, host_s)
             self.done = True
-        return self.output
+        return None
 
 
 @dataclass(slots=True)
@@ -249,11 +245,7 @@ class Executor:
             node.dropped += 1
             return None
         job = self._begin_job(node, value)
-        lost: NodeLost | None = None
-        try:
-            job.result(self.wall)
-        except NodeLost as loss:
-            lost = loss
+        lost = job.settle(self.wall)
         latency_s = self._book(job)
         node.free_s = max(node.free_s, self.now_s + latency_s)
         if lost is None:
@@ -321,14 +313,12 @@ class Executor:
         if job.cancelled:
             return
         self._jobs.pop(job.node.name, None)
-        try:
-            output = job.result(self.wall)
-        except NodeLost as loss:
+        if (loss := job.settle(self.wall)) is not None:
             self._lose(job, loss)
             return
         job.node.busy = False
         assert job.turn is not None
-        self._go_on(job.turn, output)  # its core is still busy, so new invocations queue last
+        self._go_on(job.turn, job.output)  # its core is still busy, so new invocations queue last
         self._start_next(job.node)
         self._free_cores(1)
 
@@ -347,7 +337,7 @@ class Executor:
     def settle(self) -> None:
         """Wait for pending computations, so that a fault does not depend on the host's speed."""
         for job in self._jobs.values():
-            if job.node.process is not None:
+            if job.order is not None:
                 job.settle(self.wall)
         self._jobs.clear()
 
@@ -364,12 +354,13 @@ class Executor:
         Its present input is lost, as that of a node that crashes. Its successor takes the newest.
         """
         node = self.nodes[name]
-        together = (node, *node.mates)
-        jobs = [self._jobs.pop(member.name) for member in together if member.name in self._jobs]
-        if not jobs and any(member.busy for member in together):
+        members = (node, *node.mates)
+        jobs = [self._jobs.pop(member.name) for member in members if member.name in self._jobs]
+        if not jobs and any(member.busy for member in members):
             return
-        for job in jobs:  # the result must not depend on the host's progress
-            job.settle(self.wall)
+        for job in jobs:
+            if job.order is not None:  # the result must not depend on the host's progress
+                job.settle(self.wall)
             job.cancelled = True
         node.busy = True
         self._note_loss(node, self.now_s, NodeLost(hung=False, how="killed by SIGKILL"))
@@ -399,11 +390,11 @@ class Executor:
         if node.process is not None:
             node.process.close(kill=True)
         process = NodeProcess.fork(self.process_of(node.name))
-        together = (node, *node.mates)
-        for member in together:
+        members = (node, *node.mates)
+        for member in members:
             member.process = process
             member.restarts += 1
             member.busy = False
-        for member in together:
+        for member in members:
             member.on_restart()
         self._start_next(node)

@@ -44,7 +44,7 @@ class NoInjection:
         self.injector = NoInjector()
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
-        """Draw what depends on the way to the goal and on the detector."""
+        """Draw the values that depend on the way to the goal and on the detector."""
 
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
@@ -61,11 +61,11 @@ class NoInjection:
         return None
 
     def close(self) -> None:
-        """End what was started for the injection."""
+        """End the processes of the injection."""
 
 
 class _Killer(Injector):
-    """Decides when the process of a node is killed, which happens once."""
+    """Decides when the process of a node is killed. It is killed once."""
 
     _awaits = "control tick"
 
@@ -94,7 +94,7 @@ class SourceInjection(NoInjection):
         self._news: list[str] = []
         self._executor: Executor | None = None
         self.in_queue = config.strikes_queue
-        self._reader = ""  # who reads at once what is corrupted; empty: the follower finds out
+        self._reader = ""  # first reader of the corrupted value; empty: the follower determines it
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
         """Draw the fault.
@@ -136,7 +136,7 @@ class SourceInjection(NoInjection):
             self._units = {state.name: state.unit for state in fault.states}
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Have a node that is killed work in a process of its own."""
+        """Run a node that will be killed in its own process."""
         if self._config.killed_node is not None:
             self._executor = executor
             executor.isolate(self._config.killed_node)
@@ -167,7 +167,6 @@ class SourceInjection(NoInjection):
         return self._write()
 
     def _write(self) -> dict[str, Any]:
-        """Write and return the requested fault, the drawn values and the strikes."""
         activation, reader = self._activation()
         trigger, injector = self._config.trigger(), self.injector
         written = {

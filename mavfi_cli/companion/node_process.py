@@ -71,7 +71,7 @@ class NodeProcess:
     """Runs kernels for the executor: `order` sends an input, `take` returns its output.
 
     Args:
-        ending: Returns how the process ended if another waiter reaped it, else None.
+        ending: Describes the process's end if another waiter reaped it, else returns None.
         answered: Called after each answer or loss, before the process gets another input.
         patient: Never treat the process as hung, because a debugger may hold it.
     """
@@ -102,7 +102,6 @@ class NodeProcess:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
         def child() -> int:
-            """Serve the parent until it closes the connection."""
             ours.close()
             cls.serve(theirs, runs)
 
@@ -147,8 +146,8 @@ class NodeProcess:
         finally:
             self._answered()
         if answer.error is not None:
-            how, _, text = answer.error.partition("\n")
-            raise NodeLost(hung=False, how=how, traceback=text)
+            how, _, trace = answer.error.partition("\n")
+            raise NodeLost(hung=False, how=how, traceback=trace)
         return answer.output, answer.host_s
 
     def _await(self, number: int) -> _Answer:
@@ -179,7 +178,7 @@ class NodeProcess:
             return 0.0
 
     def _end(self) -> str:
-        """Return in words how the process ended."""
+        """Describe how the process ended."""
         ending = self._ending()
         self._gone = True
         if ending is not None:
@@ -236,7 +235,6 @@ class NodeProcess:
 
 def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:
     def run() -> int:
-        """Process the next order without an answer."""
         order: _Order = receive(connection)
         runs[order.node](order.input, order.start_s)
         return 0

@@ -148,7 +148,7 @@ class Companion:
             self.executor.share_process(nodes)
         self._frame: DepthFrame | None = None
         self._map: MapSnapshot | None = None
-        self._heard_seq = 0  # newest future_collision_seq known to the planner
+        self._heard_seq = 0  # newest future_collision_seq that reached the planner
         self._queued: Trajectory | None = None  # control's copy of the plan
         self._setpoints: deque[_Setpoint] = deque()  # computed, not yet due
         self._state: VehicleState | None = None
@@ -175,8 +175,8 @@ class Companion:
         await self._check()
 
     async def _check(self) -> None:
-        """Check the rest of the active plan against the newest map, and tell the pilot."""
-        self._recovery.look_ahead(self._now_s)
+        """Check the rest of the active plan against the newest map, and report to the pilot."""
+        self._recovery.judge_ahead(self._now_s)
         active, snapshot = self.pilot.active, self._map
         if snapshot is None or active.trajectory is None:
             return
@@ -206,7 +206,7 @@ class Companion:
     # Planning
 
     async def _plan(self, request: PlanRequest) -> None:
-        """Plan a trajectory on the newest map, and give it to the pilot."""
+        """Plan a trajectory on the newest map, and pass it to the pilot."""
         assert self._map is not None
         if self._stack.owns_sequence_numbers:
             request = replace(request, future_collision_seq=self._heard_seq)
@@ -283,7 +283,6 @@ class Companion:
         )
 
     def _send(self, setpoint: _Setpoint) -> None:
-        """Let a due command take effect."""
         try:
             command = self.command = self.publish(setpoint.command, setpoint)
         except _Withheld as withheld:
@@ -334,7 +333,7 @@ class Companion:
     # Every message
 
     def publish(self, message: M, setpoint: _Setpoint | None = None) -> M:
-        """Give a kernel's output to its receivers. Return it as they get it.
+        """Pass a kernel's output to its receivers. Return the version that they receive.
 
         Raises:
             TurnOver: The detector withholds the message. Its recovery has begun.
@@ -364,7 +363,7 @@ class Companion:
         return PASSED
 
     def _strike_memory(self) -> Trajectory | None:
-        """Let a fault strike memory, and the detector look at the active plan, before its use.
+        """Let a fault strike memory, then have the detector judge the active plan before its use.
 
         If control owns its queue, its copy is the active trajectory, and control passes the rest of
         it to the other nodes. Otherwise the copy lasts for this tick, and is returned.
@@ -378,7 +377,7 @@ class Companion:
                 copy = None if struck is flown else struck
             else:
                 active.exchange(flown, struck)
-            self._recovery.look_round(self._now_s, flown)
+            self._recovery.judge_changes(self._now_s, flown)
         self._follow(copy)
         return copy
 
@@ -400,8 +399,7 @@ class Companion:
     # Restarts of nodes
 
     def _octomap_is_up(self) -> None:
-        """Nodes in OctoMap's process have lost the map."""
-        if self._octomap.mates:
+        if self._octomap.mates:  # they have lost the map
             self._map = MapSnapshot.empty(self._config.map_resolution_m)
 
     def _planner_is_up(self) -> None:

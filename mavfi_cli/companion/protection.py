@@ -1,30 +1,15 @@
 """The detector's gate in a mission: decides whether to withhold, recompute or accept a message.
 
-A message that raises an alarm is withheld and its stage is recomputed (paper, section V-E). A
-recomputed report that raises the same alarm confirms the withheld one and takes effect, so only a
-report that predicts a collision makes the vehicle stop and plan anew.
-
-The number of recomputations is bounded: at the `alarms_max`-th consecutive alarm of planning or
-control the vehicle holds and plans anew. The next message of the stage passes, because so many
-computations agree. Messages accepted while the vehicle hovers do not end the series, because they
-do not test the waypoints that raised the alarms.
-
 `Protection` judges and counts messages. `Recovery` applies its response to the mission: it
-recomputes the stage of a withheld message, or holds the vehicle.
+recomputes the stage of a withheld message (paper, section V-E), or holds the vehicle.
 
     response    report                       plan              active plan          command
     RECOMPUTE   recompute perception         request another   drop the waypoint    recompute it
     HOLD        never                        hold              hold                 hold
 
-Perception recomputes only if the alarm names it. A detector over all stages recomputes control
-(paper, section V-D), which happens in the next tick without the report.
-
-If a sequence number of the active plan has changed, but no waypoint, the plan gets its accepted
-number back, and a new plan is requested. Mission logic and collision check never see the change.
-
-A vehicle that holds drops the plan, hovers, and plans anew from there. PASS and ACCEPT let the
-message take effect. If recomputing a command did not help, or its waypoint is at fault, control
-drops that waypoint, takes the next, and resets its state (paper, section V-E).
+PASS and ACCEPT let the message take effect. A vehicle that holds drops the plan, hovers, and plans
+anew from there. docs/explanation/detection.md gives the rules for each alarm and the bounds on
+recomputation, with their reasons.
 """
 
 from __future__ import annotations
@@ -33,6 +18,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import Enum
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -49,7 +35,7 @@ from mavfi_cli.fi.injector import Follower
 from mavfi_cli.spec.detector import DetectorConfig
 
 MAX_LISTED_ALARMS = 100
-TOLD_EVERY_S = 1.0  # minimum time between two announced alarms of one stage
+ANNOUNCED_EVERY_S = 1.0  # minimum time between two announced alarms of one stage
 
 
 class Response(Enum):
@@ -62,7 +48,7 @@ class Response(Enum):
 
 
 @dataclass(slots=True)
-class _Recovery:
+class _Outage:
     """Number and duration of the phases in which a stage had no accepted message."""
 
     count: int = 0
@@ -82,6 +68,11 @@ class _ListedAlarm:
     score: float
     states: tuple[str, ...]
     response: str
+    recomputes: str | None  # recomputed stage if it is another; else None, which is not written
+
+
+def _known(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {key: value for key, value in items if value is not None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +146,7 @@ class Protection(NoProtection):
         self._threshold = detector.threshold
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
-        self._recoveries = {stage: _Recovery() for stage in Stage}
+        self._outages = {stage: _Outage() for stage in Stage}
         self._alarms: list[_ListedAlarm] = []
         self._news: list[str] = []
         self._announced_s: dict[Stage, float] = {}
@@ -163,18 +154,13 @@ class Protection(NoProtection):
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
         """Judge a collision report on its arrival."""
         alarm = self._judge("report", self.gate.judge_report, report)
-        decision = self._decide(alarm, "report", Stage.PERCEPTION, stamp_s, proven=True)
-        if decision.response is Response.ACCEPT:
-            self.gate.accept_report()
-        return decision
+        return self._decide(alarm, "report", Stage.PERCEPTION, stamp_s, self.gate.accept_report)
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
         """Judge a plan on its arrival."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
-        decision = self._decide(alarm, "plan", Stage.PLANNING, stamp_s, proven=False)
-        if decision.response is Response.ACCEPT:
-            self.gate.accept_plan(plan)
-        return decision
+        accept = partial(self.gate.accept_plan, plan)
+        return self._decide(alarm, "plan", Stage.PLANNING, stamp_s, accept, proven=False)
 
     def lose_plan(self) -> None:
         """Note that the planner has answered without a usable plan."""
@@ -194,13 +180,10 @@ class Protection(NoProtection):
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         stage = Stage.CONTROL if alarm is None else alarm.stage
         flown = Stage.PLANNING in self.gate.fresh
-        proven = flown or self.gate.detector.per_stage
-        decision = self._decide(alarm, "tick", stage, stamp_s, proven=proven)
         if alarm is None and flown:
-            self._recoveries[Stage.PLANNING].in_a_row = 0
-        if decision.response is Response.ACCEPT:
-            self.gate.accept_tick()
-        return decision
+            self._outages[Stage.PLANNING].in_a_row = 0
+        proven = flown or self.gate.detector.per_stage
+        return self._decide(alarm, "tick", stage, stamp_s, self.gate.accept_tick, proven=proven)
 
     def _judge(self, kind: str, check: Callable[..., Alarm | None], *message: Any) -> Alarm | None:
         self._checks[kind] += 1
@@ -210,30 +193,51 @@ class Protection(NoProtection):
         return alarm
 
     def _decide(
-        self, alarm: Alarm | None, message: str, stage: Stage, stamp_s: float, *, proven: bool
+        self,
+        alarm: Alarm | None,
+        message: str,
+        stage: Stage,
+        stamp_s: float,
+        accept: Callable[[], None],
+        *,
+        proven: bool = True,
     ) -> Decision:
-        """Count a message that passes, or respond to its alarm."""
-        if alarm is None:
-            self._recovered(stage, stamp_s, proven=proven)
-            return PASSED
-        return self._respond(alarm, message, stage, stamp_s)
+        """Pass a message without an alarm, or respond to its alarm.
+
+        Args:
+            accept: Makes the gate accept the message in spite of its alarm.
+            proven: The message contained all states for which its stage raises alarms. Only such a
+                message ends the series of a holding vehicle, because the steps within a plan and
+                the commands of a hover always pass.
+        """
+        if alarm is not None:
+            decision = self._respond(alarm, message, stage, stamp_s)
+            if decision.response is Response.ACCEPT:
+                accept()
+            return decision
+        outage = self._outages[stage]
+        outage.alarm = None
+        if proven or outage.in_a_row < self._config.alarms_max:
+            outage.in_a_row = 0
+        self._end(outage, stamp_s)
+        return PASSED
 
     def _respond(self, alarm: Alarm, message: str, stage: Stage, stamp_s: float) -> Decision:
-        recovery = self._recoveries[stage]
-        recovery.in_a_row += 1
+        outage = self._outages[stage]
+        outage.in_a_row += 1
         is_report, alarms_max = message == "report", self._config.alarms_max
         response = Response.RECOMPUTE
-        if recovery.in_a_row > alarms_max or (is_report and alarm == recovery.alarm):
+        if outage.in_a_row > alarms_max or (is_report and alarm == outage.alarm):
             response = Response.ACCEPT
-        elif recovery.in_a_row == alarms_max and not is_report:
+        elif outage.in_a_row == alarms_max and not is_report:
             response = Response.HOLD
-        recovery.alarm = alarm
+        outage.alarm = alarm
         self._responses[response.value] += 1
-        if recovery.since_s is None:
-            recovery.since_s = stamp_s
-            recovery.count += 1
+        if outage.since_s is None:
+            outage.since_s = stamp_s
+            outage.count += 1
         if response is Response.ACCEPT:
-            self._close(recovery, stamp_s)
+            self._end(outage, stamp_s)
         if len(self._alarms) < MAX_LISTED_ALARMS:
             self._alarms.append(
                 _ListedAlarm(
@@ -243,6 +247,7 @@ class Protection(NoProtection):
                     score=alarm.score,
                     states=alarm.states,
                     response=response.value,
+                    recomputes=None if alarm.stage is stage else alarm.stage.value,
                 )
             )
         self._announce(alarm, stage, response, stamp_s)
@@ -250,31 +255,20 @@ class Protection(NoProtection):
 
     def _announce(self, alarm: Alarm, stage: Stage, response: Response, stamp_s: float) -> None:
         last_s = self._announced_s.get(stage)
-        if response is not Response.HOLD and last_s is not None and stamp_s - last_s < TOLD_EVERY_S:
+        if (
+            response is not Response.HOLD
+            and last_s is not None
+            and stamp_s - last_s < ANNOUNCED_EVERY_S
+        ):
             return
         self._announced_s[stage] = stamp_s
         where = ", ".join(alarm.states[:2]) or "all states together"
         self._news.append(f"{alarm.detector} alarm in {stage.value}: {where}; {response.value}")
 
-    def _recovered(self, stage: Stage, stamp_s: float, *, proven: bool) -> None:
-        """Note an accepted message.
-
-        Args:
-            proven: The message contained all states for which its stage raises alarms. Only such a
-                message ends the series of a holding vehicle, because the steps within a plan and
-                the commands of a hover always pass.
-        """
-        recovery = self._recoveries[stage]
-        recovery.alarm = None
-        if proven or recovery.in_a_row < self._config.alarms_max:
-            recovery.in_a_row = 0
-        if recovery.since_s is not None:
-            self._close(recovery, stamp_s)
-
-    def _close(self, recovery: _Recovery, stamp_s: float) -> None:
-        if recovery.since_s is not None:
-            recovery.total_s += stamp_s - recovery.since_s
-            recovery.since_s = None
+    def _end(self, outage: _Outage, stamp_s: float) -> None:
+        if outage.since_s is not None:
+            outage.total_s += stamp_s - outage.since_s
+            outage.since_s = None
 
     def news(self) -> list[str]:
         """Return the lines to announce since the last call."""
@@ -290,10 +284,10 @@ class Protection(NoProtection):
             "checks": self._checks,
             "alarm_count": sum(self._responses.values()),
             "responses": self._responses,
-            "alarms": [asdict(alarm) for alarm in self._alarms],
+            "alarms": [asdict(alarm, dict_factory=_known) for alarm in self._alarms],
             "recoveries": {
-                stage.value: {"count": entry.count, "total_s": round(entry.total_s, 9)}
-                for stage, entry in self._recoveries.items()
+                stage.value: {"count": outage.count, "total_s": round(outage.total_s, 9)}
+                for stage, outage in self._outages.items()
             },
         }
 
@@ -343,7 +337,7 @@ class Recovery:
         self._pilot = pilot
         self._follower = follower
         self._recompute_perception = recompute_perception
-        self._looked: tuple[Trajectory | None, int] = (None, -1)
+        self._judged: tuple[Trajectory | None, int] = (None, -1)
         self.state: VehicleState | None = None
 
     def recover(self, withheld: Message, decision: Decision) -> None:
@@ -359,7 +353,7 @@ class Recovery:
         if decision.response is Response.HOLD:
             self._hold()
 
-    def look_round(self, stamp_s: float, unharmed: Trajectory) -> None:
+    def judge_changes(self, stamp_s: float, unharmed: Trajectory) -> None:
         """Judge changes of the active plan since the last tick, before the mission logic uses it.
 
         A new plan or a new waypoint triggers a check of the whole plan ahead. In between, each tick
@@ -369,16 +363,16 @@ class Recovery:
         Args:
             unharmed: Plan before this tick's strike, which the gate has already judged.
         """
-        active, (seen, seen_at) = self._pilot.active, self._looked
+        active, (judged, judged_at) = self._pilot.active, self._judged
         if active.trajectory is None:
             return
         at = active.waypoint
-        if active.trajectory is not seen or at != seen_at:
-            known = unharmed is seen and at == seen_at
-            self.look_ahead(stamp_s, at if known else None)
-        self._looked = (active.trajectory, at)
+        if active.trajectory is not judged or at != judged_at:
+            unchanged = unharmed is judged and at == judged_at
+            self.judge_ahead(stamp_s, at if unchanged else None)
+        self._judged = (active.trajectory, at)
 
-    def look_ahead(self, stamp_s: float, only: int | None = None) -> None:
+    def judge_ahead(self, stamp_s: float, only: int | None = None) -> None:
         """Drop anomalous waypoints of the plan ahead before other nodes use them."""
         active = self._pilot.active
         while (flown := active.trajectory) is not None:

@@ -111,5 +111,4 @@ class AutoencoderDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the reconstruction error: the mean square over the 13 scaled deltas."""
-        error: float = _reconstruction_error(self.flat, deltas)
-        return error
+        return _reconstruction_error(self.flat, deltas)

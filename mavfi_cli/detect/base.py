@@ -1,4 +1,4 @@
-"""Detectors: their interface, those of other packages, and the base and model files of ours.
+"""The detector interface, the registry of detectors, and the base class and model files of ours.
 
 A model file is a fitted detector with its provenance in JSON. Reading is strict.
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
@@ -157,8 +157,8 @@ class Model:
         if not isinstance(data, dict):
             raise ModelError("corrupt model file: no JSON object", path=path)
         if (schema := data.get("schema", SCHEMA)) != SCHEMA:
-            raise ModelError(f"made for model schema {schema!r}, this is {SCHEMA!r}", path=path)
-        if odd := set(data) ^ {each.name for each in fields(cls)}:
+            raise ModelError(f"model schema must be {SCHEMA!r}, got {schema!r}", path=path)
+        if odd := set(data) ^ {key.name for key in fields(cls)}:
             raise ModelError(f"corrupt model file: keys {', '.join(sorted(odd))}", path=path)
         try:
             model = structure(data, cls)
@@ -168,17 +168,17 @@ class Model:
             raise ModelError("corrupt model file: preprocess: parameters are missing", path=path)
         return model
 
-    def problem_of(self, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> str:
-        """Return why this version has no detector of that kind for the model; empty if it has."""
+    def incompatibility(self, detector: str, shapes: Mapping[str, tuple[int, ...]]) -> str:
+        """Return the reason why a detector cannot use the model; empty if it can."""
         names = [state.name for state in EXTENDED]
         if self.mavfi != version("mavfi"):
             return f"made for mavfi {self.mavfi!r}, this is {version('mavfi')!r}"
         if self.detector != detector:
             return f"made for detector {self.detector!r}, this is {detector!r}"
         if self.states != STATES_DIGEST:
-            return "made for another table of states; train it anew"
+            return "made for another table of states; train it again"
         if self.preprocess_digest != self.preprocess.digest():
-            return "made with another preprocessing; train it anew"
+            return "made with another preprocessing; train it again"
         if set(self.extended) != set(names):
             return f"corrupt model file: extended must be {', '.join(names)}"
         for name, (low, high) in self.extended.items():
@@ -191,7 +191,7 @@ class Model:
 
 def _require_finite(name: str, array: FloatArray, path: Path) -> None:
     if not np.isfinite(array).all():
-        raise ModelError(f"array {name!r} holds a number that is not finite", path=path)
+        raise ModelError(f"array {name!r} must be finite", path=path)
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
@@ -199,43 +199,58 @@ def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
     return SHIPPED / stack / f"{detector}.json"
 
 
-def listing(models: Path | None = None) -> list[dict[str, Any]]:
-    """Return one row per model: detector, file, stack, threshold, provenance, and a line about it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorListing:
+    """A detector with one of its models."""
 
-    A detector without a model has one row. For a model that cannot be used, the line says why.
+    name: str
+    model: str | None = None  # path of the model file
+    stack: str | None = None
+    threshold: float | None = None
+    provenance: Mapping[str, Any] | None = None
+    description: str  # origin of the model, or the reason why it cannot be used
+
+
+def listing(models: Path | None = None) -> list[DetectorListing]:
+    """List all detectors with their models. A detector without a model has one row.
 
     Args:
-        models: Folder of model files `NAME.json`; None takes those that are shipped.
+        models: Folder of model files `NAME.json`; None selects the shipped ones.
     """
     rows = []
     for name in PLUG_INS.names:
-        shipped_ones = sorted(SHIPPED.glob(f"*/{name}.json"))
-        paths = shipped_ones if models is None else [models / f"{name}.json"]
-        rows += [_row(name, path) for path in paths] or [_row(name, None)]
+        ours = sorted(SHIPPED.glob(f"*/{name}.json"))
+        paths = ours if models is None else [models / f"{name}.json"]
+        rows += [_listed(name, path) for path in paths] or [_listed(name, None)]
     return rows
 
 
-def _row(name: str, path: Path | None) -> dict[str, Any]:
-    has_model = path is not None and path.is_file()
-    nothing = dict.fromkeys(("stack", "threshold", "provenance"))
-    row: dict[str, Any] = {"name": name, "model": str(path) if has_model else None, **nothing}
+def _listed(name: str, path: Path | None) -> DetectorListing:
+    row = DetectorListing(
+        name=name,
+        model=str(path) if path is not None and path.is_file() else None,
+        description="needs no training",
+    )
     try:
-        row["threshold"] = find_detector(name, model=path).threshold
+        row = replace(row, threshold=find_detector(name, model=path).threshold)
         if path is None:
-            return {**row, "told": "needs no training"}
+            return row
         model = Model.read(path)
     except MavfiError as error:  # of the model, or of a plug-in that does not load
-        return {**row, "told": f"cannot be used: {error}"}
+        return replace(row, description=f"cannot be used: {error}")
     provenance, flights = model.provenance, model.training_flights
-    row["provenance"] = {"mavfi": model.mavfi, "detector": model.detector, **provenance}
-    row["stack"] = model.stack.name
     seeds = sorted({int(end) for f in flights if (end := f.rpartition("/")[2]).isdigit()})
     span = f", seeds {seeds[0]} to {seeds[-1]}" if seeds else ""
     worlds = ", ".join(provenance.get("worlds", [])) or "unknown worlds"
     flown = f"{provenance.get('flights', len(flights))} flights"
     if autopilot := provenance.get("autopilot"):
         flown += f" of {autopilot}"
-    return {**row, "told": f"{flown} in {worlds}{span}; mavfi {model.mavfi}"}
+    return replace(
+        row,
+        stack=model.stack.name,
+        provenance={"mavfi": model.mavfi, "detector": model.detector, **provenance},
+        description=f"{flown} in {worlds}{span}; mavfi {model.mavfi}",
+    )
 
 
 Shapes = dict[str, tuple[int, ...]]
@@ -274,26 +289,21 @@ class FittedDetector:
         self.flat: FloatArray = np.concatenate([*pieces, np.zeros(self.scratch)])
         self.stack: StackMark | None = None
         self.extended: Ranges | None = None
-        self._views()
-
-    def _views(self) -> None:
-        self._memory: dict[str, FloatArray] = {}
-        start = 0
-        for name, shape in self.shapes.items():
-            end = start + math.prod(shape)
-            self._memory[name] = self.flat[start:end].reshape(shape)
-            start = end
 
     @property
     def memory(self) -> Mapping[str, FloatArray]:
         """Writable views of the detector's state. A change takes effect at the next sample."""
-        return self._memory
+        views, start = {}, 0
+        for name, shape in self.shapes.items():
+            end = start + math.prod(shape)
+            views[name] = self.flat[start:end].reshape(shape)
+            start = end
+        return views
 
     @property
     def threshold(self) -> float:
         """Threshold. A score above it raises an alarm."""
-        threshold: float = self.flat.item(0)
-        return threshold
+        return self.flat.item(0)
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
@@ -312,7 +322,7 @@ class FittedDetector:
     @classmethod
     def _arrays(cls, model: Model, path: Path) -> dict[str, FloatArray]:
         """Return the arrays of a model. A ModelError says why this version cannot use it."""
-        if problem := model.problem_of(cls.name, cls.shapes):
+        if problem := model.incompatibility(cls.name, cls.shapes):
             raise ModelError(problem, path=path)
         arrays = {}
         for name, shape in cls.shapes.items():
@@ -322,20 +332,14 @@ class FittedDetector:
                 problem = f"corrupt model file: array {name!r} does not contain numbers"
                 raise ModelError(problem, path=path) from None
             if array.shape != shape:
-                problem = f"array {name!r} has shape {array.shape}, this version needs {shape}"
+                problem = f"array {name!r} must have shape {shape}, got {array.shape}"
                 raise ModelError(problem, path=path)
             _require_finite(name, array, path)
             if name in (next(iter(cls.shapes)), *cls.divisors) and not (array > 0.0).all():
-                raise ModelError(f"array {name!r} holds a number that is not above 0", path=path)
+                problem = f"array {name!r} must be above 0, got {array.min()}"
+                raise ModelError(problem, path=path)
             arrays[name] = array
         return arrays
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
         """Do nothing, because most models are fixed in flight. See `Detector`."""
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"flat": self.flat, "stack": self.stack, "extended": self.extended}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.flat, self.stack, self.extended = state["flat"], state["stack"], state["extended"]
-        self._views()

@@ -56,7 +56,7 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
         if kind not in KINDS:
             raise UnknownName("detector", kind, KINDS)
     if flights < FLIGHTS_MIN:
-        raise ModelError(f"{flights} flights are too few to fit to: {FLIGHTS_MIN} at least")
+        raise ModelError(f"the number of flights must be at least {FLIGHTS_MIN}, got {flights}")
     if n_sigma is not None:
         checked_threshold(n_sigma, "n sigma")
     if "aad" in kinds and find_spec("torch") is None:  # its import would take seconds
@@ -237,13 +237,13 @@ def _train_once(torch: Any, inputs: FloatArray, validation: FloatArray, seed: in
     curve: list[list[float]] = []
     for epoch in range(EPOCHS + 1):
         with torch.no_grad():
-            met = float(loss_of(checked).max())
-        if met < best:
-            best, best_epoch = met, epoch
+            error = float(loss_of(checked).max())
+        if error < best:
+            best, best_epoch = error, epoch
             kept = {name: w.detach().numpy().copy() for name, w in weights.items()}
         loss = loss_of(rows).mean()
         if epoch % CURVE_EVERY == 0:
-            curve.append([epoch, float(loss.detach()), met])
+            curve.append([epoch, float(loss.detach()), error])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

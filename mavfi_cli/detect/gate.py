@@ -1,9 +1,9 @@
 """The gate: every message passes it before it takes effect, and may raise an alarm.
 
-The gate knows messages and deltas, but no clock and no mission. A message that raises an alarm does
-not become the reference, and the detector does not learn it. The caller withholds the message and
-recomputes the stage. If recomputation confirms the message, the caller accepts it with
-`accept_report`, `accept_plan` or `accept_tick`, and the message becomes the reference.
+A message that raises an alarm does not become the reference, and the detector does not learn it.
+The caller withholds the message and recomputes the stage. If recomputation confirms the message,
+the caller accepts it with `accept_report`, `accept_plan` or `accept_tick`, and the message becomes
+the reference.
 
 The alarm of a per-stage detector (`Detector.per_stage`) names the stage with anomalous states. A
 detector over all stages scores one vector: of a report on its arrival, and of each tick together
@@ -25,28 +25,15 @@ from numpy.typing import NDArray
 
 from mavfi_cli.core.types import CollisionReport, Command, FloatArray, Message, Stage, Trajectory
 from mavfi_cli.detect import preprocess
-from mavfi_cli.detect.base import (
-    OF_CONTROL,
-    OF_PLANNING,
-    PASSED,
-    Detector,
-    FittedDetector,
-    TickJudge,
-)
-from mavfi_cli.detect.preprocess import (
-    COUNT,
-    EXTENDED,
-    NAMES,
-    SPANS,
-    Codes,
-    PreprocessParams,
-    Ranges,
-)
+from mavfi_cli.detect.base import OF_CONTROL, OF_PLANNING, PASSED, Detector, FittedDetector
+from mavfi_cli.detect.preprocess import COUNT, EXTENDED, NAMES, SPANS, Codes, PreprocessParams
 from mavfi_cli.detect.span import MARGIN
 
 _NO_WAYPOINTS = np.zeros((0, 10))
 _TICK, _TICK_AND_WAYPOINT = (Stage.CONTROL,), (Stage.PLANNING, Stage.CONTROL)
 ALL_STAGES = frozenset(Stage)
+# Arguments of `preprocess.take_tick` before the working array.
+_Tick = tuple[FloatArray, int, FloatArray, float, bool]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +62,7 @@ class _ExtendedWatch:
             state. A modification takes effect at once.
     """
 
-    def __init__(self, ranges: Ranges) -> None:
+    def __init__(self, ranges: preprocess.Ranges) -> None:
         rows = zip(*(ranges[state.name] for state in EXTENDED), strict=True)
         self.memory: Codes = np.array([[0] * len(EXTENDED), *rows], np.int16)
         self._lost = {CollisionReport: 0, Trajectory: 0}  # messages since the last accepted one
@@ -118,22 +105,22 @@ class _ExtendedWatch:
         references: Mapping[int, int] | Sequence[int],
         steps: int,
     ) -> Alarm | None:
-        found: list[tuple[int, int]] = []
+        anomalies: list[tuple[int, int]] = []
         for place, code in preprocess.extended_codes(message):
             delta = min(max(code - references[place], -preprocess.LIMIT), preprocess.LIMIT)
             lowest, highest = self.memory[1:, place].tolist()
             distance = max(steps * lowest - delta, delta - steps * highest)
             if distance > 0:
-                found.append((-distance, place))
-        if not found:
+                anomalies.append((-distance, place))
+        if not anomalies:
             return None
-        found.sort()
+        anomalies.sort()
         return Alarm(
-            stage=EXTENDED[found[0][1]].stage,
+            stage=EXTENDED[anomalies[0][1]].stage,
             detector="extended watch",
-            score=float(-found[0][0]),
+            score=float(-anomalies[0][0]),
             threshold=MARGIN,
-            states=tuple(EXTENDED[place].name for _, place in found),
+            states=tuple(EXTENDED[place].name for _, place in anomalies),
         )
 
 
@@ -155,7 +142,7 @@ class Gate:
         detector: Detector,
         protect: frozenset[Stage] = ALL_STAGES,
         params: PreprocessParams | None = None,
-        extended: Ranges | None = None,
+        extended: preprocess.Ranges | None = None,
     ) -> None:
         self.detector = detector
         self._watch = None if extended is None else _ExtendedWatch(extended)
@@ -170,13 +157,13 @@ class Gate:
         self._judged: tuple[Trajectory | None, int] = (None, -1)
         self._pending = False  # True if a report's deltas wait for the next tick
         self._ignored = [slice(*SPANS[stage]) for stage in Stage if stage not in protect]
-        self._steps = np.empty(0, np.int64)  # buffer for the steps of a plan, see `_look`
+        self._steps = np.empty(0, np.int64)  # buffer for the steps of a plan, see `_score_steps`
         self._changes = np.empty((0, COUNT), np.int16)
         self._scores = np.empty(0)
         fitted = detector if isinstance(detector, FittedDetector) else None
         self._flat = None if fitted is None else fitted.flat
         compiled = None if fitted is None or self._ignored else fitted.tick_judge
-        self._tick_judge: TickJudge = compiled or self._judge_stages
+        self._tick_judge = compiled or self._judge_stages
         self._plan_judge = None if fitted is None else fitted.plan_judge
 
     @property
@@ -226,11 +213,9 @@ class Gate:
         return self._settled(trajectory, alarm)
 
     def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
-        """Tell the extended watch whether a judged message takes effect; return the alarm."""
-        if self._watch is not None and alarm is None:
-            self._watch.accept(message)
-        elif self._watch is not None:
-            self._watch.lose(type(message))
+        """Pass the extended watch the fate of a judged message. Return the alarm."""
+        if self._watch is not None:
+            self._watch.accept(message) if alarm is None else self._watch.lose(type(message))
         return alarm
 
     def lose_plan(self) -> None:
@@ -258,7 +243,7 @@ class Gate:
         rows = len(trajectory.waypoints)
         if rows < 2:
             return None
-        scores, threshold = self._look(trajectory, first), self.detector.threshold
+        scores, threshold = self._score_steps(trajectory, first), self.detector.threshold
         bad = [number for number, score in enumerate(scores) if not score <= threshold]
         if not bad:
             return None
@@ -269,7 +254,7 @@ class Gate:
         deltas, waypoint = self._changes[number], step if only_first else step + 1
         return self._alarm(stage, scores[number], deltas, waypoint)
 
-    def _look(self, trajectory: Trajectory, first: int) -> list[float]:
+    def _score_steps(self, trajectory: Trajectory, first: int) -> list[float]:
         """Return the scores of the steps with a changed code; `_steps` and `_changes` hold them."""
         waypoints = trajectory.waypoints
         if len(waypoints) > len(self._steps):
@@ -317,17 +302,10 @@ class Gate:
         return self._alarm(stage, score, self._deltas)
 
     def _judge_stages(
-        self,
-        _flat: FloatArray | None,
-        work: Codes,
-        waypoints: FloatArray,
-        row: int,
-        velocity_enu_mps: FloatArray,
-        yaw_rad: float,
-        keep_report: bool,
+        self, _flat: FloatArray | None, work: Codes, *tick: *_Tick
     ) -> tuple[float, int]:
         """Judge a tick as `FittedDetector.tick_judge` does, for a detector that has none."""
-        preprocess.take_tick(waypoints, row, velocity_enu_mps, yaw_rad, keep_report, work)
+        preprocess.take_tick(*tick, work)
         for span in self._ignored:
             self._deltas[span] = 0
         for stage in self.fresh if self._per_stage else _TICK:

@@ -144,8 +144,7 @@ class GaussianDetector(FittedDetector):
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the distance of the stage's most anomalous delta from its mean, in sigmas."""
         first, end = span(stage)
-        distance: float = _farthest(self.flat, deltas, first, end)
-        return distance
+        return _farthest(self.flat, deltas, first, end)
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
         """Apply equations 1 and 2 to each state of the stage."""

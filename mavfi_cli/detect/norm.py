@@ -21,13 +21,11 @@ class NormDetector(FittedDetector):
 
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the norm of the scaled deltas."""
-        length: float = _norm(self.flat, deltas)
-        return length
+        return _norm(self.flat, deltas)
 
 
 @compiled
 def _norm(memory: FloatArray, deltas: Codes) -> float:
-    """Return the Euclidean norm of the scaled deltas (COUNT,)."""
     total = 0.0
     for place in range(COUNT):
         scaled = deltas[place] / memory[1 + place]

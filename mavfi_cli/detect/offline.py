@@ -61,7 +61,7 @@ class PlanStrike:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Judgement:
     stamp_s: float
-    report: bool  # True for a collision report, False for a control tick
+    report: CollisionReport | None  # None for a control tick
     new_waypoint: bool
     deltas: Codes  # (COUNT,)
     score: float  # highest score of the stages and of the plan's steps ahead
@@ -69,7 +69,7 @@ class _Judgement:
 
 
 class _Probe:
-    """Wraps a detector, or none, and keeps the highest score since the last `look`."""
+    """Wraps a detector, or none, and keeps the highest score since `take_highest`."""
 
     def __init__(self, detector: Detector | None) -> None:
         self._detector = detector
@@ -90,8 +90,8 @@ class _Probe:
         if self._detector is not None:
             self._detector.learn(deltas, stage)
 
-    def look(self) -> float:
-        """Return the highest score since the last look; minus infinity if there was none."""
+    def take_highest(self) -> float:
+        """Return the highest score since the last call; minus infinity if there was none."""
         highest, self.highest = self.highest, -np.inf
         return highest
 
@@ -139,10 +139,10 @@ def replay(
                 continue
             judged = _Judgement(
                 stamp_s=stamp_s,
-                report=is_report,
+                report=message if isinstance(message, CollisionReport) else None,
                 new_waypoint=Stage.PLANNING in gate.fresh,
                 deltas=gate.deltas,
-                score=probe.look(),
+                score=probe.take_highest(),
                 alarm=alarm,
             )
             in_a_row[is_report] = in_a_row[is_report] + 1 if alarm is not None else 0
@@ -160,11 +160,11 @@ class _FlownPlans:
     ) -> None:
         self._plans = {plan.stamp_s: plan for plan in plans}
         self._strikes = sorted(strikes, key=lambda strike: strike.stamp_s)
-        self._looked: tuple[Trajectory | None, int] = (None, -1)
+        self._judged: tuple[Trajectory | None, int] = (None, -1)
         if not plans:
             return
         if not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
-            raise ModelError("the trace does not say which plan is flown")
+            raise ModelError("the trace has no columns trajectory_stamp_s and waypoint_index")
         self._stamps_s = _reals(trace["trajectory_stamp_s"])
         self._waypoints = _reals(trace["waypoint_index"])
 
@@ -178,8 +178,8 @@ class _FlownPlans:
         if plan is None:
             return None
         waypoint = int(self._waypoints[row])
-        seen, self._looked = self._looked, (plan, waypoint)
-        return None if plan is seen[0] and waypoint == seen[1] else (plan, waypoint)
+        before, self._judged = self._judged, (plan, waypoint)
+        return None if plan is before[0] and waypoint == before[1] else (plan, waypoint)
 
     def _strike(self, strike: PlanStrike, plan_stamp_s: float) -> None:
         """Apply a strike to the active plan, unless the value was published so."""
@@ -252,8 +252,7 @@ class _Messages:
 
 
 def _reals(column: NDArray[Any]) -> FloatArray:
-    filled: FloatArray = np.ma.filled(column.astype(np.float64), np.nan)
-    return filled
+    return np.ma.filled(column.astype(np.float64), np.nan)
 
 
 def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
@@ -319,28 +318,27 @@ class FlightSamples:
         """
         params = params or PreprocessParams()
         judged = list(replay(trace, None, params))
-        steps = [step for plan in plans for step in _plan_steps(plan, params)]
-        stamps = [plan.stamp_s for plan in plans for _ in range(len(plan.waypoints) - 1)]
-        extended = np.zeros((len(judged) + len(steps), len(EXTENDED)), np.int16)
-        messages = _Messages(trace)
-        reports = [messages.report(row) for row in range(len(messages.stamps_s))]
-        extended[np.flatnonzero([each.report for each in judged])] = _extended_changes(
-            [report for report in reports if report is not None]
-        )
-        firsts = np.cumsum([len(judged), *(len(plan.waypoints) - 1 for plan in plans)])[:-1]
-        for first, plan, row in zip(firsts.tolist(), plans, _extended_changes(plans), strict=True):
-            if len(plan.waypoints) > 1:
-                extended[first] = row
-        no_steps, no_messages = [False] * len(steps), [False] * len(judged)
+        reports = [judgement.report for judgement in judged if judgement.report is not None]
+        of_reports, unchanged = iter(_extended_changes(reports)), np.zeros(len(EXTENDED), np.int16)
+        rows: list[tuple[float, bool, bool, bool, Codes, Codes]] = []
+        for j in judged:
+            changes = unchanged if j.report is None else next(of_reports)
+            rows.append((j.stamp_s, bool(j.report), False, j.new_waypoint, j.deltas, changes))
+        for plan, changes in zip(plans, _extended_changes(plans), strict=True):
+            for deltas in _plan_steps(plan, params):
+                rows.append((plan.stamp_s, False, True, False, deltas, changes))
+                changes = unchanged  # those of a plan are in its first row
+        columns: Any = list(zip(*rows, strict=True)) or [()] * 6
+        stamps_s, is_report, is_step, new_waypoint, coded, extended = columns
         return cls(
             world=world,
             seed=seed,
-            stamps_s=np.array([each.stamp_s for each in judged] + stamps, np.float64),
-            reports=np.array([each.report for each in judged] + no_steps, np.bool_),
-            plan_steps=np.array(no_messages + [True] * len(steps), np.bool_),
-            new_waypoint=np.array([each.new_waypoint for each in judged] + no_steps, np.bool_),
-            deltas=np.array([each.deltas for each in judged] + steps, np.int16).reshape(-1, COUNT),
-            extended=extended,
+            stamps_s=np.array(stamps_s, np.float64),
+            reports=np.array(is_report, np.bool_),
+            plan_steps=np.array(is_step, np.bool_),
+            new_waypoint=np.array(new_waypoint, np.bool_),
+            deltas=np.array(coded, np.int16).reshape(-1, COUNT),
+            extended=np.array(extended, np.int16).reshape(-1, len(EXTENDED)),
         )
 
     def of_stage(self, stage: Stage) -> Codes:
@@ -353,18 +351,18 @@ class FlightSamples:
 
     def scores(self, detector: Detector) -> FloatArray:
         """Return the score of every judged message (n,): the highest score of its stages."""
-        found = np.zeros(len(self.deltas))
+        scores = np.zeros(len(self.deltas))
         flags = (self.reports, self.plan_steps, self.new_waypoint)
         rows = zip(self.deltas, *(flag.tolist() for flag in flags), strict=True)
         for row, (deltas, report, step, new) in enumerate(rows):
             if report:
-                found[row] = detector.score(deltas, Stage.PERCEPTION)
+                scores[row] = detector.score(deltas, Stage.PERCEPTION)
                 continue
             if not (step and detector.per_stage):
-                found[row] = detector.score(deltas, Stage.CONTROL)
+                scores[row] = detector.score(deltas, Stage.CONTROL)
             if (new or step) and detector.per_stage:
-                found[row] = max(found[row], detector.score(deltas, Stage.PLANNING))
-        return found
+                scores[row] = max(scores[row], detector.score(deltas, Stage.PLANNING))
+        return scores
 
 
 def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
@@ -372,20 +370,21 @@ def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
     rows = len(plan.waypoints)
     steps, changes = np.empty(rows, np.int64), np.empty((rows, COUNT), np.int16)
     count = preprocess.plan_deltas(plan.waypoints, 0, params.working_array(), steps, changes)
-    found = np.zeros((max(0, rows - 1), COUNT), np.int16)
-    found[steps[:count]] = changes[:count]
-    return found
+    deltas = np.zeros((max(0, rows - 1), COUNT), np.int16)
+    deltas[steps[:count]] = changes[:count]
+    return deltas
 
 
 def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
     """Return the changes (n, 3) of the extended states between messages of one kind."""
-    found = np.zeros((len(messages), len(EXTENDED)), np.int16)
+    changes = np.zeros((len(messages), len(EXTENDED)), np.int16)
     before = [0] * len(EXTENDED)
     for row, message in enumerate(messages):
         for place, code in preprocess.extended_codes(message):
-            found[row, place] = min(max(code - before[place], -preprocess.LIMIT), preprocess.LIMIT)
+            change = code - before[place]
+            changes[row, place] = min(max(change, -preprocess.LIMIT), preprocess.LIMIT)
             before[place] = code
-    return found
+    return changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -399,7 +398,7 @@ class Dataset:
     def __post_init__(self) -> None:
         keys = [(flight.world, flight.seed) for flight in self.flights]
         if len(set(keys)) != len(keys):
-            raise ModelError("a data set holds each flight (world and seed) once only")
+            raise ModelError("a data set must hold every flight (world and seed) once")
 
     def __len__(self) -> int:
         return len(self.flights)
@@ -408,24 +407,20 @@ class Dataset:
         """Write the data set as Parquet, atomically. Equal data sets give equal bytes."""
         import pyarrow as pa
 
-        flights = self.flights
-        lengths = [len(flight.stamps_s) for flight in flights]
-        worlds = np.repeat([f.world for f in flights], lengths).tolist()
-        columns: dict[str, pa.Array] = {
-            "world": pa.array(worlds, pa.string()),
-            "seed": pa.array(np.repeat([f.seed for f in flights], lengths), pa.int64()),
-            "stamp_s": pa.array(np.concatenate([[], *(f.stamps_s for f in flights)]), pa.float64()),
-        }
-        for flag in _FLAGS:
-            flags = np.concatenate([np.zeros(0, np.bool_), *(getattr(f, flag) for f in flights)])
-            columns[flag] = pa.array(flags, pa.bool_())
-        codes = [np.column_stack([f.deltas, f.extended]) for f in flights]
-        coded = np.concatenate([np.zeros((0, len(_CODED)), np.int16), *codes])
-        for place, name in enumerate(_CODED):
-            columns[name] = pa.array(coded[:, place], pa.int16())
+        schema = pa.schema(
+            [("world", pa.string()), ("seed", pa.int64()), ("stamp_s", pa.float64())]
+            + [(flag, pa.bool_()) for flag in _FLAGS]
+            + [(name, pa.int16()) for name in _CODED]
+        )
+        tables = [schema.empty_table()]
+        for flight in self.flights:
+            named = [[value] * len(flight.stamps_s) for value in (flight.world, flight.seed)]
+            flags = [getattr(flight, flag) for flag in _FLAGS]
+            codes = np.column_stack([flight.deltas, flight.extended]).T
+            tables.append(pa.table([*named, flight.stamps_s, *flags, *codes], schema=schema))
         stack = {"mavfi_stack": self.stack.name, "mavfi_stack_digest": self.stack.digest}
         metadata = {**_signature(self.preprocess), **stack}
-        write_parquet(path, pa.table(columns).replace_schema_metadata(metadata))
+        write_parquet(path, pa.concat_tables(tables).replace_schema_metadata(metadata))
 
     @classmethod
     def load(cls, path: Path, preprocess: PreprocessParams | None = None) -> Dataset:
@@ -449,7 +444,8 @@ class Dataset:
             raise ModelError("is not a data set of mavfi", path=path)
         if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
             raise ModelError(
-                "made for another version, table of states or preprocessing; fly it anew", path=path
+                "made for another version, table of states or preprocessing; fly it again",
+                path=path,
             )
         stack = StackMark(name=metadata["mavfi_stack"], digest=metadata["mavfi_stack_digest"])
         return cls(flights=tuple(_flights(table)), preprocess=params, stack=stack)

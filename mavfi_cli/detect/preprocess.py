@@ -105,10 +105,11 @@ class PreprocessParams:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if not -1022 <= value <= 1023:
-                raise ConfigError(f"an exponent of a float64 lies in -1022..1023, got {value}",
-                                  key=name)  # fmt: skip
-        if self.time_to_collision_ceiling <= self.time_to_collision_floor:
-            raise ConfigError("must be above the floor", key="time_to_collision_ceiling")
+                raise ConfigError(f"must be from -1022 to 1023, got {value}", key=name)
+        floor, ceiling = self.time_to_collision_floor, self.time_to_collision_ceiling
+        if ceiling <= floor:
+            problem = f"must be above the floor {floor}, got {ceiling}"
+            raise ConfigError(problem, key="time_to_collision_ceiling")
 
     def working_array(self) -> Codes:
         """Create the working array (ROWS, COUNT) of the functions below, without references.
@@ -148,7 +149,6 @@ def extended_codes(message: Message) -> list[tuple[int, int]]:
 
 @compiled
 def _encode(value: float, floor: int, ceiling: int, kind: int) -> int:
-    """Return the code of one value."""
     if math.isnan(value):
         return NAN_CODE
     if kind == _INTEGER:

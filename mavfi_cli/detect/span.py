@@ -23,8 +23,7 @@ class RangeDetector(FittedDetector):
     def score(self, deltas: Codes, stage: Stage) -> float:
         """Return the largest distance of the stage's deltas from their ranges, in codes."""
         first, end = span(stage)
-        distance: float = _outside(self.flat, deltas, first, end)
-        return distance
+        return _outside(self.flat, deltas, first, end)
 
 
 @compiled

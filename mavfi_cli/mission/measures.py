@@ -360,7 +360,11 @@ class DetectionCost:
         if not checks or not flight_s:
             return None
         # Alarms that are not listed are distributed over the stages like those that are.
-        listed = [alarm["stage"] for alarm in detection["alarms"] if alarm["response"] in _AGAIN]
+        listed = [
+            alarm.get("recomputes", alarm["stage"])
+            for alarm in detection["alarms"]
+            if alarm["response"] in _AGAIN
+        ]
         total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
         again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 

@@ -102,7 +102,7 @@ def test_a_dropped_waypoint_is_bridged_in_the_active_plan_and_needs_no_new_check
 def test_every_bad_waypoint_ahead_is_dropped():
     gate = Told(ahead=[2, 4])
     flying = Flying(gate)
-    flying.recovery.look_ahead(1.0)
+    flying.recovery.judge_ahead(1.0)
     seen = [plan for plan, _ in gate.looked]
     assert len(seen) == len({id(plan) for plan in seen}) == 3
     assert seen[0] is flying.plan
@@ -112,12 +112,12 @@ def test_every_bad_waypoint_ahead_is_dropped():
 def test_between_waypoints_a_plan_that_was_seen_is_not_looked_through_again():
     gate = Told()
     flying = Flying(gate)
-    flying.recovery.look_round(1.0, flying.plan)
-    flying.recovery.look_round(1.02, flying.plan)
+    flying.recovery.judge_changes(1.0, flying.plan)
+    flying.recovery.judge_changes(1.02, flying.plan)
     assert gate.looked == [(flying.plan, None)]
     flying.pilot.active.trajectory = struck = a_plan()
-    flying.recovery.look_round(1.04, flying.plan)
+    flying.recovery.judge_changes(1.04, flying.plan)
     assert gate.looked[1:] == [(struck, 1)]  # a strike: only the waypoint that is followed
     flying.pilot.active.time_s = 1.2
-    flying.recovery.look_round(1.06, struck)
+    flying.recovery.judge_changes(1.06, struck)
     assert gate.looked[2:] == [(struck, None)]

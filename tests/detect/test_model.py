@@ -51,7 +51,7 @@ def test_what_is_saved_is_loaded_exactly(path):
 @pytest.mark.parametrize(
     ("values", "problem"),
     [
-        ({"schema": 1}, "made for model schema 1, this is 2"),
+        ({"schema": 1}, "model schema must be 2, got 1"),
         ({"mavfi": "0.1.0"}, "made for mavfi '0.1.0', this is '"),
         ({"stack": "mavbench"}, "corrupt model file: stack: expected a table"),
         ({"stack": {"name": "mavbench"}}, "corrupt model file: stack.digest: is missing"),
@@ -90,11 +90,11 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(path, values, problem):
 @pytest.mark.parametrize(
     ("value", "problem"),
     [
-        ([1.0, 2.0], r"array 'n_sigma' has shape \(2,\), this version needs \(1,\)"),
+        ([1.0, 2.0], r"array 'n_sigma' must have shape \(1,\), got \(2,\)"),
         (["a"], "array 'n_sigma' does not contain numbers"),
-        ([None], "not finite"),
+        ([None], "must be finite"),
         ([[1.0], [2.0, 3.0]], "does not contain numbers"),
-        ([float("inf")], "not finite"),
+        ([float("inf")], "must be finite"),
     ],
 )
 def test_arrays_are_checked(path, value, problem):
@@ -116,7 +116,7 @@ def test_thresholds_and_divisors_out_of_range_are_refused(tmp_path, name, array,
     data["arrays"][array][-1] = value
     path = tmp_path / "odd.json"
     path.write_text(json.dumps(data))
-    with pytest.raises(ModelError, match=f"array '{array}' holds a number that is not above 0"):
+    with pytest.raises(ModelError, match=f"array '{array}' must be above 0, got"):
         base.find_detector(name, model=path)
 
 
@@ -134,7 +134,7 @@ def test_a_number_that_is_not_finite_overwrites_nothing(path):
     before = path.read_bytes()
     loaded = Model.read(path)
     loaded.arrays["mean"][0] = np.nan
-    with pytest.raises(ModelError, match="array 'mean' holds a number that is not finite"):
+    with pytest.raises(ModelError, match="array 'mean' must be finite"):
         loaded.save(path)
     assert path.read_bytes() == before
 
@@ -147,7 +147,7 @@ def test_thresholds_out_of_range(value):
 
 def test_a_model_of_version_0_1_is_refused_by_its_schema(path):
     changed(path, schema=1, mavfi="0.1.0", stack=None, extended=None)
-    with pytest.raises(ModelError, match="made for model schema 1, this is 2"):
+    with pytest.raises(ModelError, match="model schema must be 2, got 1"):
         base.find_detector("gad", model=path)
 
 
@@ -180,6 +180,6 @@ def test_a_plug_in_that_does_not_load_has_a_row_of_its_own(monkeypatch):
     )
     found = installed.PlugIns(base.PLUG_INS.group, "detector")
     monkeypatch.setattr(base, "PLUG_INS", found)
-    rows = {row["name"]: row for row in base.listing()}
-    assert rows["gone"]["told"].startswith("cannot be used: the plug-in 'gone'")
+    rows = {row.name: row for row in base.listing()}
+    assert rows["gone"].description.startswith("cannot be used: the plug-in 'gone'")
     assert {"gad", "aad", "range", "l2"} < set(rows)

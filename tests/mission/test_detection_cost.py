@@ -47,6 +47,14 @@ def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels()
     assert cost.recovery_share == pytest.approx(1.521 / 20.0)
 
 
+def test_an_alarm_about_a_report_that_recomputes_control_costs_control_only():
+    alarm = {"stage": "perception", "recomputes": "control", "response": "recompute"}
+    detection = RECORD["detection"] | {"responses": {"recompute": 1}, "alarms": [alarm]}
+    cost = DetectionCost.of(RECORD | {"detection": detection})
+    assert cost.recomputations == {"perception": 0.0, "planning": 0.0, "control": 1.0}
+    assert cost.recovered_s == pytest.approx(0.0005)
+
+
 def test_without_a_flight_time_the_whole_mission_counts():
     cost = DetectionCost.of(RECORD | {"quality_of_flight": {"flight_time_s": None}})
     assert cost.detection_share == pytest.approx(0.005 / 32.0)

@@ -129,6 +129,15 @@ def test_a_wild_report_is_withheld(limit):
     assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
 
 
+def test_the_record_names_the_recomputed_stage_if_it_is_not_the_alarm_s(per_stage, limit):
+    gate = protection(limit)
+    for number in (0, 1 << 20):
+        gate.report(replace(CALM, future_collision_seq=number), 0.0)
+    (alarm,) = gate.summary()["alarms"]
+    assert (alarm["stage"], alarm["message"]) == ("perception", "report")
+    assert alarm.get("recomputes") == (None if per_stage else "control")
+
+
 CALM = CollisionReport(
     stamp_s=0.0, collision=False, time_to_collision_s=np.inf, future_collision_seq=0
 )

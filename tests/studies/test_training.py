@@ -71,7 +71,7 @@ def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (["--flights", "2"], "8 flights are too few to fit to: 10 at least"),
+        (["--flights", "2"], "the number of flights must be at least 10, got 8"),
         (
             ["--kind", "gud"],
             "--kind: unknown detector 'gud'; did you mean 'gad'? Known: aad, gad, l2, range",
