@@ -12,6 +12,10 @@ from dataclasses import dataclass
 EARTH_RADIUS_M = 6_371_000.0
 
 
+def _sine_cosine(angle_deg: float) -> tuple[float, float]:
+    return math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
     """Geographic origin of the local frame. The default is PX4 SITL's home near Zurich."""
@@ -20,16 +24,12 @@ class Origin:
     longitude_deg: float = 8.545594
     altitude_amsl_m: float = 489.4
 
-    @property
-    def _sine_cosine(self) -> tuple[float, float]:
-        return math.sin(math.radians(self.latitude_deg)), math.cos(math.radians(self.latitude_deg))
-
     def geodetic(self, north_m: float, east_m: float) -> tuple[float, float]:
         """Return latitude and longitude, degrees, of a point of the local frame."""
         distance = math.hypot(north_m, east_m)
         if distance < 1e-9:
             return self.latitude_deg, self.longitude_deg
-        origin_sine, origin_cosine = self._sine_cosine
+        origin_sine, origin_cosine = _sine_cosine(self.latitude_deg)
         arc = distance / EARTH_RADIUS_M
         sin_arc, cos_arc = math.sin(arc), math.cos(arc)
         sine = cos_arc * origin_sine + north_m * sin_arc * origin_cosine / distance
@@ -41,10 +41,9 @@ class Origin:
 
     def local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Return north and east, m, of a point given in degrees."""
-        latitude = math.radians(latitude_deg)
         delta = math.radians(longitude_deg - self.longitude_deg)
-        sin_latitude, cos_latitude = math.sin(latitude), math.cos(latitude)
-        origin_sine, origin_cosine = self._sine_cosine
+        sin_latitude, cos_latitude = _sine_cosine(latitude_deg)
+        origin_sine, origin_cosine = _sine_cosine(self.latitude_deg)
         cosine = origin_sine * sin_latitude + origin_cosine * cos_latitude * math.cos(delta)
         arc = math.acos(max(-1.0, min(1.0, cosine)))
         scale = EARTH_RADIUS_M * (arc / math.sin(arc) if arc > 1e-9 else 1.0)

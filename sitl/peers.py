@@ -2,8 +2,8 @@
 
 A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
 the number of peers and of their waiting bytes. The source address of a datagram may be false, and
-replies then reach somebody who did not ask. So a UDP peer gets all messages only for a short time
-after each of its valid frames, then fewer and fewer, and is forgotten after 30 s.
+replies then reach a host that has sent nothing. So a UDP peer gets all messages only for a short
+time after a valid frame, then fewer and fewer. It is forgotten after 30 s of silence.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _AFTER_FIRST_S, _AFTER_LATER_S = 0.2, 3.0
 
 
 class Peer(ABC):
-    """Somebody at the other end of a transport.
+    """The program at the other end of a transport. `Peers` sets the attributes.
 
     Attributes:
         scheme: Scheme of its endpoint's URL.
-        last_received_s: Time of its newest valid frame. `Peers` sets this and the following ones.
-        last_sent_s: Time at which it was last sent something.
+        last_received_s, last_sent_s: Times of its newest valid frame and of the newest message to
+            it.
         full_rate_s: Time after a valid frame for which it gets all messages.
     """
 
@@ -130,11 +130,10 @@ class Peers(Generic[P]):
             self._call(action, peer)
 
     def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
-        """Call a function that sends with every peer in turn, except for a silent UDP peer.
+        """Call a function that sends with every peer in turn, with a silent UDP peer less often.
 
-        A silent peer is sent to at intervals that double. Once the time is over, the remaining
-        peers wait for the next call, which begins with them. The function returns False if it had
-        nothing to send.
+        The intervals of a silent peer double. Once the time is over, the remaining peers wait for
+        the next call, which begins with them. The function returns False if it had nothing to send.
         """
         for _ in range(len(self._peers)):
             if not self._peers:

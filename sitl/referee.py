@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mavfi_cli.core.errors import RecordError, VehicleProcessError
-from mavfi_cli.core.files import write_atomically, write_json
+from mavfi_cli.core.errors import VehicleProcessError
+from mavfi_cli.core.files import write_atomically, write_json, writing
 from mavfi_cli.core.frames import Vector, norm
 from sitl.sweep import clearance, sweep
 from sitl.world.world import World
@@ -66,8 +66,8 @@ class Referee:
     Args:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.
         vehicle, physics: Name, mass and thrust of the vehicle, for the report.
-        pose: Whose pose it judges, for the report; None for the true one.
-        logs: Keep a row of truth for each observation, for `save`.
+        pose: Source of the poses, for the report; None for the true ones.
+        logs: Keep a row of truth for every observation, for `save`.
     """
 
     def __init__(
@@ -139,10 +139,8 @@ class Referee:
         collision = None if self.collision is not None else self._hit(before, pose, crashed=crashed)
         if self._logs:
             gap_m, _ = clearance(position, quaternion, self._half, self._boxes)
-            powers = (power_regression_w, power_propeller_w)
-            self._rows.append(
-                (stamp_s, position, velocity, quaternion, gap_m, *powers, armed, on_ground)
-            )
+            observed = power_regression_w, power_propeller_w, armed, on_ground
+            self._rows.append((stamp_s, position, velocity, quaternion, gap_m, *observed))
         return collision
 
     def _crashes(
@@ -173,10 +171,10 @@ class Referee:
         return not (may_land and is_gentle)
 
     def _hit(self, before: _Pose, now: _Pose, *, crashed: bool) -> Collision | None:
-        poses = (before.position, before.quaternion, now.position, now.quaternion)
         share, box, self.min_clearance_m = sweep(
-            *poses, self._half, self._boxes, self.min_clearance_m
-        )
+            before.position, before.quaternion, now.position, now.quaternion,
+            self._half, self._boxes, self.min_clearance_m,
+        )  # fmt: skip
         if box < 0 and not crashed:
             return None
         share = share if box >= 0 else 1.0
@@ -192,15 +190,14 @@ class Referee:
     def report(self, energies_j: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of the flight for JSON. An infinite clearance (no boxes) is None."""
         hit, least = self.collision, self.min_clearance_m
-        what = {} if hit is None else {**dataclasses.asdict(hit), "what": hit.what}
         return {
-            "collision": what or None,
+            "collision": None if hit is None else {**dataclasses.asdict(hit), "what": hit.what},
             "min_clearance_m": least if math.isfinite(least) else None,
             "distance_m": self.distance_m,
             "energies_j": dict(energies_j or {}),
             "vehicle": self.vehicle,
             "physics": self.physics,
-            "world": self.world.as_json(),
+            "world": self.world.as_dict(),
             **({} if self._pose is None else {"pose": self._pose}),
         }
 
@@ -214,10 +211,8 @@ class Referee:
 
         Raises RecordError if it cannot be created or written (no space, no permission).
         """
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordError(f"{folder}: cannot write the truth log: {error.strerror}") from None
-        arrays: dict[str, Any] = self.log()
-        write_atomically(folder / "truth.npz", lambda file: np.savez(file, **arrays))
+        columns: Any = self.log()
+        write_atomically(folder / "truth.npz", lambda file: np.savez(file, **columns))
         write_json(folder / "truth.json", self.report(energies_j))

@@ -30,6 +30,7 @@ from sitl.command_line import stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.options import ServerOptions, VehicleSetup, parse
 from sitl.peers import Peer, Peers
+from sitl.referee import Collision
 from sitl.simulation import Simulation
 from sitl.vehicle.cascade import control_step
 from sitl.vehicle.profile import VehicleProfile, load_profile
@@ -41,7 +42,7 @@ _FRAMES = (
     dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
     dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
 )
-_OVERHEARD = 10  # number of newest texts to keep
+_MOST_TEXTS = 10  # newest texts of a client that wait for the others
 
 
 class Client(Peer):
@@ -51,8 +52,8 @@ class Client(Peer):
     heartbeat.
 
     Attributes:
-        overheard: Frames of received STATUSTEXTs for the other clients, unchanged, as an
-            autopilot forwards its companion's texts to the ground station.
+        texts: Frames of received STATUSTEXTs for the other clients, unchanged, as an autopilot
+            forwards its companion's texts to the ground station.
     """
 
     def __init__(
@@ -67,12 +68,13 @@ class Client(Peer):
         self._simulation = simulation
         self._preset = preset
         self.link = simulation.autopilot.open_link(preset)
-        system = simulation.autopilot.system_id
-        self._codec = Codec(system, COMPONENT, signing=signing)
-        self._camera_codec = Codec(system, CAMERA, signing=signing)
+        self._codec, self._camera_codec = (
+            Codec(simulation.autopilot.system_id, component, signing=signing)
+            for component in (COMPONENT, CAMERA)
+        )
         self._camera_answers: list[Any] = []
         self._wants_frames = False
-        self.overheard: deque[bytes] = deque(maxlen=_OVERHEARD)
+        self.texts: deque[bytes] = deque(maxlen=_MOST_TEXTS)
 
     def rejoin(self) -> None:
         """Begin again with the preset's streams, after the simulation has restarted."""
@@ -100,25 +102,23 @@ class Client(Peer):
                 if message.get_msgId() in _COMMANDS:
                     self._offer_camera(message)
                 elif message.get_msgId() == dialect.MAVLINK_MSG_ID_STATUSTEXT:
-                    self.overheard.append(bytes(message.get_msgbuf()))
+                    self.texts.append(bytes(message.get_msgbuf()))
                 self._simulation.handle(message, self.link)
         return messages
 
     def send_tick(self) -> bool:
-        """Send all that is due at this tick at once; True if there was any.
+        """Send all messages due at this tick at once, the autopilot's streams last.
 
-        The autopilot's streams are the last.
+        Return False if none is due.
         """
         with self._simulation.wall.measure("link"):
-            due = [
-                message
-                for message in self._simulation.camera_due
-                if self._wants_frames or message.get_msgId() not in _FRAMES
-            ]
+            due = self._simulation.camera_due
+            if not self._wants_frames:
+                due = [message for message in due if message.get_msgId() not in _FRAMES]
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> bool:
-        """Send the streams that are faster than a tick, at a stamp between two ticks."""
+        """Send the streams that are faster than ticks, at a stamp between two ticks."""
         autopilot = self._simulation.autopilot
         if not (self.link.is_fast and isinstance(autopilot, Autopilot)):
             return False
@@ -139,20 +139,16 @@ class Client(Peer):
 
     def _offer_camera(self, message: Any) -> None:
         answers = self._simulation.camera.handle(message)
-        if not answers:
-            return
         self._camera_answers += answers
-        if answers[-1].result != dialect.MAV_RESULT_ACCEPTED:
-            return
-        if message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE:
-            self._wants_frames = True
-        elif message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
-            self._wants_frames = False
+        if answers and answers[-1].result == dialect.MAV_RESULT_ACCEPTED:
+            starts = message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE
+            if starts or message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
+                self._wants_frames = starts
 
 
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
-_LOOK_UP_S = 0.2  # interval at which a silent wait checks for a stop
+_LOOK_UP_S = 0.2  # interval at which a wait checks for a stop
 _LATE_S = 0.25  # delay of a tick beyond which fast streams have the rate of ticks
 _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdue
 
@@ -175,10 +171,13 @@ class _Pace:
 
 
 def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[[], bool]) -> None:
-    """Run until the companion closes the connection or gives no answer, or until stopped."""
+    """Run until the companion closes the connection, or until stopped.
+
+    Raises VehicleProcessError if the companion does not answer a tick.
+    """
     client = Client(simulation, open_transport(f"fd:{options.fd}"), preset=Preset.LOCKSTEP)
     pace = None if options.speed is None else _Pace(options.speed)
-    try:
+    with contextlib.closing(client), contextlib.suppress(LinkLost):
         while not stopped():
             client.send_tick()
             stamp_ms = simulation.stamp_us // 1000
@@ -188,33 +187,24 @@ def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[
                 pace.next_tick(TICK_US * 1e-6)
                 time.sleep(max(pace.remaining_s(), 0.0))
             simulation.advance()
-    except LinkLost:
-        return
-    finally:
-        client.close()
 
 
 def _await_answer(
     stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
 ) -> bool:
     """Handle messages of the companion until it answers. Return False if stopped before."""
-    deadline_s = 0.0
-    while True:
+    received_s = time.monotonic()
+    while not stopped():
         messages = client.receive(_LOOK_UP_S)
         if _answers(messages, stamp_ms):
             return True
         if messages:
-            deadline_s = 0.0
-            continue
-        now_s = time.monotonic()
-        if stopped():
-            return False
-        if not deadline_s:
-            deadline_s = now_s + limit_s
-        elif now_s > deadline_s:
+            received_s = time.monotonic()
+        elif time.monotonic() > received_s + limit_s:
             raise VehicleProcessError(
-                f"the companion gave no answer to {stamp_ms} ms within {limit_s:g} s"
+                f"the companion did not answer the tick at {stamp_ms} ms within {limit_s:g} s"
             )
+    return False
 
 
 def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
@@ -231,7 +221,7 @@ class EmbeddedVehicle:
 
     Attributes:
         link: The companion's end of the link.
-        briefing: What the companion knows before the first message.
+        briefing: The companion's data before the first message.
         error: The error that ended the vehicle before its companion, if any.
 
     Raises:
@@ -263,12 +253,10 @@ class EmbeddedVehicle:
 
     def _fly_tick(self) -> bool:
         messages, simulation = self._client.receive(0.0), self._simulation
-        answered = not simulation.awaits_setpoints or _answers(
-            messages, simulation.stamp_us // 1000
-        )
-        if answered:
-            simulation.advance()
-        return answered
+        if simulation.awaits_setpoints and not _answers(messages, simulation.stamp_us // 1000):
+            return False
+        simulation.advance()
+        return True
 
     def end(self) -> None:
         """Fly the companion's last answer. May be called repeatedly."""
@@ -301,7 +289,7 @@ class _Realtime:
             signs = None if parse_endpoint(url).scheme == "fd" else signing
             make = partial(Client, simulation, preset=preset, signing=signs)
             self._clients.open(url, make)
-        self._announced = False
+        self._announced: Collision | None = None
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Run until stopped, or until an inherited connection closes."""
@@ -316,13 +304,12 @@ class _Realtime:
             self._serve(Client.send_tick, STEP_US if is_fast else TICK_US, stopped)
             self._simulation.advance(partial(self._between, stopped=stopped) if is_fast else None)
             collision = self._simulation.referee.collision
-            if collision is not None and not self._announced:
-                self._announced = True
+            if collision is not None and collision is not self._announced:
                 echo(f"{collision.text}; the vehicle stays there until a client reboots it")
-            if self._simulation.autopilot.restart_asked:
+            self._announced = collision
+            if self._simulation.autopilot.restart_requested:
                 self._simulation.restart()
                 self._clients.for_all(Client.rejoin)
-                self._announced = False
                 echo("restarted")
 
     def _between(self, stamp_us: int, *, stopped: Callable[[], bool]) -> None:
@@ -336,10 +323,10 @@ class _Realtime:
     def _serve(
         self, send: Callable[[Client], bool], duration_us: int, stopped: Callable[[], bool]
     ) -> None:
-        """Send what is due, and answer clients until the next tick or step, once if it is overdue.
+        """Send due messages, then answer clients until the next tick, or once if it is overdue.
 
-        The time for all clients is bounded, so that a flood cannot stop the clock: half of it is
-        for what is due.
+        The time for all clients is bounded, so that a flood cannot stop the clock. Half of it is
+        for the due messages.
         """
         self._pace.next_tick(duration_us * 1e-6)
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
@@ -355,12 +342,10 @@ class _Realtime:
                 break
 
     def _forward(self, until_s: float) -> None:
-        for speaker in self._clients:
-            while speaker.overheard and time.monotonic() < until_s:
-                frame = speaker.overheard.popleft()
-                self._clients.send_in_turn(
-                    partial(Client.forward, frame=frame, of=speaker), until_s
-                )
+        for sender in self._clients:
+            while sender.texts and time.monotonic() < until_s:
+                forward = partial(Client.forward, frame=sender.texts.popleft(), of=sender)
+                self._clients.send_in_turn(forward, until_s)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -424,27 +409,32 @@ def _simulation(
     )  # fmt: skip
 
 
+# Schemes of MAVSDK and MAVProxy for the client of an endpoint.
+_CALLERS = {
+    "udpout": ("udpin", "udpin"), "udpin": ("udpout", "udpout"), "tcpin": ("tcpout", "tcp"),
+}  # fmt: skip
+
+
 def _announce(options: ServerOptions, simulation: Simulation) -> None:
     world = simulation.referee.world
     links = []
     for preset, url in options.links:
-        first, *rest = _ways_to(url) or [""]
-        links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{way}" for way in rest)]
-    whose = "anyone" + ("" if options.key_file is None else " who signs")
+        first, *rest = _clients_of(url) or [""]
+        links += [f"  {preset.value:9} {url:32} {first}", *(f"{'':45}{line}" for line in rest)]
+    source = "anyone" + ("" if options.key_file is None else " who signs")
     if options.setup.trusted:
-        whose = f"system {', '.join(map(str, sorted(options.setup.trusted)))} only"
-    lines = [
+        source = f"system {', '.join(map(str, sorted(options.setup.trusted)))} only"
+    note(
         f"world {world.name} seed {world.seed}, vehicle {simulation.referee.vehicle}, "
-        f"system {options.setup.system_id}, {options.speed:g} x real time",
-        f"takes commands from {whose}",
-        *(line.rstrip() for line in links),
-        *_needs_of_firmware(options),
-        "Ctrl-C ends it.",
-    ]
-    note("\n".join(lines))
+        f"system {options.setup.system_id}, {options.speed:g} x real time"
+    )
+    note(f"takes commands from {source}")
+    for line in [*links, *_firmware_settings(options), "Ctrl-C ends it."]:
+        note(line.rstrip())
 
 
-def _needs_of_firmware(options: ServerOptions) -> list[str]:
+def _firmware_settings(options: ServerOptions) -> list[str]:
+    """Return the settings of a firmware that somebody else starts, in lines."""
     kind = options.setup.firmware_kind
     if kind is None or options.setup.firmware is not None:
         return []
@@ -456,14 +446,12 @@ def _needs_of_firmware(options: ServerOptions) -> list[str]:
     ]
 
 
-def _ways_to(url: str) -> list[str]:
-    """Return the options with which known clients reach an endpoint, a line each."""
+def _clients_of(url: str) -> list[str]:
+    """Return a line for each known client with the option that connects it to an endpoint."""
     at = parse_endpoint(url)
-    mavsdk, mavproxy = {
-        "udpout": ("udpin", "udpin"), "udpin": ("udpout", "udpout"), "tcpin": ("tcpout", "tcp"),
-    }.get(at.scheme, ("", ""))  # fmt: skip
-    if not mavsdk:
+    if at.scheme not in _CALLERS:
         return []
+    mavsdk, mavproxy = _CALLERS[at.scheme]
     place = f"[{at.host}]:{at.port}" if ":" in at.host else f"{at.host}:{at.port}"
     alone = ["QGroundControl by itself"] if (at.scheme, at.port) == ("udpout", 14550) else []
     return [f"MAVSDK    {mavsdk}://{place}", f"MAVProxy  --master={mavproxy}:{place}", *alone]

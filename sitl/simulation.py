@@ -24,7 +24,7 @@ from sitl.vehicle.truth import Truth
 from sitl.vehicle.vehicle import Quadrotor
 from sitl.world import World
 
-HOST_FILE = "host.json"  # where this machine's time went; beside the truth, and no part of it
+HOST_FILE = "host.json"  # time and memory of this machine; beside the truth, and no part of it
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
 _GROUND_M = 0.3  # highest centre of a fallen vehicle
@@ -104,7 +104,7 @@ class Simulation:
         """Fly one control tick with the autopilot's command, then judge the result.
 
         Args:
-            between: Called with the stamp of each physics step within the tick, us.
+            between: Called with the stamp of every physics step within the tick, us.
         """
         self._fly(between)
         self.stamp_us += TICK_US
@@ -114,7 +114,7 @@ class Simulation:
         autopilot, vehicle = self.autopilot, self.vehicle
         assert isinstance(autopilot, Autopilot)
         autopilot.fly()
-        setpoint, motors_on = autopilot.setpoint, autopilot.motors_on
+        setpoint, motors_on = autopilot.snapshot.setpoint, autopilot.snapshot.motors_on
         for step in range(1, STEPS_A_TICK + 1):
             if self._wreck is None:
                 with self.wall.measure("physics"):
@@ -129,18 +129,19 @@ class Simulation:
         """Release everything outside this process. May be called repeatedly."""
 
     def truth(self) -> FlightTruth:
-        """Return the referee's log and verdict, and where this machine's time went."""
-        report = self.referee.report(self._energies_j())
-        return FlightTruth(log=self.referee.log(), report=report, **self._host())
+        """Return the referee's log and verdict, and the time and memory of this machine."""
+        return FlightTruth(
+            log=self.referee.log(),
+            report=self.referee.report(self._energies_j()),
+            stage_wall_s=self.wall.totals,
+            memory_mb=_memory_mb(),
+        )
 
     def save_truth(self, folder: Path) -> None:
         """Write `truth` into a folder. Raises RecordError if a file cannot be written."""
         self.referee.save(folder, self._energies_j())
-        write_json(folder / HOST_FILE, self._host())
-
-    def _host(self) -> dict[str, Any]:
-        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        return {"stage_wall_s": self.wall.totals, "memory_mb": memory_mb}
+        host = {"stage_wall_s": self.wall.totals, "memory_mb": _memory_mb()}
+        write_json(folder / HOST_FILE, host)
 
     def _energies_j(self) -> dict[str, float]:
         truth = self.vehicle.truth
@@ -161,19 +162,14 @@ class Simulation:
         return self.camera.poll(self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
-        """After a collision the vehicle falls and stays there."""
-        commander = self.autopilot.commander
+        """Have the referee judge a pose. After a collision the vehicle falls and stays there."""
+        commander, velocity = self.autopilot.commander, enu_from_ned(truth.velocity_ned_mps)
         collision = self.referee.observe(
-            self.stamp_us * 1e-6,
-            position_enu_m,
-            quaternion_flu_enu,
-            enu_from_ned(truth.velocity_ned_mps),
-            armed=commander.armed,
-            on_ground=truth.on_ground,
+            self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu, velocity,
+            armed=commander.armed, on_ground=truth.on_ground,
             may_land=self.autopilot.may_touch_ground,
-            power_regression_w=truth.power_regression_w,
-            power_propeller_w=truth.power_propeller_w,
-        )
+            power_regression_w=truth.power_regression_w, power_propeller_w=truth.power_propeller_w,
+        )  # fmt: skip
         if collision is not None:
             commander.terminate(collision.text)
         place, rates = truth.position_ned_m, truth.rates_frd_radps
@@ -182,3 +178,7 @@ class Simulation:
             self._wreck = truth.wreck()
         if not (dot(place, place) < _FARTHEST_M**2 and dot(rates, rates) < _FASTEST_RADPS**2):
             raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
+
+
+def _memory_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -277,18 +277,17 @@ def _first_touch(ends: _Ends, half: Vector, box: Vector, travel: float) -> float
 def _approach(ends: _Ends, half: Vector, box: Vector, travel: float, least_m: float) -> float:
     """Return the smallest distance during the motion, at most `least_m`."""
     centre, rotation = np.empty(3), np.empty((3, 3))
-    lows, highs, gaps_low, gaps_high = np.empty(64), np.empty(64), np.empty(64), np.empty(64)
     _pose_at(0.0, ends, centre, rotation)
-    gaps_low[0] = _body_distance(centre, rotation, half, box)
+    first_m = _body_distance(centre, rotation, half, box)
     _pose_at(1.0, ends, centre, rotation)
-    gaps_high[0] = _body_distance(centre, rotation, half, box)
-    lows[0], highs[0] = 0.0, 1.0
-    least_m = min(least_m, gaps_low[0], gaps_high[0])
+    last_m = _body_distance(centre, rotation, half, box)
+    least_m = min(least_m, first_m, last_m)
+    intervals = np.empty((64, 4))  # a stack; shares of the motion at both ends, distances there
+    intervals[0] = 0.0, 1.0, first_m, last_m
     waiting = 1
     while waiting > 0:
         waiting -= 1
-        low, high = lows[waiting], highs[waiting]
-        gap_low, gap_high = gaps_low[waiting], gaps_high[waiting]
+        low, high, gap_low, gap_high = intervals[waiting]
         bound = 0.5 * (gap_low + gap_high - travel * (high - low))
         if bound >= least_m - APPROACH_TOLERANCE_M or waiting > 60:
             continue
@@ -296,9 +295,7 @@ def _approach(ends: _Ends, half: Vector, box: Vector, travel: float, least_m: fl
         _pose_at(middle, ends, centre, rotation)
         gap = _body_distance(centre, rotation, half, box)
         least_m = min(least_m, gap)
-        lows[waiting], highs[waiting] = low, middle
-        gaps_low[waiting], gaps_high[waiting] = gap_low, gap
-        lows[waiting + 1], highs[waiting + 1] = middle, high
-        gaps_low[waiting + 1], gaps_high[waiting + 1] = gap, gap_high
+        intervals[waiting] = low, middle, gap_low, gap
+        intervals[waiting + 1] = middle, high, gap, gap_high
         waiting += 2
     return least_m

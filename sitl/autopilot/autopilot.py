@@ -1,4 +1,4 @@
-"""The autopilot: runs the active mode and collects telemetry; who commands it."""
+"""The autopilot: runs the active mode, collects telemetry and decides whose commands count."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect, text_messages
 from sitl.autopilot.commander import GPS_FIX_US, Commander, FlightMode, Result, Severity
-from sitl.autopilot.flight_modes import Guidance, begin, climbs
+from sitl.autopilot.flight_modes import begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
-from sitl.autopilot.telemetry import Link, Links, Setpoint, Snapshot, no_setpoint
+from sitl.autopilot.telemetry import Link, Links, Snapshot, no_setpoint
 from sitl.geodesy import Origin
 from sitl.vehicle.truth import Truth
 
@@ -26,14 +26,16 @@ _TEXTS_A_TICK = 10  # further texts are lost, so that a flood of mistakes is not
 class Autopilot(Links):
     """A PX4-like autopilot without sockets or clock.
 
-    At each stamp, call `observe` with the vehicle's state, `collect` for the messages of each link,
-    `services.handle` for each received message, then `fly`. `setpoint` (11,) and `motors_on` hold
-    until the next stamp. `restart_asked` is True once a client has asked for a reboot; the owner
-    restarts.
+    At every stamp, call `observe` with the vehicle's state, `collect` for the messages of every
+    link, `services.handle` for every received message, then `fly`. The snapshot's setpoint and
+    `motors_on` hold until the next stamp.
 
     Args:
         truth: Vehicle state before the first `observe`.
         trusted: MAVLink systems that may command; empty for all.
+
+    Attributes:
+        restart_requested: A client has requested a reboot, which is up to the owner.
     """
 
     def __init__(self, truth: Truth, *, system_id: int = 1, trusted: Sequence[int] = ()) -> None:
@@ -41,8 +43,8 @@ class Autopilot(Links):
         self.system_id = system_id
         self.parameters = Parameters(system_id)
         self.commander = Commander(self.parameters)
-        self.authority = _Authority(trusted, self.commander.say)
-        self.restart_asked = False
+        self.authority = _Authority(trusted, self.commander.queue_text)
+        self.restart_requested = False
         self.snapshot = Snapshot(
             commander=self.commander,
             parameters=self.parameters,
@@ -50,19 +52,15 @@ class Autopilot(Links):
             truth=truth,
             home_ned_m=np.array(truth.position_ned_m),
         )
-        self.setpoint: Setpoint = no_setpoint()
-        self.motors_on = False
-        self._takeoff_down_m = math.nan
-        self._hold: tuple[Vector, float] | None = None  # position and yaw of the next LOITER
         self._flown: FlightMode | None = None
-        self._guidance = self._enter(FlightMode.LOITER)
+        self._guidance = begin(FlightMode.LOITER, self.snapshot)
         self._text_id = 0
         self._texts_left = _TEXTS_A_TICK
 
     # Links.
 
     def collect(self, link: Link) -> list[Any]:
-        """Return all due messages of a link at the newest stamp: answers, then streams."""
+        """Return all messages due to a link at the newest stamp: answers, then streams."""
         for _ in range(min(_PARAMETERS_A_TICK, len(link.parameters_left))):
             link.send(self.parameters.message(link.parameters_left.popleft()))
         return link.take() + link.due(self.snapshot)
@@ -76,30 +74,22 @@ class Autopilot(Links):
 
     # Requests of clients.
 
-    def enter_mode(self, mode: FlightMode | None) -> Result:
-        """Change the mode on a user's request. Entering the present mode restarts it."""
+    def enter_mode(
+        self,
+        mode: FlightMode | None,
+        *,
+        takeoff_down_m: float = math.nan,
+        hold: tuple[Vector, float] | None = None,
+    ) -> Result:
+        """Change the mode on a user's request. Entering the present mode restarts it.
+
+        Height and hold are those of `Snapshot`. A disarmed vehicle takes off after arming.
+        """
         result = self.commander.request_mode(mode)
         if result is Result.ACCEPTED:
-            self._flown = None
-            self._hold = None
+            self._flown, self.snapshot.hold = None, hold
             if mode is FlightMode.TAKEOFF:
-                self._takeoff_down_m = math.nan
-        return result
-
-    def take_off(self, target_down_m: float) -> Result:
-        """Enter AUTO.TAKEOFF to a height. A disarmed vehicle takes off after arming."""
-        result = self.enter_mode(FlightMode.TAKEOFF)
-        if result is Result.ACCEPTED:
-            self._takeoff_down_m = target_down_m
-        return result
-
-    def go_to(self, target_ned_m: Vector, yaw_rad: float) -> Result:
-        """Enter AUTO.LOITER at a position."""
-        if self.commander.landed:
-            return Result.DENIED
-        result = self.enter_mode(FlightMode.LOITER)
-        if result is Result.ACCEPTED:
-            self._hold = target_ned_m, yaw_rad
+                self.snapshot.takeoff_down_m = takeoff_down_m
         return result
 
     def set_home(self, place_ned_m: Vector) -> None:
@@ -128,7 +118,7 @@ class Autopilot(Links):
         if has_fix_now:
             self.set_home(np.array(truth.position_ned_m))
         now.consumed_mah += max(truth.battery_current_a, 0.0) * now.elapsed_s / 3.6
-        wants_up = self.motors_on and climbs(self.setpoint, truth)
+        wants_up = now.motors_on and climbs(now.setpoint, truth)
         self.commander.update(stamp_us, truth, wants_up=wants_up)
         self.flush_texts()
 
@@ -137,54 +127,28 @@ class Autopilot(Links):
         """True if a gentle ground contact now counts as a landing."""
         if self.commander.mode is not FlightMode.OFFBOARD:
             return True
-        north, east, down = self.setpoint[3:6]
+        north, east, down = self.snapshot.setpoint[3:6]
         return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
 
     def fly(self) -> None:
         """Let the active mode set setpoint and motors until the next stamp."""
-        commander, truth = self.commander, self.snapshot.truth
+        commander, now = self.commander, self.snapshot
         out = no_setpoint()
         if not commander.armed:
             self._flown = None
-            self._command(out, motors_on=False)
+            now.setpoint, now.motors_on = out, False
             return
         if commander.mode is not self._flown:
-            self._guidance = self._enter(commander.mode)
+            self._guidance = begin(commander.mode, now)
             self._flown = commander.mode
-        self._guidance(self.snapshot, out)
-        lifts_off = self.snapshot.spooled_up and climbs(out, truth)
-        flies = not commander.landed or lifts_off
-        self._command(out, motors_on=flies and not commander.terminated)
+        self._guidance(now, out)
+        flies = not commander.landed or (now.spooled_up and climbs(out, now.truth))
+        now.setpoint, now.motors_on = out, flies and not commander.terminated
         self.flush_texts()
-
-    def _command(self, setpoint: Setpoint, *, motors_on: bool) -> None:
-        self.setpoint = self.snapshot.setpoint = setpoint
-        self.motors_on = self.snapshot.motors_on = motors_on
-
-    def _enter(self, mode: FlightMode) -> Guidance:
-        guidance = begin(
-            mode, self.snapshot, takeoff_down_m=self._takeoff_down_m, hold=self._hold,
-            finished=self._takeoff_finished, announce_return=self._announce_return,
-        )  # fmt: skip
-        if mode is FlightMode.LOITER:
-            self._hold = None
-        return guidance
-
-    def _takeoff_finished(self, place_ned_m: Vector) -> None:
-        self._hold = place_ned_m, math.nan
-        self.commander.takeoff_finished()
-
-    def _announce_return(self, height_m: float) -> None:
-        amsl = self.snapshot.amsl_m(float(self.snapshot.home_ned_m[2])) + height_m
-        text = f"RTL: start return at {amsl:.0f} m ({height_m:.0f} m above destination)"
-        self.commander.say(Severity.INFO, text)
 
     def flush_texts(self) -> None:
         """Broadcast the commander's new texts."""
-        texts = self.commander.texts
-        if not texts:
-            return
-        self.commander.texts = []
+        texts, self.commander.texts = self.commander.texts, []
         for severity, text in texts[: self._texts_left]:
             self._texts_left -= 1
             self._text_id = self._text_id % 0xFFFF + 1
@@ -196,7 +160,7 @@ class Autopilot(Links):
 
 # Who commands -------------------------------------------------------------------------------------
 
-_TOLD = 64  # senders that are remembered as told
+_MOST_WARNED = 64  # senders that are remembered as warned
 
 # Commands that anybody may send, because they change nothing but the sender's own streams.
 _HARMLESS = (
@@ -222,12 +186,12 @@ class _Authority:
 
     Commands of every trusted system count, of all if none is named. Setpoints of one sender count
     at a time: of the first that sends them, until it has been silent for as long as OFFBOARD
-    tolerates.
+    tolerates. `queue_text` takes the warnings.
     """
 
-    def __init__(self, trusted: Sequence[int], say: Callable[[Severity, str], None]) -> None:
+    def __init__(self, trusted: Sequence[int], queue_text: Callable[[Severity, str], None]) -> None:
         self._trusted = frozenset(trusted)
-        self._say = say
+        self._queue_text = queue_text
         self._holder: _Sender | None = None
         self._held_us = 0
         self._warned: set[_Sender] = set()
@@ -240,7 +204,7 @@ class _Authority:
         kind = message.get_type()
         if kind not in _COMMANDING or (kind in _COMMANDS and message.command in _HARMLESS):
             return True
-        names = ", ".join(str(number) for number in sorted(self._trusted))
+        names = ", ".join(map(str, sorted(self._trusted)))
         self._warn_once((link, system, 0), f"Commands of system {system} refused, trusted: {names}")
         return False
 
@@ -253,21 +217,21 @@ class _Authority:
         holder = self._holder
         if holder is not None and holder != sender:
             if stamp_us - self._held_us <= silence_us:
-                self._warn_once(
-                    sender, f"Setpoints of {_name(sender)} ignored: {_name(holder)} commands"
-                )
+                text = f"Setpoints of {_name(sender)} ignored: {_name(holder)} commands"
+                self._warn_once(sender, text)
                 return False
-            self._say(Severity.WARNING, f"{_name(sender)} commands instead of {_name(holder)}")
+            text = f"{_name(sender)} commands instead of {_name(holder)}"
+            self._queue_text(Severity.WARNING, text)
             self._warned.clear()
         self._holder, self._held_us = sender, stamp_us
         return True
 
     def _warn_once(self, sender: _Sender, text: str) -> None:
         if sender not in self._warned:
-            if len(self._warned) >= _TOLD:
+            if len(self._warned) >= _MOST_WARNED:
                 self._warned.clear()
             self._warned.add(sender)
-            self._say(Severity.WARNING, text)
+            self._queue_text(Severity.WARNING, text)
 
 
 def _name(sender: _Sender) -> str:

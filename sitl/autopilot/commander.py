@@ -5,6 +5,7 @@ Texts, results and delays are those observed in messages of PX4 v1.17.
 
 from __future__ import annotations
 
+import math
 from enum import Enum, IntEnum
 
 from mavfi_cli.link.codec import dialect
@@ -88,6 +89,8 @@ _RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended 
 _UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
 _OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
 _OBL_TERMINATE = 6
+# Modes with an input from outside, and the parameter of the time for which it may be missing.
+_INPUT_LIMITS = {FlightMode.OFFBOARD: "COM_OF_LOSS_T", FlightMode.POSCTL: "COM_RC_LOSS_T"}
 _LANDED_STATES: dict[FlightMode, int] = {
     FlightMode.TAKEOFF: dialect.MAV_LANDED_STATE_TAKEOFF,
     FlightMode.LAND: dialect.MAV_LANDED_STATE_LANDING,
@@ -107,17 +110,15 @@ class Commander:
         self._settled_us: int | None = None  # since when it has stood still on the ground
         self.terminated = False  # True once flight termination has stopped the motors for good
         self.texts: list[tuple[Severity, str]] = []  # pending; the owner removes them
-        self._armed_us = 0
-        self._landed_us = 0
+        self._armed_us = self._landed_us = 0
         self._flown_since_arming = False
-        self._offboard_us: int | None = None  # stamp of the newest accepted setpoint
-        self._sticks_us: int | None = None  # stamp of the newest stick message
+        self._input_us: dict[FlightMode, int] = {}  # stamps of newest setpoint and sticks
         self._control_back_us: int | None = None
         self._battery_warned = 0
 
     @property
     def mode(self) -> FlightMode:
-        """Active mode."""
+        """Active mode: the failsafe's, else the user's."""
         return self.failsafe or self.user_mode
 
     @property
@@ -148,15 +149,13 @@ class Commander:
     @property
     def system_status(self) -> int:
         """HEARTBEAT.system_status."""
-        for holds, status in (
-            (self.terminated, dialect.MAV_STATE_FLIGHT_TERMINATION),
-            (self.failsafe is not None, dialect.MAV_STATE_CRITICAL),
-            (self.armed, dialect.MAV_STATE_ACTIVE),
-            (self.can_arm, dialect.MAV_STATE_STANDBY),
-        ):
-            if holds:
-                return int(status)
-        return int(dialect.MAV_STATE_UNINIT)
+        if self.terminated:
+            return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
+        if self.failsafe is not None:
+            return int(dialect.MAV_STATE_CRITICAL)
+        if self.armed:
+            return int(dialect.MAV_STATE_ACTIVE)
+        return int(dialect.MAV_STATE_STANDBY if self.can_arm else dialect.MAV_STATE_UNINIT)
 
     @property
     def landed_state(self) -> int:
@@ -167,26 +166,17 @@ class Commander:
 
     def is_available(self, mode: FlightMode) -> bool:
         """Return True if the mode has its inputs: setpoints for OFFBOARD, sticks for POSCTL."""
-        if mode is FlightMode.OFFBOARD:
-            return self._is_fresh(self._offboard_us, "COM_OF_LOSS_T")
-        if mode is FlightMode.POSCTL:
-            return self._is_fresh(self._sticks_us, "COM_RC_LOSS_T")
+        if mode in _INPUT_LIMITS:
+            stamp_us = self._input_us.get(mode, -math.inf)
+            limit_s = self._parameters.effective(_INPUT_LIMITS[mode])
+            return self.stamp_us - stamp_us <= limit_s * 1e6
         return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which does not exist
 
-    def _is_fresh(self, stamp_us: int | None, parameter: str) -> bool:
-        if stamp_us is None:
-            return False
-        return self.stamp_us - stamp_us <= self._parameters.effective(parameter) * 1e6
+    def input_arrived(self, mode: FlightMode) -> None:
+        """Reset the watchdog of OFFBOARD or POSCTL."""
+        self._input_us[mode] = self.stamp_us
 
-    def offboard_setpoint_arrived(self) -> None:
-        """Reset the watchdog of OFFBOARD."""
-        self._offboard_us = self.stamp_us
-
-    def sticks_arrived(self) -> None:
-        """Reset the watchdog of POSCTL."""
-        self._sticks_us = self.stamp_us
-
-    def say(self, severity: Severity, text: str) -> None:
+    def queue_text(self, severity: Severity, text: str) -> None:
         """Queue a status text for every client."""
         self.texts.append((severity, text))
 
@@ -197,7 +187,9 @@ class Commander:
         if mode is None:
             return Result.TEMPORARILY_REJECTED
         if self.armed and not self.is_available(mode):
-            self.say(Severity.CRITICAL, f"Switching to {mode.label} is currently not available")
+            self.queue_text(
+                Severity.CRITICAL, f"Switching to {mode.label} is currently not available"
+            )
             return Result.TEMPORARILY_REJECTED
         self.user_mode = mode
         self.failsafe = None
@@ -208,21 +200,21 @@ class Commander:
         if self.armed:
             return Result.ACCEPTED
         if self.terminated or not (force or self.can_arm):
-            text = "Arming denied: Resolve system health failures first"
+            why = "Resolve system health failures first"
             if self.terminated:
-                text = "Arming denied: terminated, a reboot begins again"
-            self.say(Severity.CRITICAL, text)
+                why = "terminated, a reboot begins again"
+            self.queue_text(Severity.CRITICAL, f"Arming denied: {why}")
             return Result.TEMPORARILY_REJECTED
         self.armed = True
         self._armed_us = self.stamp_us
         self._flown_since_arming = False
-        self.say(Severity.INFO, "Armed by external command")
+        self.queue_text(Severity.INFO, "Armed by external command")
         return Result.ACCEPTED
 
     def request_disarm(self, *, force: bool) -> Result:
         """Disarm, in the air only if `force` is set."""
         if self.armed and not self.landed and not force:
-            self.say(Severity.CRITICAL, "Disarming denied: not landed")
+            self.queue_text(Severity.CRITICAL, "Disarming denied: not landed")
             return Result.TEMPORARILY_REJECTED
         if self.armed:
             self._disarm("external command")
@@ -232,7 +224,7 @@ class Commander:
         """Stop the motors permanently."""
         if not self.terminated:
             self.terminated = True
-            self.say(Severity.EMERGENCY, text)
+            self.queue_text(Severity.EMERGENCY, text)
 
     # Updates over time.
 
@@ -269,7 +261,7 @@ class Commander:
             self._flown_since_arming = True
         if self.armed:
             what = "Landing" if self.landed else "Takeoff"
-            self.say(Severity.INFO, f"{what} detected")
+            self.queue_text(Severity.INFO, f"{what} detected")
 
     def _watch_control(self) -> None:
         """Enter or leave the failsafe when the input of the user's mode is lost or returns."""
@@ -286,18 +278,16 @@ class Commander:
             return
         action = int(self._parameters.effective("COM_OBL_RC_ACT"))
         self.failsafe = _OBL_ACTIONS.get(action, FlightMode.RTL)
-        self.say(Severity.CRITICAL, "Failsafe activated")
+        self.queue_text(Severity.CRITICAL, "Failsafe activated")
         if action >= _OBL_TERMINATE:
             self.terminate("Flight termination active")
 
     def _auto_disarm(self) -> None:
         if not self.landed:
             return
+        wait, since, reason = "COM_DISARM_PRFLT", self._armed_us, "auto preflight disarming"
         if self._flown_since_arming:
             wait, since, reason = "COM_DISARM_LAND", self._landed_us, "landing"
-        else:
-            wait, since = "COM_DISARM_PRFLT", self._armed_us
-            reason = "auto preflight disarming"
         limit_s = self._parameters.effective(wait)
         if limit_s > 0.0 and self.stamp_us - since >= limit_s * 1e6:
             self._disarm(reason)
@@ -306,7 +296,7 @@ class Commander:
         self.armed = False
         self.failsafe = None
         self._control_back_us = None
-        self.say(Severity.INFO, f"Disarmed by {reason}")
+        self.queue_text(Severity.INFO, f"Disarmed by {reason}")
         if self.user_mode in _RETRIED_MODES:
             self.user_mode = FlightMode.LOITER
 
@@ -317,4 +307,4 @@ class Commander:
         threshold, text = levels[self._battery_warned]
         if remaining < self._parameters.effective(threshold):
             self._battery_warned += 1
-            self.say(Severity.WARNING, text)
+            self.queue_text(Severity.WARNING, text)

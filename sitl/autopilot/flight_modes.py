@@ -1,4 +1,4 @@
-"""Guidance of the flight modes. Each computes a setpoint from the situation.
+"""Guidance of the flight modes: computes a setpoint from the state of the flight.
 
 Speeds and heights are PX4's parameters. The sequences (brake, then hold; climb, then cross, then
 descend) are those of PX4's multicopter modes.
@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mavfi_cli.core.frames import Vector, dot, norm
-from sitl.autopilot.commander import FlightMode
+from sitl.autopilot.commander import FlightMode, Severity
 from sitl.autopilot.parameters import Parameters
 from sitl.autopilot.telemetry import Setpoint, Snapshot
 from sitl.vehicle.truth import Truth
@@ -31,8 +31,8 @@ _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
 
 
-# Guidance of a flight mode from one entry to its end: writes the setpoint of this tick into an
-# array that holds NaN.
+# Guidance of a flight mode from one entry to its end. It writes the setpoint of this tick into an
+# array of NaN.
 Guidance = Callable[[Snapshot, Setpoint], None]
 
 
@@ -43,7 +43,7 @@ def climbs(out: Setpoint, truth: Truth) -> bool:
 
 
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
-    """Return a velocity (n,) towards a point at a distance `delta` (n,) that allows a stop there.
+    """Return a velocity (n,) towards a point at an offset `delta` (n,) that allows a stop there.
 
     It is the minimum of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
     """
@@ -61,10 +61,7 @@ def _limit_velocity(out: Setpoint, parameters: Parameters) -> None:
     if speed > fastest:
         out[3:5] *= fastest / speed
     up, down = parameters.effective("MPC_Z_VEL_MAX_UP"), parameters.effective("MPC_Z_VEL_MAX_DN")
-    if out[5] < -up:
-        out[5] = -up
-    elif out[5] > down:
-        out[5] = down
+    out[5] = min(max(out[5], -up), down)  # NaN stays
 
 
 class _Anchor:
@@ -75,7 +72,7 @@ class _Anchor:
         self._place = place
 
     def hold(self, now: Snapshot, out: Setpoint) -> None:
-        """Write position, or zero velocity while braking, for the anchor's axes."""
+        """Write the position to hold, or zero velocity while braking, for the anchor's axes."""
         axes = self._axes
         if self._place is None:
             velocity = now.truth.velocity_ned_mps[axes]
@@ -102,10 +99,10 @@ def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guid
     return fly
 
 
-def _take_off(target_down_m: float, finished: Callable[[Vector], None]) -> Guidance:
-    """AUTO.TAKEOFF: climbs straight to a height, then has it held, but 0.5 m lower at most.
+def _take_off(target_down_m: float) -> Guidance:
+    """AUTO.TAKEOFF: climbs straight to a height; its speed ramps up over MPC_TKO_RAMP_T.
 
-    Its speed ramps up over MPC_TKO_RAMP_T.
+    A LOITER follows, at most 0.5 m below the height at the end.
     """
     anchor, climbing_s = _Anchor(_HORIZONTAL), 0.0
 
@@ -117,7 +114,8 @@ def _take_off(target_down_m: float, finished: Callable[[Vector], None]) -> Guida
             out[2] = target_down_m
             place = np.array(now.truth.position_ned_m)
             place[2] = min(target_down_m, float(place[2]) + 0.5)
-            finished(place)
+            now.hold = place, math.nan
+            now.commander.takeoff_finished()
             return
         if now.spooled_up:
             climbing_s += now.elapsed_s
@@ -144,7 +142,7 @@ def _land(over: Vector | None = None) -> Guidance:
     return fly
 
 
-def _return(announce: Callable[[float], None]) -> Guidance:
+def _return() -> Guidance:
     """AUTO.RTL: climbs, crosses, descends and lands at home."""
     down_m: float | None = None
     anchor = _Anchor(_HORIZONTAL)
@@ -157,9 +155,11 @@ def _return(announce: Callable[[float], None]) -> Guidance:
             out[5] = now.parameters.effective("MPC_LAND_SPEED")
             return
         if down_m is None:
-            height = _return_height(now)
-            down_m = float(now.home_ned_m[2]) - height
-            announce(height)
+            height_m, home_down_m = _return_height_m(now), float(now.home_ned_m[2])
+            down_m = home_down_m - height_m
+            altitudes = f"{now.amsl_m(home_down_m) + height_m:.0f} m ({height_m:.0f} m above"
+            text = f"RTL: start return at {altitudes} destination)"
+            now.commander.queue_text(Severity.INFO, text)
         to_home = now.home_ned_m - now.truth.position_ned_m
         to_home[2] = down_m - float(now.truth.position_ned_m[2])
         if landing is not None:
@@ -176,8 +176,8 @@ def _return(announce: Callable[[float], None]) -> Guidance:
     return fly
 
 
-def _return_height(now: Snapshot) -> float:
-    """Return the height above home: a cone round it when near, RTL_RETURN_ALT when far."""
+def _return_height_m(now: Snapshot) -> float:
+    """Return the height above home, m: within a cone round it if near, else RTL_RETURN_ALT."""
     value = now.parameters.effective
     away = now.truth.position_ned_m - now.home_ned_m
     distance, above = math.hypot(away[0], away[1]), -float(away[2])
@@ -192,14 +192,12 @@ def _return_height(now: Snapshot) -> float:
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
     """OFFBOARD: the newest accepted setpoint; an axis that it leaves free stands still."""
     out[:] = now.offboard
-    for axis in range(3):
-        if math.isnan(out[axis]) and math.isnan(out[3 + axis]):
-            out[3 + axis] = 0.0
+    out[3:6][np.isnan(out[:3]) & np.isnan(out[3:6])] = 0.0
     _limit_velocity(out, now.parameters)
 
 
 def _follow_sticks(now: Snapshot, out: Setpoint) -> None:
-    """POSCTL: sticks -1000..1000 are velocity in the heading frame; throttle 500 keeps height."""
+    """POSCTL: sticks -1000..1000 give velocity in the heading frame; throttle 500 keeps height."""
     x, y, z, r = now.sticks
     value = now.parameters.effective
     forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
@@ -231,34 +229,19 @@ def _go_vertical(now: Snapshot, out: Setpoint, delta_m: float) -> None:
     out[5] = _approach(np.array([delta_m]), speed_mps=limit, acceleration_mps2=3.0)[0]
 
 
-def begin(
-    mode: FlightMode,
-    now: Snapshot,
-    *,
-    takeoff_down_m: float,
-    hold: tuple[Vector, float] | None,
-    finished: Callable[[Vector], None],
-    announce_return: Callable[[float], None],
-) -> Guidance:
-    """Return the guidance of a mode at its entry.
-
-    Args:
-        takeoff_down_m: Height of a TAKEOFF; NaN is MIS_TAKEOFF_ALT above home.
-        hold: Position (3,), NED, and yaw of a LOITER; None stops here.
-        finished: Called with the position to hold (3,) at the end of a TAKEOFF.
-        announce_return: Called with the height of an RTL above home, m.
-    """
+def begin(mode: FlightMode, now: Snapshot) -> Guidance:
+    """Return the guidance of a mode at its entry. A LOITER uses up the position to hold."""
     if mode is FlightMode.OFFBOARD:
         return _follow_companion
     if mode is FlightMode.POSCTL:
         return _follow_sticks
     if mode is FlightMode.TAKEOFF:
-        if math.isnan(takeoff_down_m):
-            height_m = now.parameters.effective("MIS_TAKEOFF_ALT")
-            takeoff_down_m = float(now.home_ned_m[2]) - height_m
-        return _take_off(takeoff_down_m, finished)
+        default_down_m = float(now.home_ned_m[2]) - now.parameters.effective("MIS_TAKEOFF_ALT")
+        is_default = math.isnan(now.takeoff_down_m)
+        return _take_off(default_down_m if is_default else now.takeoff_down_m)
     if mode is FlightMode.LAND:
         return _land()
     if mode is FlightMode.RTL:
-        return _return(announce_return)
+        return _return()
+    hold, now.hold = now.hold, None
     return _hold(*(hold or ()))

@@ -33,19 +33,17 @@ class _Parameter(NamedTuple):
     read_only: bool = False
 
     @property
-    def is_integer(self) -> bool:
-        return isinstance(self.default, int)
-
-    @property
     def wire_type(self) -> int:
-        return TYPE_INT32 if self.is_integer else TYPE_REAL32
+        return TYPE_INT32 if isinstance(self.default, int) else TYPE_REAL32
 
     def packed(self, value: float) -> bytes:
-        return struct.pack("<i" if self.is_integer else "<f", value)
+        return struct.pack("<i" if self.wire_type == TYPE_INT32 else "<f", value)
 
     def stored(self, value: float) -> float | int:
         """Return the value rounded to the wire's precision."""
-        return int(value) if self.is_integer else struct.unpack("<f", self.packed(value))[0]
+        layout = "<i" if self.wire_type == TYPE_INT32 else "<f"
+        rounded: float | int = struct.unpack(layout, self.packed(value))[0]
+        return rounded
 
 
 @cache
@@ -106,7 +104,7 @@ class Parameters:
             return None
         row = self._table[number]
         value: float | int = wire_value
-        if row.is_integer:
+        if wire_type == TYPE_INT32:
             (value,) = struct.unpack("<i", struct.pack("<f", wire_value))
         if row.read_only or not math.isfinite(value) or value == self._values[number]:
             return False

@@ -1,4 +1,4 @@
-"""What the autopilot does with each message: commands, setpoints, parameters and small services."""
+"""The autopilot's handlers of messages: commands, setpoints, parameters and small services."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sitl.geodesy import Origin
 _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
 _FARTHEST_M = 1e6  # a setpoint's larger value counts as not controlled
-_NOT_REQUESTABLE = (dialect.MAVLINK_MSG_ID_MISSION_CURRENT,)  # as in PX4, though streamed
+_NOT_REQUESTABLE = dialect.MAVLINK_MSG_ID_MISSION_CURRENT  # as in PX4, though streamed
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
@@ -60,10 +60,9 @@ def _acknowledge(message: Any, number: int, result: Result) -> Any:
 def _refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer a sender that may not command: commands are denied, a parameter keeps its value."""
     name = message.get_type()
-    if name == "SET_MODE":
-        link.send(_acknowledge(message, dialect.MAV_CMD_DO_SET_MODE, Result.DENIED))
-    elif name.startswith("COMMAND_"):
-        link.send(_acknowledge(message, message.command, Result.DENIED))
+    if name == "SET_MODE" or name.startswith("COMMAND_"):
+        number = getattr(message, "command", dialect.MAV_CMD_DO_SET_MODE)
+        link.send(_acknowledge(message, number, Result.DENIED))
     elif name == "PARAM_SET":
         index = autopilot.parameters.index(message.param_id)
         if index is not None:
@@ -99,12 +98,12 @@ def _down(autopilot: Autopilot, message: Any) -> float:
 
 
 def _arm_disarm(autopilot: Autopilot, message: Any, _link: Link) -> Result | None:
-    force = _whole(message.param2) == _FORCE_MAGIC
+    commander, force = autopilot.commander, _whole(message.param2) == _FORCE_MAGIC
     if message.param1 == 1.0:
-        return autopilot.commander.request_arm(force=force)
+        return commander.request_arm(force=force)
     if message.param1 == 0.0:
-        return autopilot.commander.request_disarm(force=force)
-    autopilot.commander.say(Severity.CRITICAL, "Unsupported ARM_DISARM param")
+        return commander.request_disarm(force=force)
+    commander.queue_text(Severity.CRITICAL, "Unsupported ARM_DISARM param")
     return None
 
 
@@ -121,14 +120,14 @@ def _takeoff(autopilot: Autopilot, message: Any, _link: Link) -> Result:
     height = autopilot.parameters.effective("MIS_TAKEOFF_ALT")
     target = float(autopilot.snapshot.home_ned_m[2]) - height
     down = _down(autopilot, message)
-    say = autopilot.commander.say
+    queue_text = autopilot.commander.queue_text
     if math.isnan(down):
-        say(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m")
+        queue_text(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m")
     elif down > target + 0.1:
-        say(Severity.CRITICAL, f"Using minimum takeoff altitude: {height:.2f} m")
+        queue_text(Severity.CRITICAL, f"Using minimum takeoff altitude: {height:.2f} m")
     else:
         target = down
-    return autopilot.take_off(target)
+    return autopilot.enter_mode(FlightMode.TAKEOFF, takeoff_down_m=target)
 
 
 def _reposition(autopilot: Autopilot, message: Any, _link: Link) -> Result:
@@ -138,10 +137,10 @@ def _reposition(autopilot: Autopilot, message: Any, _link: Link) -> Result:
         target[:2] = place
     if not math.isnan(down):
         target[2] = down
-    if not np.all(np.abs(target) < _FARTHEST_M):
+    if autopilot.commander.landed or not np.all(np.abs(target) < _FARTHEST_M):
         return Result.DENIED
     yaw = message.param4 if abs(message.param4) <= math.tau else math.nan
-    return autopilot.go_to(target, yaw)
+    return autopilot.enter_mode(FlightMode.LOITER, hold=(target, yaw))
 
 
 def _change_speed(autopilot: Autopilot, message: Any, _link: Link) -> Result:
@@ -172,24 +171,21 @@ def _set_home(autopilot: Autopilot, message: Any, _link: Link) -> Result:
 
 def _request_message(autopilot: Autopilot, message: Any, link: Link) -> Result:
     number = _whole(message.param1)
-    if number is None or number in _NOT_REQUESTABLE:
+    if number is None or number == _NOT_REQUESTABLE:
         return Result.DENIED
-    describe = DESCRIPTIONS.get(number)
-    if describe is None:
-        return _send_one(autopilot, number, link)
-    messages = describe(autopilot.snapshot, _whole(message.param2) or 0)
-    for each in messages:
-        link.send(each)
+    return _send(autopilot, link, number, index=_whole(message.param2) or 0)
+
+
+def _send(autopilot: Autopilot, link: Link, number: int, *, index: int = 0) -> Result:
+    """Send a requested message, or those of an index of it."""
+    if number in DESCRIPTIONS:
+        messages = DESCRIPTIONS[number](autopilot.snapshot, index)
+    else:
+        message = BUILDERS[number](autopilot.snapshot) if number in BUILDERS else None
+        messages = [] if message is None else [message]
+    for message in messages:
+        link.send(message)
     return Result.ACCEPTED if messages else Result.DENIED
-
-
-def _send_one(autopilot: Autopilot, number: int, link: Link) -> Result:
-    build = BUILDERS.get(number)
-    message = None if build is None else build(autopilot.snapshot)
-    if message is None:
-        return Result.DENIED
-    link.send(message)
-    return Result.ACCEPTED
 
 
 def _set_interval(autopilot: Autopilot, message: Any, link: Link) -> Result:
@@ -217,9 +213,9 @@ def _reboot(autopilot: Autopilot, message: Any, link: Link) -> Result:
     if autopilot.snapshot.stamp_us < GPS_FIX_US:
         return Result.TEMPORARILY_REJECTED  # still booting
     if autopilot.commander.armed and not autopilot.commander.terminated:
-        autopilot.commander.say(Severity.CRITICAL, "Reboot denied: armed")
+        autopilot.commander.queue_text(Severity.CRITICAL, "Reboot denied: armed")
         return Result.TEMPORARILY_REJECTED
-    autopilot.restart_asked = True
+    autopilot.restart_requested = True
     return Result.ACCEPTED
 
 
@@ -235,12 +231,12 @@ _COMMANDS: Mapping[int, _CommandHandler] = {
     dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
-    dialect.MAV_CMD_GET_HOME_POSITION: lambda autopilot, _message, link: _send_one(
-        autopilot, dialect.MAVLINK_MSG_ID_HOME_POSITION, link
+    dialect.MAV_CMD_GET_HOME_POSITION: lambda autopilot, _message, link: _send(
+        autopilot, link, dialect.MAVLINK_MSG_ID_HOME_POSITION
     ),
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda autopilot, _message, link: _send_one(
-        autopilot, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION, link
+    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: lambda autopilot, _message, link: _send(
+        autopilot, link, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
     ),
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
@@ -255,35 +251,31 @@ _COMMANDS: Mapping[int, _CommandHandler] = {
 
 def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
     now = autopilot.snapshot
-    setpoint = setpoint_of(
-        message, heading_rad=now.truth.euler_rad[2], origin=now.origin,
-        home_down_m=float(now.home_ned_m[2]),
-    )  # fmt: skip
-    if isinstance(setpoint, str):
-        autopilot.commander.say(Severity.CRITICAL, f"{message.get_type()} {setpoint}")
+    heading_rad, home_down_m = now.truth.euler_rad[2], float(now.home_ned_m[2])
+    try:
+        setpoint = setpoint_of(message, heading_rad, now.origin, home_down_m)
+    except ValueError as error:
+        autopilot.commander.queue_text(Severity.CRITICAL, f"{message.get_type()} {error}")
         return
     silence_us = autopilot.parameters.effective("COM_OF_LOSS_T") * 1e6
     if autopilot.authority.follows(message, link, now.stamp_us, silence_us):
         now.offboard = setpoint
-        autopilot.commander.offboard_setpoint_arrived()
+        autopilot.commander.input_arrived(FlightMode.OFFBOARD)
 
 
-def setpoint_of(
-    message: Any, *, heading_rad: float, origin: Origin, home_down_m: float
-) -> Setpoint | str:
-    """Return the setpoint of a SET_POSITION_TARGET message, or in words what is not supported.
+def setpoint_of(message: Any, heading_rad: float, origin: Origin, home_down_m: float) -> Setpoint:
+    """Return the setpoint of a SET_POSITION_TARGET message.
 
     A BODY_NED setpoint is rotated by the heading (rad, from north). The altitude of a global one is
-    above sea or home.
+    above sea or home. Raises ValueError if frame or type mask are not supported.
     """
     frame, mask = message.coordinate_frame, message.type_mask
     is_local = message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
     if frame not in ((_LOCAL_NED, _BODY_NED) if is_local else _ABSOLUTE_ALTITUDE + _ABOVE_HOME):
-        return f"coordinate frame {frame} unsupported"
+        raise ValueError(f"coordinate frame {frame} unsupported")
     if frame == _BODY_NED:
         mask |= _IGNORE_POSITION  # PX4 accepts positions in the local frame only
-    if problem := _unsupported(mask):
-        return problem
+    _check_mask(mask)
     out = no_setpoint()
     if mask & _IGNORE_POSITION != _IGNORE_POSITION:
         if is_local:
@@ -303,15 +295,14 @@ def setpoint_of(
     return out
 
 
-def _unsupported(mask: int) -> str:
-    """Return why a type mask is not supported; "" if it is."""
-    moves = any(mask & each != each for each in (_IGNORE_POSITION, _IGNORE_VELOCITY))
+def _check_mask(mask: int) -> None:
+    """Raise ValueError if a type mask is not supported."""
     accelerates = mask & _IGNORE_ACCELERATION != _IGNORE_ACCELERATION
     if accelerates and mask & _FORCE:  # the bit gives the acceleration fields' meaning
-        return "force not supported"
-    if moves:
-        return ""
-    return "acceleration without velocity not supported" if accelerates else "invalid"
+        raise ValueError("force not supported")
+    if not ~mask & (_IGNORE_POSITION | _IGNORE_VELOCITY):
+        problem = "acceleration without velocity not supported" if accelerates else "invalid"
+        raise ValueError(problem)
 
 
 def _fill(
@@ -327,12 +318,10 @@ def _turn(out: Setpoint, heading_rad: float) -> None:
     """Rotate velocity and acceleration from forward-right to north-east."""
     cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
     for start in (3, 6):
-        forward, right = out[start], out[start + 1]
-        if math.isnan(forward) and math.isnan(right):
-            continue
-        forward, right = np.nan_to_num(forward), np.nan_to_num(right)
-        out[start] = cosine * forward - sine * right
-        out[start + 1] = sine * forward + cosine * right
+        if not np.isnan(out[start : start + 2]).all():
+            forward, right = np.nan_to_num(out[start : start + 2])
+            out[start] = cosine * forward - sine * right
+            out[start + 1] = sine * forward + cosine * right
 
 
 # Other messages -----------------------------------------------------------------------------------
@@ -352,7 +341,7 @@ def _set_mode_message(autopilot: Autopilot, message: Any, link: Link) -> None:
 def _manual_control(autopilot: Autopilot, message: Any, _link: Link) -> None:
     if message.target == autopilot.system_id:
         autopilot.snapshot.sticks = (message.x, message.y, message.z, message.r)
-        autopilot.commander.sticks_arrived()
+        autopilot.commander.input_arrived(FlightMode.POSCTL)
 
 
 def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
@@ -364,14 +353,13 @@ def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None
 
 def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
     """Send one parameter by index, or by name if the index is -1; no answer if unknown."""
-    index: int | None = message.param_index
-    if message.param_index < 0:
-        if message.param_id == HASH_NAME:
-            link.send(autopilot.parameters.hash_message())
-            return
-        index = autopilot.parameters.index(message.param_id)
-    if index is not None and index < len(autopilot.parameters):
-        link.send(autopilot.parameters.message(index))
+    store, index = autopilot.parameters, message.param_index
+    if index < 0 and message.param_id == HASH_NAME:
+        link.send(store.hash_message())
+        return
+    index = store.index(message.param_id) if index < 0 else index
+    if index is not None and index < len(store):
+        link.send(store.message(index))
 
 
 def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -441,8 +429,10 @@ ADDRESSED: Mapping[int, _Service] = {
     ),
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: _position_target,
     dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: _position_target,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: lambda autopilot, *_: autopilot.commander.say(
-        Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported"
+    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: (
+        lambda autopilot, *_: autopilot.commander.queue_text(
+            Severity.CRITICAL, "SET_ATTITUDE_TARGET not supported"
+        )
     ),
     dialect.MAVLINK_MSG_ID_COMMAND_LONG: _execute,
     dialect.MAVLINK_MSG_ID_COMMAND_INT: _execute,

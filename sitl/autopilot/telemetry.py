@@ -1,6 +1,6 @@
-"""Telemetry: the state behind it, a builder for each message, and the streams of each client.
+"""Telemetry: the state behind it, the builders of its messages, and the streams of a client.
 
-Most messages can be streamed. Those of DESCRIPTIONS, what the autopilot is and can do, are sent on
+Most messages can be streamed. Those of DESCRIPTIONS, which describe the autopilot, are sent on
 request only.
 """
 
@@ -44,7 +44,7 @@ def no_setpoint() -> Setpoint:
 
 @dataclass(slots=True, kw_only=True)
 class Snapshot:
-    """State behind every telemetry message. The autopilot updates it each tick."""
+    """State behind guidance and telemetry. The autopilot updates it at every tick."""
 
     commander: Commander
     parameters: Parameters
@@ -56,6 +56,8 @@ class Snapshot:
     motors_on: bool = False
     offboard: Setpoint = field(default_factory=no_setpoint)  # newest one of the companion
     sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
+    takeoff_down_m: float = math.nan  # of the next TAKEOFF; NaN is MIS_TAKEOFF_ALT above home
+    hold: tuple[Vector, float] | None = None  # NED position (3,) and yaw of the next LOITER
     elapsed_s: float = 0.0  # since the tick before
     consumed_mah: float = 0.0
 
@@ -188,22 +190,17 @@ def _global_position_int(s: Snapshot) -> Any | None:
 
 def _servo_output_raw(s: Snapshot) -> Any:
     """Motor commands of 1000 to 2000 us, 900 if stopped, as in PX4."""
-    pulses = [
-        _uint16(1000.0 + 1000.0 * command) if s.motors_on else 900
-        for command in s.truth.motor_commands.tolist()
-    ]
-    return dialect.MAVLink_servo_output_raw_message(
-        s.stamp_us & 0xFFFFFFFF, 0, *pulses[:4], *([0] * (8 - len(pulses[:4])))
-    )
+    commands = s.truth.motor_commands.tolist()
+    pulses = [_uint16(1000.0 + 1000.0 * c) if s.motors_on else 900 for c in commands]
+    stamp_us = s.stamp_us & 0xFFFFFFFF
+    return dialect.MAVLink_servo_output_raw_message(stamp_us, 0, *pulses, 0, 0, 0, 0)
 
 
 def _gps_global_origin(s: Snapshot) -> Any | None:
     if not s.commander.has_gps_fix:
         return None
-    altitude_mm = round(s.origin.altitude_amsl_m * 1e3)
-    return dialect.MAVLink_gps_global_origin_message(
-        *s.geodetic_e7(0.0, 0.0), altitude_mm, s.stamp_us
-    )
+    place = *s.geodetic_e7(0.0, 0.0), round(s.origin.altitude_amsl_m * 1e3)
+    return dialect.MAVLink_gps_global_origin_message(*place, s.stamp_us)
 
 
 def _vfr_hud(s: Snapshot) -> Any:
@@ -215,14 +212,17 @@ def _vfr_hud(s: Snapshot) -> Any:
     )  # fmt: skip
 
 
+def _attitude_target(s: Snapshot) -> Any:
+    quaternion, rates = s.truth.quaternion_frd_ned.tolist(), s.truth.rates_frd_radps.tolist()
+    return dialect.MAVLink_attitude_target_message(s.boot_ms, 0, quaternion, *rates, s.thrust)
+
+
 def _position_target_local_ned(s: Snapshot) -> Any:
     """The active setpoint, as in PX4."""
-    values = s.setpoint.tolist()
-    mask = sum(
-        bits for start, bits in _ZERO_MASKS if all(map(math.isnan, values[start : start + 3]))
-    )
-    sent = [0.0 if math.isnan(value) else value for value in values]
-    if math.isnan(values[9]):
+    unset = np.isnan(s.setpoint)
+    mask = sum(bits for start, bits in _ZERO_MASKS if unset[start : start + 3].all())
+    sent = np.where(unset, 0.0, s.setpoint).tolist()
+    if unset[9]:
         sent[9] = s.truth.euler_rad[2]
     return dialect.MAVLink_position_target_local_ned_message(
         s.boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *sent
@@ -242,22 +242,21 @@ def _highres_imu(s: Snapshot) -> Any:
 
 
 def _altitude(s: Snapshot) -> Any:
-    """The ground is flat at the origin's height."""
+    """Altitudes above sea, home and the ground, which is flat at the origin's height."""
     down = float(s.truth.position_ned_m[2])
-    amsl = s.amsl_m(down)
+    amsl, above_home = s.amsl_m(down), float(s.home_ned_m[2]) - down
     return dialect.MAVLink_altitude_message(
-        s.stamp_us, amsl, amsl, -down, float(s.home_ned_m[2]) - down,
-        s.origin.altitude_amsl_m, -down,
-    )  # fmt: skip
+        s.stamp_us, amsl, amsl, -down, above_home, s.origin.altitude_amsl_m, -down
+    )
 
 
 def _battery_status(s: Snapshot) -> Any:
     truth = s.truth
     cells = min(max(int(s.parameters.value("BAT1_N_CELLS")), 1), 10)
-    each = _uint16(truth.battery_voltage_v / cells * 1e3)
+    cell_mv = _uint16(truth.battery_voltage_v / cells * 1e3)
     return dialect.MAVLink_battery_status_message(
         0, dialect.MAV_BATTERY_FUNCTION_ALL, dialect.MAV_BATTERY_TYPE_LIPO, 32767,
-        [each] * cells + [65535] * (10 - cells),
+        [cell_mv] * cells + [65535] * (10 - cells),
         _int16(truth.battery_current_a * 100.0), _clip(s.consumed_mah, 0, 2**31 - 1), -1,
         _clip(truth.battery_remaining * 100.0, 0, 100), 0, dialect.MAV_BATTERY_CHARGE_STATE_OK,
     )  # fmt: skip
@@ -314,13 +313,7 @@ BUILDERS: Mapping[int, _Builder] = {
     ),
     dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _gps_global_origin,
     dialect.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_TARGET: lambda s: dialect.MAVLink_attitude_target_message(
-        s.boot_ms,
-        0,
-        s.truth.quaternion_frd_ned.tolist(),
-        *s.truth.rates_frd_radps.tolist(),
-        s.thrust,
-    ),
+    dialect.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target_local_ned,
     dialect.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     dialect.MAVLINK_MSG_ID_TIMESYNC: lambda s: dialect.MAVLink_timesync_message(
@@ -366,7 +359,7 @@ _STANDARD_MODES = {
 
 
 def _flight_information(now: Snapshot, _index: int) -> list[Any]:
-    """The time of arming is 0 while disarmed."""
+    """Return FLIGHT_INFORMATION, with 0 as the time of arming while disarmed."""
     armed_us = 0
     if now.commander.armed:
         armed_us = _UNIX_EPOCH_S * 1_000_000 + now.stamp_us - round(now.commander.armed_for_s * 1e6)
@@ -410,20 +403,18 @@ class Preset(Enum):
 _RATES_HZ, _ = read_toml(Path(__file__).with_name("streams.toml"))
 
 
+@dataclass(slots=True)
 class _Stream:
-    __slots__ = ("build", "due_us", "interval_us")
-
-    def __init__(self, build: _Builder, interval_us: int) -> None:
-        self.build = build
-        self.interval_us = interval_us  # 0: not streamed
-        self.due_us = 0
+    build: _Builder
+    interval_us: int  # 0: not streamed
+    due_us: int = 0
 
 
 class Link:
     """The autopilot's end of one connection, without a socket, and its telemetry streams."""
 
     def __init__(self, preset: Preset) -> None:
-        self.in_lockstep = preset is Preset.LOCKSTEP  # time stands still while the client thinks
+        self.in_lockstep = preset is Preset.LOCKSTEP  # time stands still while the client computes
         self.outbox: list[Any] = []  # pending messages, oldest first
         self.parameters_left: deque[int] = deque()  # indices of those still to be listed
         self._rates_hz: Mapping[str, float] = _RATES_HZ[preset.value]
@@ -455,13 +446,11 @@ class Link:
         stream = self._streams.get(message_id)
         if stream is None:
             return False
-        if interval_us < 0:
-            stream.interval_us = 0
-        elif interval_us == 0:
-            stream.interval_us = self._default_us(message_id)
-        else:
+        if interval_us > 0:
             shortest_us = TICK_US if self.in_lockstep else STEP_US
             stream.interval_us = int(min(max(interval_us, shortest_us), 3.6e9))
+        else:
+            stream.interval_us = 0 if interval_us < 0 else self._default_us(message_id)
         stream.due_us = stamp_us
         self._choose_active()
         return True

@@ -22,10 +22,10 @@ from sitl.command_line import (
     Place,
     Triple,
     camera_options,
+    signing,
     stop_on_signals,
     world_and_vehicle,
 )
-from sitl.command_line import signing as signing_options
 from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
@@ -54,7 +54,7 @@ from sitl.world import load_world
     "--truth", type=OutFolder(), metavar="DIR",
     help="Folder for the briefing and, at the end, the referee's log and verdict.",
 )  # fmt: skip
-@signing_options
+@signing
 def _camera(
     *,
     origin: Triple | None,
@@ -78,7 +78,7 @@ def _camera(
     The camera reads the vehicle's pose from ATTITUDE_QUATERNION (or ATTITUDE) and
     LOCAL_POSITION_NED, and requests these messages if they do not arrive. It sends frames as a
     MAVLink camera (component 100) on all links once a client has sent IMAGE_START_CAPTURE. The
-    referee judges the same pose, and tells a collision in a STATUSTEXT.
+    referee judges the same pose, and reports a collision in a STATUSTEXT.
     """
     scene = load_world(world, seed=seed, start_enu_m=start_enu_m, goal_enu_m=goal_enu_m)
     profile = load_profile(vehicle)
@@ -88,19 +88,17 @@ def _camera(
         hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
         heartbeat_hz=camera_heartbeat_hz,
     )  # fmt: skip
-    signing = signing_from_file(key_file)
     witness = Witness(scene, profile, logs=truth is not None)
     if truth is not None:
         scene.write_briefing((forward, left, up), truth)
     stopped = stop_on_signals()
     tracker = PoseTracker(scene.start_enu_m if origin is None else np.array(origin))
     station = Station(
-        camera, tracker, links, witness=witness, origin_given=origin is not None, signing=signing,
-        allow_unsigned=allow_unsigned,
+        camera, tracker, links, witness=witness, origin_given=origin is not None,
+        signing=signing_from_file(key_file), allow_unsigned=allow_unsigned,
     )  # fmt: skip
-    place = f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}"
     with contextlib.closing(station):
-        note(place)
+        note(f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}")
         try:
             station.run(lambda: not stopped())
         except LinkLost:

@@ -44,7 +44,7 @@ _PAYLOAD_BYTES = 253
 _PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal length)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class _Schedule:
     """Due at the first poll and then every `interval_s` in phase with it.
 
@@ -95,12 +95,13 @@ class Camera:
         system: int = 1,
     ) -> None:
         if not 0.0 < rate_hz <= MAX_RATE_HZ:
-            raise ConfigError(f"camera rate {rate_hz:g} Hz: must be above 0, to {MAX_RATE_HZ:g}")
+            limits = f"above 0 and at most {MAX_RATE_HZ:g} Hz"
+            raise ConfigError(f"camera rate must be {limits}, got {rate_hz:g}")
         if not (1 <= columns <= _MAX_SIDE_PX and 1 <= rows <= _MAX_SIDE_PX):
-            size = f"{columns}x{rows}"
-            raise ConfigError(f"camera size {size}: each side must be 1 to {_MAX_SIDE_PX} pixels")
+            limits = f"1x1 to {_MAX_SIDE_PX}x{_MAX_SIDE_PX} pixels"
+            raise ConfigError(f"camera size must be {limits}, got {columns}x{rows}")
         if not 0.01 <= hfov_rad <= 3.1:
-            raise ConfigError(f"camera field of view {hfov_rad:g} rad: must be 0.01 to 3.1")
+            raise ConfigError(f"camera field of view must be 0.01 to 3.1 rad, got {hfov_rad:g}")
         self.mount_offset_flu_m = np.array(mount_offset_flu_m, dtype=np.float64)
         self._columns, self._rows, self._hfov_rad = columns, rows, hfov_rad
         self.system = system
@@ -112,7 +113,7 @@ class Camera:
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
         self._stamp_s = 0.0
-        self._heartbeat = _Schedule(interval_s=1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
+        self._heartbeat = _Schedule(1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
         self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
 
@@ -121,14 +122,12 @@ class Camera:
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
             return []
-        if message.target_component == COMPONENT_ID:
-            return self._command(message)
-        if message.target_component == dialect.MAV_COMP_ID_ALL:
-            # The autopilot gets the command, too. A refusal here would confuse the sender.
-            answers = self._command(message)
-            accepted = answers[-1].result == dialect.MAV_RESULT_ACCEPTED
-            return answers if accepted else []
-        return []
+        if message.target_component not in (COMPONENT_ID, dialect.MAV_COMP_ID_ALL):
+            return []
+        answers = self._command(message)
+        # The autopilot gets a command for all, too. A refusal here would confuse the sender.
+        is_ours = message.target_component == COMPONENT_ID
+        return answers if is_ours or answers[-1].result == dialect.MAV_RESULT_ACCEPTED else []
 
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
@@ -144,16 +143,19 @@ class Camera:
             for schedule in filter(None, (self._heartbeat, self._frames)):
                 schedule.restart()
         self._stamp_s = stamp_s
-        beats = self._heartbeat is not None and self._heartbeat.due(stamp_s)
-        due = [_heartbeat()] if beats else []
+        due = self.idle() if self._heartbeat and self._heartbeat.due(stamp_s) else []
         if self._frames is not None and self._frames.due(stamp_s):
             offset_m = rotate(rotation_matrix(quaternion_flu_enu), self.mount_offset_flu_m)
             due += self._take_frame(position_enu_m + offset_m, quaternion_flu_enu)
         return due
 
     def idle(self) -> list[Message]:
-        """Return the messages to send while there is no pose: a heartbeat, unless it has none."""
-        return [] if self._heartbeat is None else [_heartbeat()]
+        """Return the messages to send while there is no pose: a heartbeat, if heartbeats are on."""
+        if self._heartbeat is None:
+            return []
+        kind, no_autopilot = dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID
+        active = dialect.MAV_STATE_ACTIVE
+        return [dialect.MAVLink_heartbeat_message(kind, no_autopilot, 0, 0, active, 3)]
 
     def _take_frame(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Message]:
         """Return the messages of one frame in the order of sending.
@@ -166,9 +168,12 @@ class Camera:
         pixels = render_depth(
             self._boxes, position_enu_m, quaternion_flu_enu, columns, rows, self._hfov_rad
         ).tobytes()
+        east, north, up = position_enu_m.tolist()
+        latitude, longitude = self._origin.geodetic(north, east)
         captured = dialect.MAVLink_camera_image_captured_message(
-            self._boot_ms, 0, 0, *self._geodetic_e7_mm(position_enu_m),
-            int32(position_enu_m[2] * 1e3), flu_enu_from_frd_ned(quaternion_flu_enu).tolist(),
+            self._boot_ms, 0, 0, int32(latitude * 1e7), int32(longitude * 1e7),
+            int32((self._origin.altitude_amsl_m + up) * 1e3), int32(up * 1e3),
+            flu_enu_from_frd_ned(quaternion_flu_enu).tolist(),
             self.images, 1, b"depth8:crc32=%08x" % zlib.crc32(pixels),
         )  # fmt: skip
         packets = -(-len(pixels) // _PAYLOAD_BYTES)
@@ -216,14 +221,12 @@ class Camera:
         )  # fmt: skip
 
     def _capture_status(self) -> Message:
-        """Idle, or capturing at an interval."""
         status, interval_s = (0, 0.0) if self._frames is None else (3, self._frames.interval_s)
         return dialect.MAVLink_camera_capture_status_message(
             self._boot_ms, status, 0, interval_s, 0, 0.0, self.images
         )
 
     def _local_origin(self) -> Message:
-        """To be added to a LOCAL_POSITION_NED for world coordinates."""
         offset = enu_from_ned(self.local_origin_enu_m).tolist()
         return dialect.MAVLink_local_position_ned_system_global_offset_message(
             self._boot_ms, *offset, 0.0, 0.0, 0.0
@@ -233,49 +236,37 @@ class Camera:
     def _boot_ms(self) -> int:
         return round(self._stamp_s * 1000.0) & 0xFFFF_FFFF
 
-    def _geodetic_e7_mm(self, position_enu_m: Vector) -> tuple[int, int, int]:
-        east, north, up = position_enu_m.tolist()
-        latitude, longitude = self._origin.geodetic(north, east)
-        altitude = int32((self._origin.altitude_amsl_m + up) * 1e3)
-        return int32(latitude * 1e7), int32(longitude * 1e7), altitude
-
     def _act(self, number: int, message: Message) -> int:
-        """Return the MAV_RESULT of a command."""
-        result: int = dialect.MAV_RESULT_ACCEPTED
+        """Execute a command. Return its MAV_RESULT."""
+        accepted = True
         if number == dialect.MAV_CMD_IMAGE_START_CAPTURE:
-            result = self._start_capture(message)
+            accepted = self._start_capture(message)
         elif number == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
             self._frames, self._frames_left = None, 0
-        elif number != dialect.MAV_CMD_SET_CAMERA_MODE:
-            result = dialect.MAV_RESULT_UNSUPPORTED
-        elif _whole(message.param2) != 0:  # any mode but photo
-            result = dialect.MAV_RESULT_DENIED
-        return result
+        elif number == dialect.MAV_CMD_SET_CAMERA_MODE:
+            accepted = _whole(message.param2) == dialect.CAMERA_MODE_IMAGE
+        else:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        return int(dialect.MAV_RESULT_ACCEPTED if accepted else dialect.MAV_RESULT_DENIED)
 
-    def _start_capture(self, message: Message) -> int:
-        """Handle IMAGE_START_CAPTURE: param2 is the interval, s (0: default), param3 the count."""
+    def _start_capture(self, message: Message) -> bool:
+        """Start by param2, the interval in s (0: default), and param3, the number of frames."""
         interval_s, count = float(message.param2), _whole(message.param3)
         if count is None or count < 0 or interval_s < 0.0 or math.isinf(interval_s):
-            return int(dialect.MAV_RESULT_DENIED)
+            return False
         if math.isnan(interval_s) or interval_s == 0.0:
             interval_s = self._default_interval_s
         interval_s = round(interval_s, 6)  # a float32 of 0.1 would drift against ticks
-        self._frames = _Schedule(interval_s=max(interval_s, 1.0 / MAX_RATE_HZ))
+        self._frames = _Schedule(max(interval_s, 1.0 / MAX_RATE_HZ))
         self._frames_left = count
-        return int(dialect.MAV_RESULT_ACCEPTED)
+        return True
 
 
 def _whole(value: float) -> int | None:
-    """Return an integer sent in a float parameter; NaN, which means not given, is 0."""
+    """Return an integer sent in a float parameter; 0 for NaN, None beyond 32 bits."""
     if math.isnan(value):
         return 0
     return round(value) if abs(value) < 2**31 else None
-
-
-def _heartbeat() -> Message:
-    return dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
-    )
 
 
 _BUILDERS: dict[int | None, Callable[[Camera], Message]] = {

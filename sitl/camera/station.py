@@ -1,4 +1,4 @@
-"""Stand-alone depth camera: tracks a foreign autopilot's vehicle, serves frames and is referee."""
+"""Stand-alone depth camera and referee for the vehicle of a foreign autopilot."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Linked(Peer):
         messages = self._codec.decode(data, datagram=self.transport.datagram)
         self.awaits_frames = self.awaits_frames or bool(messages)
         for message in messages:
-            self._station.hear(message, self)
+            self._station.receive(message, self)
         return messages
 
     def forward(self, *, frame: bytes, of: Peer) -> bool:
@@ -77,20 +77,29 @@ _REBOOT_S = 1.0
 _LONGEST_EXTRAPOLATION_S = 0.5
 
 _WAIT_S = 0.2
-_ASK_AGAIN_S = 2.0
+_REQUEST_AGAIN_S = 2.0
 _POSE_INTERVAL_US = 20_000.0
 _ANNOUNCE_S = 1.0
 _PLACE_S = 1.0
-_MOST_HELD = 64  # commands that wait until the camera knows its place
+_MOST_HELD = 64  # commands that wait for the camera's origin
 _POSE = "the autopilot's own pose"
 _ACCELERATION_S = 0.2  # time over which velocities are differentiated
 _GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
+_INTERVAL = (dialect.MAV_COMP_ID_AUTOPILOT1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0)
+_REQUESTS = (  # component, command, confirmation and message id
+    (*_INTERVAL, dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION),
+    (*_INTERVAL, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
+    (
+        COMPONENT_ID, dialect.MAV_CMD_REQUEST_MESSAGE, 0,
+        dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET,
+    ),
+)  # fmt: skip
 
 
 class PoseTracker:
     """Combines attitude and local position, which have different stamps.
 
-    There is a pose at each new attitude. The newest position is extrapolated to its stamp with the
+    Every new attitude gives a pose. The newest position is extrapolated to its stamp with the
     velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
     """
 
@@ -140,7 +149,7 @@ class PoseTracker:
         else:
             return None
         length = norm(quaternion)
-        return quaternion / length if math.isfinite(length) and length > 0.5 else None
+        return quaternion / length if 0.5 < length < math.inf else None
 
     def pose(self) -> tuple[float, Vector, Vector, Vector]:
         """Return stamp, s, position (3,) in the world, attitude (4,) FLU to ENU, and velocity (3,).
@@ -152,13 +161,12 @@ class PoseTracker:
         stamp_s, quaternion = self._attitude
         since_s, position, velocity = self._position
         ahead_s = max(0.0, min(stamp_s - since_s, _LONGEST_EXTRAPOLATION_S))
-        local = enu_from_ned(position + ahead_s * velocity)
-        place = self.origin_enu_m + local
+        place = self.origin_enu_m + enu_from_ned(position + ahead_s * velocity)
         return stamp_s, place, flu_enu_from_frd_ned(quaternion), enu_from_ned(velocity)
 
 
 class Witness:
-    """Collision, clearance and energy of a foreign vehicle, as far as its pose tells them.
+    """Collision, clearance and energy of a foreign vehicle, derived from its pose.
 
     The record begins when the vehicle arms. The energy is that of the regression; the power of the
     propellers is not known. The profile's body box and regression stand for the vehicle's.
@@ -220,10 +228,9 @@ class Witness:
         return float(regression_power(velocity, acceleration, self._coefficients))
 
     def save(self, folder: Path) -> None:
-        """Write the referee's log and verdict, if it has seen anything. Raises RecordError."""
-        if self._stamp_s is None:
-            return
-        self._referee.save(folder, {"regression": self._energy_j})
+        """Write the referee's log and verdict, if there was a pose. Raises RecordError."""
+        if self._stamp_s is not None:
+            self._referee.save(folder, {"regression": self._energy_j})
 
 
 class Station:
@@ -231,13 +238,13 @@ class Station:
 
     It joins the peers of several endpoints, and is the camera component among them. Two autopilots
     of the same system id at one endpoint would be one vehicle that jumps. The frames of the second
-    are dropped, and a STATUSTEXT tells both senders. Frames of others keep their own signatures.
+    are dropped, and a STATUSTEXT names both senders. Frames of others keep their own signatures.
 
     Args:
         urls: Endpoints to open. One that cannot be opened raises LinkError.
         witness: Judges the poses; None without a referee.
-        origin_given: The tracker's origin holds. Otherwise another camera of ours on the link,
-            whose vehicle is simulated, knows a better one.
+        origin_given: The tracker's origin is final. Otherwise the camera of a simulated vehicle on
+            the link may replace it.
         clock: Monotonic clock in seconds for repeated requests, never for frames.
     """
 
@@ -270,8 +277,7 @@ class Station:
         self._held: dict[tuple[int, int, int], Any] = {}
         if origin_given:
             self._place_at(tracker.origin_enu_m)
-        self._ask_at_s = 0.0
-        self._announce_at_s = 0.0
+        self._request_at_s = self._announce_at_s = 0.0
 
     def run(self, keep_on: Callable[[], bool]) -> None:
         """Serve until `keep_on` returns False, or until an inherited connection closes.
@@ -289,9 +295,9 @@ class Station:
             raise self.peers.lost
         self._announce()
         self._place()
-        self._ask()
+        self._request()
 
-    def hear(self, message: Any, source: _Linked) -> None:
+    def receive(self, message: Any, source: _Linked) -> None:
         """Handle a message of a peer, and pass it on."""
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
@@ -302,7 +308,10 @@ class Station:
             return True
         slot = source.slots.setdefault(message.get_srcSystem(), SenderSlot(self._clock))
         if slot.hears(source):
-            self._tell_rival(slot)
+            if slot.rival is not None:
+                addresses = f"{source.transport.address} and {slot.rival.transport.address}"
+                slot.rival = None
+                self._send_text(f"{TWO_AUTOPILOTS}, {addresses}", _TEXT_ID)
         elif slot.is_free:
             slot.take(source)
         else:
@@ -311,19 +320,10 @@ class Station:
             return False
         return True
 
-    def _tell_rival(self, slot: SenderSlot[_Linked]) -> None:
-        if slot.holder is None or slot.rival is None:
-            return
-        holder, rival = slot.holder.transport.address, slot.rival.transport.address
-        text = f"{TWO_AUTOPILOTS}, {holder} and {rival}"
-        slot.rival = None
-        severity = dialect.MAV_SEVERITY_CRITICAL
-        self._send(list(text_messages(severity, text.encode(), _TEXT_ID)))
-
     def take(self, message: Any) -> bool:
         """Handle a message. Return True if the other peers get it, too.
 
-        What is for the camera or of another one stays here, so that there is one camera.
+        Messages to the camera or from another camera stay here, so that there is one camera.
         """
         component = message.get_srcComponent()
         if component == COMPONENT_ID and message.get_srcSystem() == self._autopilot:
@@ -345,36 +345,30 @@ class Station:
         return not for_camera
 
     def _hold(self, command: Any) -> None:
-        key = command.get_srcSystem(), command.get_srcComponent(), command.command
-        if key not in self._held and len(self._held) >= _MOST_HELD:
-            return
-        self._held[key] = command
-        progress = dialect.MAV_RESULT_IN_PROGRESS
-        sender = command.get_srcSystem(), command.get_srcComponent()
-        self._send([dialect.MAVLink_command_ack_message(command.command, progress, 0, 0, *sender)])
+        """Keep a command until the camera has its origin."""
+        sender, number = (command.get_srcSystem(), command.get_srcComponent()), command.command
+        if len(self._held) < _MOST_HELD or (*sender, number) in self._held:
+            self._held[*sender, number] = command
+            progress = dialect.MAV_RESULT_IN_PROGRESS
+            self._send([dialect.MAVLink_command_ack_message(number, progress, 0, 0, *sender)])
 
     def _look(self) -> None:
-        """Send what is due at the newest pose, and let the referee judge it."""
+        """Send the messages due at the newest pose, and let the referee judge it."""
         pose = self._tracker.pose()
         self._send(self.camera.poll(*pose[:3]))
-        if self._witness is not None:
-            collision = self._witness.observe(*pose)
-            if collision is not None:
-                text = collision.text.encode()
-                self._send(list(text_messages(dialect.MAV_SEVERITY_CRITICAL, text, 1)))
+        collision = None if self._witness is None else self._witness.observe(*pose)
+        if collision is not None:
+            self._send_text(collision.text, 1)
 
     def _is_autopilot(self, message: Any) -> bool:
         """Return True for a message of the autopilot, which its first heartbeat identifies."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return False
         if self._autopilot is None:
-            if (
-                message.get_type() != "HEARTBEAT"
-                or message.autopilot == dialect.MAV_AUTOPILOT_INVALID
-            ):
+            is_heartbeat = isinstance(message, dialect.MAVLink_heartbeat_message)
+            if not is_heartbeat or message.autopilot == dialect.MAV_AUTOPILOT_INVALID:
                 return False
-            self._autopilot = self.camera.system = message.get_srcSystem()
-            self._codec.system = self.camera.system
+            self._autopilot = self.camera.system = self._codec.system = message.get_srcSystem()
         return bool(message.get_srcSystem() == self._autopilot)
 
     def _announce(self) -> None:
@@ -386,9 +380,9 @@ class Station:
             self._send(self.camera.idle())
 
     def _place(self) -> None:
-        """Take the given origin if nobody has told a better one within a second.
+        """Use the given origin if no camera has sent a better one within a second.
 
-        The autopilot's clock counts it, because it may run much faster than the wall clock.
+        The second is one of the autopilot's clock, which may run much faster than the wall clock.
         """
         stamp_s = self._tracker.attitude_stamp_s
         if self._placed or stamp_s is None:
@@ -406,30 +400,24 @@ class Station:
             for command in held.values():
                 self._send(self.camera.handle(command))
 
-    def _ask(self) -> None:
-        """Request attitude and position from the autopilot until both arrive."""
-        if self._autopilot is None or self._clock() < self._ask_at_s:
+    def _request(self) -> None:
+        """Request attitude, position and origin until they arrive."""
+        if self._autopilot is None or self._clock() < self._request_at_s:
             return
-        self._ask_at_s = self._clock() + _ASK_AGAIN_S
-        autopilot = dialect.MAV_COMP_ID_AUTOPILOT1
-        interval = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
-        if not self._tracker.has_quaternion:
-            self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
-        if not self._tracker.has_position:
-            self._command(autopilot, interval, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
-        if not self._placed:
-            offset = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
-            self._command(COMPONENT_ID, dialect.MAV_CMD_REQUEST_MESSAGE, offset)
-
-    def _command(self, component: int, command: int, message_id: int) -> None:
+        self._request_at_s = self._clock() + _REQUEST_AGAIN_S
+        present = self._tracker.has_quaternion, self._tracker.has_position, self._placed
         self._send(
             [
                 dialect.MAVLink_command_long_message(
-                    self._autopilot, component, command, 0, float(message_id), _POSE_INTERVAL_US,
-                    *[0.0] * 5,
+                    self._autopilot, *request, _POSE_INTERVAL_US, *[0.0] * 5
                 )
+                for request, is_present in zip(_REQUESTS, present, strict=True)
+                if not is_present
             ]
-        )  # fmt: skip
+        )
+
+    def _send_text(self, text: str, text_id: int) -> None:
+        self._send([*text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), text_id)])
 
     def _send(self, messages: Sequence[Any]) -> None:
         self.frames_sent += sum(m.get_type() == "CAMERA_IMAGE_CAPTURED" for m in messages)

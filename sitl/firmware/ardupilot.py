@@ -1,4 +1,4 @@
-"""ArduPilot: its JSON backend (servo outputs in, the vehicle's state out, over UDP), and its start.
+"""ArduPilot: starts it, and serves its JSON backend (servo outputs in, state out, over UDP).
 
 ArduPilot sends its outputs and waits for the state, whose timestamp is its clock. It simulates
 barometer, magnetometer and GPS itself.
@@ -10,7 +10,6 @@ import json
 import socket
 import struct
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import numpy as np
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
-from sitl.firmware.autopilot import FirmwareProcess
+from sitl.firmware.autopilot import FIXED_PARAMETERS, Boot, FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.geodesy import Origin
 from sitl.vehicle.gains import RateLoops
@@ -35,7 +34,6 @@ _LEAST_US, _SPAN_US = 1000.0, 1000.0
 ANSWER_LIMIT_S = 10.0
 _EPOCH_S = 1_600_000_000  # start of its clock: the same in every flight
 _FULL_SHARE = 0.5  # share of the rotors' torque that its mixer gives at full command
-_SPIN_MIN, _SPIN_ARM = 0.05, 0.03  # throttles of the rotors in flight and on the ground
 
 
 class ArduPilotLink:
@@ -70,43 +68,26 @@ class ArduPilotLink:
         """Return ArduCopter's parameters for a vehicle: frame, thrust curve and rate loops."""
         loops = RateLoops.of(profile)
         return {
-            "FRAME_CLASS": 1,
-            "FRAME_TYPE": 1,
+            **FIXED_PARAMETERS["ardupilot"],
             "MOT_THST_EXPO": loops.curve,
             "MOT_THST_HOVER": loops.hover_share,
-            "MOT_HOVER_LEARN": 0,
-            "MOT_SPIN_ARM": _SPIN_ARM,
-            "MOT_SPIN_MIN": _SPIN_MIN,
-            "MOT_SPIN_MAX": 1.0,
-            "SIM_RATE_HZ": 400,
-            "LOG_BACKEND_TYPE": 0,
-            "FS_THR_ENABLE": 0,  # no radio control
-            "ARMING_CHECK": 1,
             **loops.parameters("ATC_RAT_{axis}_{term}", ("RLL", "PIT", "YAW"), [_FULL_SHARE] * 3),
         }
 
-    def start(
-        self,
-        binary: Path,
-        parameters: Mapping[str, float],
-        *,
-        system_id: int,
-        mavlink_port: int,
-        heading_deg: float,
-    ) -> FirmwareProcess:
+    def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
         """Start ArduCopter's SITL binary, which calls this link. See `Px4Link.start`."""
         program, origin = FirmwareProcess.program(binary), Origin()
         scratch = ScratchFolder("ardupilot")
-        lines = [f"{name} {value:.6g}\n" for name, value in parameters.items()]
+        lines = [f"{name} {value:.6g}\n" for name, value in self.parameters(boot.profile).items()]
         (scratch.path / "vehicle.parm").write_text("".join(lines))
-        home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, heading_deg)
+        home = (origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m, boot.heading_deg)
         arguments = [
             "--model", f"JSON:{_LOOPBACK}", "--wipe", "--speedup", "100",
-            "--defaults", "vehicle.parm", "--sysid", str(system_id),
+            "--defaults", "vehicle.parm", "--sysid", str(boot.system_id),
             "--home", ",".join(f"{value:.7f}" for value in home),
             "--start-time", str(_EPOCH_S),
             "--sim-port-out", str(self.port), "--sim-port-in", "0", "--rc-in-port", "0",
-            "--serial0", f"udpclient:{_LOOPBACK}:{mavlink_port}", "--serial1", "none:",
+            "--serial0", f"udpclient:{_LOOPBACK}:{boot.mavlink_port}", "--serial1", "none:",
             "--serial2", "none:",
         ]  # fmt: skip
         return FirmwareProcess(program, arguments, scratch, {})
@@ -116,7 +97,7 @@ class ArduPilotLink:
         """Port that ArduPilot sends to."""
         return int(self._socket.getsockname()[1])
 
-    def heard(self, timeout_s: float) -> bool:
+    def has_called(self, timeout_s: float) -> bool:
         """Return True once ArduPilot has sent its outputs, waiting at most `timeout_s`."""
         return self._peer is not None or self._await_servos(timeout_s)
 
@@ -127,7 +108,7 @@ class ArduPilotLink:
         """
         self._socket.sendto(self._state(stamp_us, truth), self._peer)
         if not self._await_servos(ANSWER_LIMIT_S):
-            raise VehicleProcessError(f"ArduPilot gave no outputs for {ANSWER_LIMIT_S:g} s")
+            raise VehicleProcessError(f"ArduPilot sent no outputs for {ANSWER_LIMIT_S:g} s")
         return self._throttles
 
     def close(self) -> None:

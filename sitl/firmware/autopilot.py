@@ -10,9 +10,11 @@ import signal
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.fork_server import die_with
@@ -21,6 +23,7 @@ from mavfi_cli.link.transport import Transport
 from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.geodesy import Origin
+from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.truth import Truth
 
 _STATE_US = 20_000.0
@@ -48,15 +51,15 @@ def follows_companion(heartbeat: Any) -> bool:
 class FirmwareAutopilot(Links):
     """A firmware behind a MAVLink link, as the autopilot of a simulation.
 
-    It asks the firmware for the streams of a flight, and sets its local origin to the world's, so
+    It requests the streams of a flight, and sets the firmware's local origin to the world's, so
     that its positions are world coordinates. Clients of any preset get all its `common` messages.
 
     Args:
-        echoes: The firmware answers TIMESYNC while its clock stands still. Then a client's frame
-            has been read before simulated time goes on.
+        echoes: The firmware answers TIMESYNC while its clock stands still. The firmware then reads
+            a client's frame before simulated time continues.
     """
 
-    restart_asked = False  # a reboot is the firmware's own
+    restart_requested = False  # a reboot is the firmware's own
 
     def __init__(self, transport: Transport, *, system_id: int = 1, echoes: bool = True) -> None:
         super().__init__()
@@ -92,16 +95,15 @@ class FirmwareAutopilot(Links):
             link.outbox.clear()
 
     def terminate(self, text: str) -> None:
-        """Stop the motors for good and tell the clients why."""
-        if self.terminated:
-            return
-        self.terminated = True
-        for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), 1):
-            self.broadcast(message)
+        """Stop the motors for good, and send the clients the reason."""
+        if not self.terminated:
+            self.terminated = True
+            for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), 1):
+                self.broadcast(message)
 
     @property
     def commander(self) -> FirmwareAutopilot:
-        """The part that knows the state of the motors."""
+        """The part with the state of the motors, `armed` and `terminated`."""
         return self
 
     @property
@@ -162,7 +164,7 @@ class FirmwareAutopilot(Links):
         self.broadcast(message)
 
     def _prepare(self) -> None:
-        """Ask for the streams and set the origin, at each heartbeat until positions arrive."""
+        """Request the streams and set the origin, at every heartbeat until positions arrive."""
         self._prepared = self.state_stamp_us >= 0
         place = Origin()
         frames = [
@@ -189,6 +191,20 @@ class FirmwareAutopilot(Links):
     def close(self) -> None:
         """Close the link to the firmware."""
         self._transport.close()
+
+
+FIXED_PARAMETERS: dict[str, dict[str, float]]
+FIXED_PARAMETERS, _ = read_toml(Path(__file__).with_name("parameters.toml"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Boot:
+    """Settings with which a firmware starts."""
+
+    profile: VehicleProfile
+    system_id: int
+    mavlink_port: int  # UDP port to which it sends its MAVLink
+    heading_deg: float
 
 
 _OUTPUT = "output.txt"
@@ -220,15 +236,10 @@ class FirmwareProcess:
         try:
             with (folder / _OUTPUT).open("wb") as output:
                 self._process = subprocess.Popen(
-                    [str(binary), *arguments],
-                    cwd=folder,
-                    env={**os.environ, **environment},
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                    preexec_fn=functools.partial(die_with, os.getpid()),
-                )
+                    [str(binary), *arguments], cwd=folder, env={**os.environ, **environment},
+                    stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                    start_new_session=True, preexec_fn=functools.partial(die_with, os.getpid()),
+                )  # fmt: skip
         except OSError as error:
             self._scratch.close()
             raise VehicleProcessError(f"{binary} is not a firmware: {error.strerror}") from None
@@ -257,7 +268,7 @@ class FirmwareProcess:
         return VehicleProcessError(f"{problem}; {self._state()}")
 
     def _state(self) -> str:
-        """Return in one line whether it runs or how it ended, and the last lines that it wrote."""
+        """Return a line: whether it runs or how it ended, and the last lines of its output."""
         code = self._process.poll()
         how = "is running" if code is None else f"ended with code {code}"
         if code is not None and code < 0:

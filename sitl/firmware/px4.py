@@ -1,4 +1,4 @@
-"""PX4: its lockstep link (sensors out, motor outputs back, over TCP), and its start.
+"""PX4: starts it, and serves its lockstep link (sensors out, motor outputs back, over TCP).
 
 PX4 is the client. HIL_SENSOR sets its clock, and HIL_ACTUATOR_CONTROLS answers it once the
 controllers have run. PX4 sends no answer while no controller runs, so a missing one must not stop
@@ -12,7 +12,6 @@ import math
 import os
 import socket
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import Codec, Message, dialect
 from mavfi_cli.link.transport import Transport, open_transport
-from sitl.firmware.autopilot import FirmwareProcess
+from sitl.firmware.autopilot import FIXED_PARAMETERS, Boot, FirmwareProcess
 from sitl.firmware.sensors import Sensors
 from sitl.vehicle.gains import RateLoops
 from sitl.vehicle.profile import VehicleProfile
@@ -78,8 +77,7 @@ class Px4Link:
         self._codec = Codec(1, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._throttles = np.zeros(4)
         self._steps = 0
-        self._heard = False
-        self._answers = False
+        self._has_called = self._answers = False
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
@@ -99,54 +97,39 @@ class Px4Link:
     def parameters(profile: VehicleProfile) -> dict[str, float]:
         """Return PX4's parameters for a vehicle: rotors, thrust curve and rate loops."""
         loops, offset_m = RateLoops.of(profile), profile.rotor.arm_m / math.sqrt(2.0)
-        parameters: dict[str, float] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
+        parameters = FIXED_PARAMETERS["px4"].copy()
         for rotor, (forward, right, sense) in enumerate(_ROTORS):
             parameters[f"CA_ROTOR{rotor}_PX"] = forward * offset_m
             parameters[f"CA_ROTOR{rotor}_PY"] = right * offset_m
             parameters[f"CA_ROTOR{rotor}_KM"] = sense * profile.rotor.torque_per_thrust_m
             parameters[f"PWM_MAIN_FUNC{rotor + 1}"] = 101 + rotor
-        axes, shares = ("ROLL", "PITCH", "YAW"), (_TILT_SHARE, _TILT_SHARE, 1.0)
+        shares = (_TILT_SHARE, _TILT_SHARE, 1.0)
         return {
             **parameters,
-            **loops.parameters("MC_{axis}RATE_{term}", axes, shares),
+            **loops.parameters("MC_{axis}RATE_{term}", ("ROLL", "PITCH", "YAW"), shares),
             "MC_ROLL_P": loops.tilt_p,
             "MC_PITCH_P": loops.tilt_p,
             "THR_MDL_FAC": loops.curve,
             "MPC_THR_HOVER": loops.hover_share,
-            "MPC_USE_HTE": 0,  # no estimate of the hover thrust: it is known
-            "IMU_INTEG_RATE": 250,
-            "EKF2_GPS_DELAY": 0,
-            "SDLOG_BACKEND": 0,
         }
 
-    def start(
-        self,
-        binary: Path,
-        parameters: Mapping[str, float],
-        *,
-        system_id: int,
-        mavlink_port: int,
-        heading_deg: float,
-    ) -> FirmwareProcess:
+    def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
         """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
 
-        Its MAVLink goes to a UDP port. The magnetometer tells PX4 its heading. Raises
-        VehicleProcessError if it cannot be started.
+        PX4 derives its heading from the magnetometer. Raises VehicleProcessError if it cannot be
+        started.
         """
         program = FirmwareProcess.program(binary)
         startup = program.parent.parent / "etc"
         if not (startup / "init.d-posix" / "rcS").is_file():
             raise VehicleProcessError(f"{binary} is not PX4: it has no startup files in {startup}")
         scratch = ScratchFolder("px4")
-        folder = scratch.path
-        instance = self.port - PORT
-        settings = [
-            f"param set {name} {value:.6g}"
-            for name, value in {**parameters, "MAV_SYS_ID": system_id}.items()
-        ]
+        folder, instance = scratch.path, self.port - PORT
+        parameters = {**self.parameters(boot.profile), "MAV_SYS_ID": boot.system_id}
+        settings = [f"param set {name} {value:.6g}" for name, value in parameters.items()]
         simulator = _SIMULATOR_SCRIPT.format(settings="\n".join(settings), port=self.port)
         (folder / "px4-rc.simulator").write_text(simulator)
-        links = _LINKS_SCRIPT.format(local=_LOCAL_PORT + instance, remote=mavlink_port)
+        links = _LINKS_SCRIPT.format(local=_LOCAL_PORT + instance, remote=boot.mavlink_port)
         (folder / "px4-rc.mavlink").write_text(links)
         environment = {
             "PX4_SIM_MODEL": "none_iris",
@@ -155,11 +138,11 @@ class Px4Link:
         arguments = ["-d", "-i", str(instance), "-w", str(folder), str(startup)]
         return FirmwareProcess(program, arguments, scratch, environment)
 
-    def heard(self, timeout_s: float) -> bool:
+    def has_called(self, timeout_s: float) -> bool:
         """Return True once PX4 has sent a message, waiting at most `timeout_s`."""
-        if not self._heard:
+        if not self._has_called:
             self._take(timeout_s)
-        return self._heard
+        return self._has_called
 
     def exchange(self, stamp_us: int, truth: Truth) -> Vector:
         """Send the sensors of a step and return the motor outputs (4,) in 0..1.
@@ -183,16 +166,10 @@ class Px4Link:
 
     def _await_answer(self, stamp_us: int) -> None:
         limit_s = ANSWER_LIMIT_S if self._answers else SILENT_WAIT_S
-        deadline_s = time.monotonic() + limit_s
-        while True:
+        deadline_s, remaining_s, self._answers = time.monotonic() + limit_s, limit_s, False
+        while remaining_s > 0.0 and not self._answers:
             remaining_s = deadline_s - time.monotonic()
-            answered = self._take(max(remaining_s, 0.0))
-            if answered >= stamp_us:
-                self._answers = True
-                return
-            if remaining_s <= 0.0:
-                self._answers = False
-                return
+            self._answers = self._take(max(remaining_s, 0.0)) >= stamp_us
 
     def _take(self, timeout_s: float) -> int:
         """Handle the next bytes. Return the newest stamp that PX4 has answered, or -1."""
@@ -202,7 +179,7 @@ class Px4Link:
             raise VehicleProcessError(_GONE) from None
         answered = -1
         for message in self._codec.decode(data) if data else ():
-            self._heard = True
+            self._has_called = True
             if message.get_msgId() == dialect.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
                 answered = message.time_usec
                 self._throttles = _throttles(message)
@@ -243,6 +220,6 @@ def _throttles(message: Message) -> Vector:
 
 
 def _is_running(instance: int) -> bool:
-    """Return True if a PX4 of this number runs on this machine. It would not start a second."""
+    """Return True if a PX4 of this number runs on this machine, where a second cannot start."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         return probe.connect_ex(_SOCKET.format(instance)) == 0

@@ -1,4 +1,4 @@
-"""What the sensors of a vehicle measure: its true state, with noise from a seed."""
+"""Sensors of a vehicle: they measure its true state, with noise from a seed."""
 
 from __future__ import annotations
 
@@ -24,13 +24,9 @@ FIX_SPEED_MPS = 0.06
 _DECLINATION_RAD = math.radians(3.19)
 _INCLINATION_RAD = math.radians(63.1)
 _STRENGTH_GAUSS = 0.4816
-FIELD_NED_GAUSS = _STRENGTH_GAUSS * np.array(
-    [
-        math.cos(_INCLINATION_RAD) * math.cos(_DECLINATION_RAD),
-        math.cos(_INCLINATION_RAD) * math.sin(_DECLINATION_RAD),
-        math.sin(_INCLINATION_RAD),
-    ]
-)
+_LEVEL_SHARE = math.cos(_INCLINATION_RAD)
+_NORTH, _EAST = _LEVEL_SHARE * math.cos(_DECLINATION_RAD), _LEVEL_SHARE * math.sin(_DECLINATION_RAD)
+FIELD_NED_GAUSS = _STRENGTH_GAUSS * np.array([_NORTH, _EAST, math.sin(_INCLINATION_RAD)])
 _GRAVITY_NED_MPS2 = np.array([0.0, 0.0, GRAVITY_MPS2])
 
 # International standard atmosphere up to 11 km

@@ -16,8 +16,9 @@ from mavfi_cli.core.errors import VehicleProcessError
 from mavfi_cli.core.frames import Vector, enu_from_ned, flu_enu_from_frd_ned
 from mavfi_cli.link.transport import open_transport
 from sitl.autopilot.telemetry import TICK_US, Link
+from sitl.camera.component import Camera
 from sitl.firmware.ardupilot import ArduPilotLink
-from sitl.firmware.autopilot import FirmwareAutopilot, FirmwareProcess
+from sitl.firmware.autopilot import Boot, FirmwareAutopilot, FirmwareProcess
 from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
 from sitl.simulation import Simulation
@@ -35,15 +36,15 @@ _START_LIMIT_S, _LOOK_S = 60.0, 0.2
 class FirmwareSimulation(Simulation):
     """A simulation whose rotors a firmware commands, one exchange for each physics step.
 
-    The firmware's state at a stamp comes a step or two after the stamp. The camera takes its frame
-    from where the vehicle truly was at the stamp of the newest state.
+    The firmware's state at a stamp arrives a step or two after the stamp. The camera takes its
+    frame from the vehicle's true pose at the stamp of the newest state.
 
     Args:
-        kind: Which firmware, one of LINKS.
+        kind: Firmware, one of LINKS.
         binary: Its SITL program, which `close` ends; None if somebody else starts it.
         seed: Seed of the sensors' noise.
         url: Link on which a firmware that somebody else starts sends its MAVLink.
-        options: Further arguments of `Simulation`.
+        system_id, camera, logs: See `Simulation`.
 
     Raises:
         LinkError: A port is in use.
@@ -62,7 +63,8 @@ class FirmwareSimulation(Simulation):
         seed: int,
         url: str,
         system_id: int,
-        **options: Any,
+        camera: Camera | None = None,
+        logs: bool = True,
     ) -> None:
         with contextlib.ExitStack() as undo:
             mavlink = open_transport(url if binary is None else "udpin:127.0.0.1:0")
@@ -72,13 +74,13 @@ class FirmwareSimulation(Simulation):
             self._process: FirmwareProcess | None = None
             if binary is not None:
                 to_goal = world.goal_enu_m - world.start_enu_m
-                self._process = link.start(
-                    binary,
-                    link.parameters(profile),
+                boot = Boot(
+                    profile=profile,
                     system_id=system_id,
                     mavlink_port=int(mavlink.port),  # type: ignore[attr-defined]
                     heading_deg=math.degrees(math.atan2(to_goal[0], to_goal[1])) % 360.0,
                 )
+                self._process = link.start(binary, boot)
                 undo.callback(self._process.end)
             self._step_us = round(link.step_s * 1e6)
             self._throttles = np.zeros(4)
@@ -86,19 +88,18 @@ class FirmwareSimulation(Simulation):
             self._poses: deque[tuple[int, Vector, Vector]] = deque(
                 maxlen=round(_REMEMBERED_S / link.step_s)
             )
-            self._firmware = firmware = FirmwareAutopilot(
-                mavlink, system_id=system_id, echoes=link.echoes
-            )
+            self._firmware = FirmwareAutopilot(mavlink, system_id=system_id, echoes=link.echoes)
             super().__init__(
-                world, profile, system_id=system_id, step_s=link.step_s, autopilot=firmware,
-                **options,
+                world, profile, system_id=system_id, step_s=link.step_s, autopilot=self._firmware,
+                camera=camera, logs=logs,
             )  # fmt: skip
             undo.pop_all()
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the firmware calls and knows where it is, or until stopped.
+        """Wait until the firmware calls and sends a position, or until stopped.
 
-        Raises VehicleProcessError if it ended, did not call within a minute, or gave no position.
+        Raises VehicleProcessError if it ended, or has not called within a minute, or has sent no
+        position within two.
         """
         self._await_call(stopped)
         autopilot = self._firmware
@@ -106,7 +107,7 @@ class FirmwareSimulation(Simulation):
             self.stamp_us < self._link.settle_s * 1e6 or autopilot.state_stamp_us < 0
         ):
             if self.stamp_us > _POSITION_LIMIT_US:
-                raise VehicleProcessError("the firmware gave no position within 120 s")
+                raise VehicleProcessError("the firmware sent no position within 120 s")
             self.advance()
         autopilot.forget()
 
@@ -140,7 +141,7 @@ class FirmwareSimulation(Simulation):
         deadline_s = time.monotonic() + _START_LIMIT_S
         while not stopped():
             with self._explained():
-                if self._link.heard(_LOOK_S):
+                if self._link.has_called(_LOOK_S):
                     return
             if self._process is None:
                 continue

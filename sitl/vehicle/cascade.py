@@ -22,11 +22,8 @@ from mavfi_cli.core.frames import Vector
 from sitl.vehicle.truth import T_ON_GROUND, T_POSITION, T_QUATERNION, T_RATES, T_VELOCITY
 
 # Setpoint (11,): NED, m, m/s, m/s^2, rad, rad/s; NaN means not controlled.
-SP_POSITION = 0
-SP_VELOCITY = 3
-SP_ACCELERATION = 6
-SP_YAW = 9
-SP_YAW_RATE = 10
+SP_POSITION, SP_VELOCITY, SP_ACCELERATION = 0, 3, 6
+SP_YAW, SP_YAW_RATE = 9, 10
 SETPOINT_SIZE = 11
 
 # A measurement (33,) is the vehicle's truth, in the order of `sitl.vehicle.truth`.
@@ -113,9 +110,7 @@ def wrap(angle_rad: float) -> float:
 @compiled
 def _finite_or_nan(value: float, limit: float) -> float:
     """Clip `value` to +-limit. Return NaN if it is not finite."""
-    if not math.isfinite(value):
-        return math.nan
-    return min(max(value, -limit), limit)
+    return _clip(value, -limit, limit) if math.isfinite(value) else math.nan
 
 
 @compiled
@@ -137,12 +132,9 @@ def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
     acceleration and yaw rate to their limits, and yaw to [-pi, pi).
     """
     clean = np.empty(SETPOINT_SIZE)
-    for axis in range(3):
-        clean[SP_POSITION + axis] = _finite_or_nan(setpoint[SP_POSITION + axis], FARTHEST_M)
-        clean[SP_VELOCITY + axis] = _finite_or_nan(setpoint[SP_VELOCITY + axis], LARGEST_INPUT)
-        clean[SP_ACCELERATION + axis] = _finite_or_nan(
-            setpoint[SP_ACCELERATION + axis], LARGEST_INPUT
-        )
+    for index in range(SP_YAW):  # position, then velocity and acceleration
+        limit = FARTHEST_M if index < SP_VELOCITY else LARGEST_INPUT
+        clean[index] = _finite_or_nan(setpoint[index], limit)
     _limit_horizontal(clean, SP_VELOCITY, gains[G_SPEED_LIMIT])
     _limit_horizontal(clean, SP_ACCELERATION, gains[G_ACCELERATION_LIMIT])
     down = SP_VELOCITY + 2
@@ -345,8 +337,8 @@ def _torque(
 ) -> Vector:
     """Return the body torque (3,), N m, of the rate loops, and advance their integrals.
 
-    The loops are PID with the derivative of the measurement, scaled by inertia, plus the gyroscopic
-    term.
+    They are PID loops with the derivative of the measurement, scaled by inertia, plus the
+    gyroscopic term.
     """
     dt = gains[G_DT]
     angular = np.empty(3)
@@ -376,7 +368,7 @@ def _torque(
 
 @compiled
 def thrust_shares(collective_n: float, torque_nm: Vector, gains: Vector) -> Vector:
-    """Return each rotor's thrust (4,) as a share of its maximum, within [LEAST_SHARE, 1].
+    """Return the thrust of the rotors (4,) as shares of the maximum, within [LEAST_SHARE, 1].
 
     If the rotors saturate, roll and pitch have priority, then the collective, then yaw.
     """

@@ -106,19 +106,19 @@ def _mixer(gains: Vector, profile: VehicleProfile) -> None:
     )
 
 
-_REDUCED = 0.6  # real firmware filters its gyroscope, and its answer is a step late
+_REDUCED = 0.6  # real firmware filters its gyroscope, and its outputs are a step late
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RateLoops:
-    """Rate loops for real firmware: ours with reduced gains, and what its units are made of.
+    """Rate loops for real firmware: ours with reduced gains, and the data to convert them.
 
-    A firmware's gain is torque as a share of what its mixer gives at full command.
+    A firmware's gain is torque as a share of its mixer's torque at full command.
     """
 
-    p: Vector  # (3,) N m of torque for each rad/s
-    i: Vector  # (3,) N m for each rad
-    d: Vector  # (3,) N m for each rad/s^2
+    p: Vector  # (3,) N m of torque per rad/s
+    i: Vector  # (3,) N m per rad
+    d: Vector  # (3,) N m per rad/s^2
     tilt_nm: float  # torque of all rotors at full differential thrust, round a level axis
     yaw_nm: float
     tilt_p: float  # 1/s
@@ -150,7 +150,7 @@ class RateLoops:
     ) -> dict[str, float]:
         """Return the gains by names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
 
-        A share is that of `tilt_nm` or `yaw_nm` which full command gives round its axis.
+        A share is the part of `tilt_nm` or `yaw_nm` that full command gives round its axis.
         """
         full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
         return {

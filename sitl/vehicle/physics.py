@@ -1,4 +1,4 @@
-"""JSBSim: writes the files of a vehicle profile, takes motor commands, returns the raw state."""
+"""JSBSim: writes the files of a vehicle profile, and steps its physics under motor commands."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def _values(profile: VehicleProfile) -> dict[str, float | str]:
 
 def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
     """Return the rows of a coefficient over the advance ratio, up to 1.5 times `ratio`."""
-    steps = [step / 20.0 for step in range(-20, 31)]
-    return "\n".join(f"{each * ratio:.6f} {static * share(each):.9f}" for each in steps)
+    advances = [step / 20.0 for step in range(-20, 31)]
+    return "\n".join(f"{j * ratio:.6f} {static * share(j):.9f}" for j in advances)
 
 
 def thrust_share(relative_advance: float) -> float:
@@ -95,31 +95,16 @@ def power_share(relative_advance: float) -> float:
 # Properties to read after a step, in order. Earth-centred axes at latitude and longitude zero are
 # (up, east, north), so positions and velocities are those of the tangent plane itself.
 RAW_PROPERTIES = (
-    "position/ecef-z-ft",
-    "position/ecef-y-ft",
-    "position/ecef-x-ft",
-    "velocities/ecef-z-fps",
-    "velocities/ecef-y-fps",
-    "velocities/ecef-x-fps",
-    "attitude/phi-rad",
-    "attitude/theta-rad",
-    "attitude/psi-rad",
-    "velocities/p-rad_sec",
-    "velocities/q-rad_sec",
-    "velocities/r-rad_sec",
+    *(f"position/ecef-{axis}-ft" for axis in "zyx"),
+    *(f"velocities/ecef-{axis}-fps" for axis in "zyx"),
+    *(f"attitude/{angle}-rad" for angle in ("phi", "theta", "psi")),
+    *(f"velocities/{axis}-rad_sec" for axis in "pqr"),
     "gear/wow",
     *(f"propulsion/engine[{n}]/propeller-rpm" for n in range(ROTORS)),
     *(f"propulsion/engine[{n}]/propeller-power-ftlbps" for n in range(ROTORS)),
 )
-RAW_POSITION, RAW_VELOCITY, RAW_EULER, RAW_RATES, RAW_WOW, RAW_RPM, RAW_POWER = (
-    0,
-    3,
-    6,
-    9,
-    12,
-    13,
-    17,
-)
+RAW_POSITION, RAW_VELOCITY, RAW_EULER, RAW_RATES = 0, 3, 6, 9
+RAW_WOW, RAW_RPM, RAW_POWER = 12, 13, 17
 RAW_SIZE = len(RAW_PROPERTIES)
 
 
@@ -166,12 +151,9 @@ def _load(profile: VehicleProfile, folder: Path, dt_s: float) -> jsbsim.FGFDMExe
     fdm = jsbsim.FGFDMExec(str(folder))
     fdm.set_debug_level(0)
     fdm.disable_output()
-    loaded = fdm.load_planet(
-        str(folder / "planet.xml"), useAircraftPath=False
-    ) and fdm.load_model_with_paths(
-        AIRCRAFT, str(folder / "aircraft"), str(folder / "engine"), str(folder)
-    )
-    if not loaded:
+    paths = (str(folder / "aircraft"), str(folder / "engine"), str(folder))
+    has_planet = fdm.load_planet(str(folder / "planet.xml"), useAircraftPath=False)
+    if not (has_planet and fdm.load_model_with_paths(AIRCRAFT, *paths)):
         raise VehicleProcessError(f"JSBSim cannot load the model of vehicle {profile.name!r}")
     fdm.set_dt(dt_s)
     return fdm

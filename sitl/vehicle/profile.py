@@ -206,8 +206,8 @@ class VehicleProfile:
             raise ConfigError(
                 f"vehicle {self.name!r} cannot fly: {self.max_thrust_n:.1f} N of thrust for "
                 f"{self.mass_kg:g} kg + {self.extra_payload_kg:g} kg payload "
-                f"({self.total_mass_kg * GRAVITY_MPS2:.1f} N) is a thrust-to-weight ratio of "
-                f"{ratio:.2f}, at least {MIN_THRUST_TO_WEIGHT:g} is needed"
+                f"({self.total_mass_kg * GRAVITY_MPS2:.1f} N). The thrust-to-weight ratio must be "
+                f"at least {MIN_THRUST_TO_WEIGHT:g}, got {ratio:.2f}"
             )
 
     def _check_ranges(self) -> None:
@@ -216,12 +216,12 @@ class VehicleProfile:
             ("battery.drive_efficiency", self.battery.drive_efficiency, 1.0),
         ):
             if value > most:
-                raise ConfigError(f"must be at most {most:g}, is {value:g}", key=key)
+                raise ConfigError(f"must be at most {most:g}, got {value:g}", key=key)
         nominal_v = self.battery.cells * self.battery.cell_nominal_v
         if self.rotor.full_throttle_voltage_v > nominal_v:
             raise ConfigError(
-                f"rotor.max_rpm needs {self.rotor.full_throttle_voltage_v:.1f} V at the motor, "
-                f"the battery has {nominal_v:.1f} V"
+                f"the voltage at rotor.max_rpm must be at most the battery's {nominal_v:.1f} V, "
+                f"got {self.rotor.full_throttle_voltage_v:.1f} V"
             )
 
     @property
@@ -270,12 +270,10 @@ def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
 def _check_number(key: str, value: float) -> None:
     if value and not 1.0 / _LARGEST <= abs(value) <= _LARGEST:  # else sums and quotients overflow
         raise ConfigError(f"no quadrotor has {value:g}", key=key)
-    if key.startswith(_ANY_SIGN):
-        return
-    if value < 0.0 and key in _MAY_BE_ZERO:
-        raise ConfigError(f"must not be negative, is {value:g}", key=key)
-    if value <= 0.0 and key not in _MAY_BE_ZERO:
-        raise ConfigError(f"must be above zero, is {value:g}", key=key)
+    may_be_zero = key in _MAY_BE_ZERO
+    if not key.startswith(_ANY_SIGN) and (value < 0.0 or (value == 0.0 and not may_be_zero)):
+        limit = "must not be negative" if may_be_zero else "must be above zero"
+        raise ConfigError(f"{limit}, got {value:g}", key=key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,7 +299,7 @@ class _StandIn:
         for key in ("mass_kg", "rotor_pull_n", "hover_power_w", "battery_wh", "acceleration_mps2"):
             value = getattr(self, key)
             if value is not None and value <= 0.0:
-                raise ValueError(f"{key}: must be above zero, is {value:g}")
+                raise ValueError(f"{key}: must be above zero, got {value:g}")
 
     def profile(self, base: VehicleProfile) -> VehicleProfile:
         """Return the scaled quadrotor.
@@ -330,11 +328,12 @@ class _StandIn:
         if self.avionics_w is not None:
             battery = dataclasses.replace(battery, avionics_w=self.avionics_w)
         if self.hover_power_w is not None:
-            share = rotor.hover_power_w(mass_kg) / self.hover_power_w
+            shaft_w = rotor.hover_power_w(mass_kg)
+            share = shaft_w / self.hover_power_w
             if share > 1.0:
                 raise ValueError(
-                    f"hover_power_w: {self.hover_power_w:g} W do not hover {mass_kg:g} kg: the "
-                    f"propellers of {self.base!r} take {rotor.hover_power_w(mass_kg):.1f} W"
+                    f"hover_power_w: must be at least the {shaft_w:.1f} W with which the "
+                    f"propellers of {self.base!r} hover {mass_kg:g} kg, got {self.hover_power_w:g}"
                 )
             battery = dataclasses.replace(battery, drive_efficiency=share)
         grown = mass_kg / base.mass_kg

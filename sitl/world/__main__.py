@@ -17,7 +17,7 @@ from mavfi_cli.core.output_paths import OutFile
 from mavfi_cli.core.terminal import echo, exit_code
 from sitl.command_line import CONTEXT, Triple, complete_world, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg
-from sitl.world.world import World, load_world, named_worlds, show
+from sitl.world.world import World, format_place, load_world, named_worlds
 
 _WORLD_HELP = "WORLD is a name from `mavfi world list`, gen:density,size, or a TOML file."
 
@@ -68,7 +68,7 @@ def _make(made: World, as_json: bool, output: Path | None) -> None:
     if output is not None:
         write_text(output, text)
     if as_json:
-        echo(json.dumps({**made.as_json(), "file": output and str(output)}, indent=1))
+        echo(json.dumps({**made.as_dict(), "file": output and str(output)}, indent=1))
     elif output is None:
         echo(text, nl=False)
     else:
@@ -90,24 +90,21 @@ def _check(made: World, as_json: bool, clearance: float, expect: str | None) -> 
     The path is searched on a grid of 0.5 m at the goal's height. Paths over or under an obstacle
     are ignored.
     """
-    result = check_world(made, clearance_m=clearance)
+    check = check_world(made, clearance_m=clearance)
     if as_json:
-        echo(json.dumps({**made.as_json(), "check": result.as_json()}, indent=1))
+        echo(json.dumps({**made.as_dict(), "check": check.as_dict()}, indent=1))
     else:
-        near_start, near_goal = (
-            f"{m:.1f} m away" if math.isfinite(m) else "none"
-            for m in (result.start_clearance_m, result.goal_clearance_m)
-        )
-        start, goal = map(show, (made.start_enu_m, made.goal_enu_m))
-        path = "none" if result.path_m is None else f"{result.path_m:.1f} m"
-        echo(
-            f"{_boxes(made)}\n"
-            f"start  {start}, nearest obstacle {near_start}\n"
-            f"goal   {goal}, nearest obstacle {near_goal}\n"
-            f"path   {path} with {result.clearance_m:g} m clearance; straight "
-            f"{result.straight_m:.1f} m"
-        )
-    if expect == "path" and not result.path_exists:
+        echo(_boxes(made))
+        for what, place, gap_m in (
+            ("start", made.start_enu_m, check.start_clearance_m),
+            ("goal ", made.goal_enu_m, check.goal_clearance_m),
+        ):
+            nearest = f"{gap_m:.1f} m away" if math.isfinite(gap_m) else "none"
+            echo(f"{what}  {format_place(place)}, nearest obstacle {nearest}")
+        path = "none" if check.path_m is None else f"{check.path_m:.1f} m"
+        clearance_text = f"{check.clearance_m:g} m clearance"
+        echo(f"path   {path} with {clearance_text}; straight {check.straight_m:.1f} m")
+    if expect == "path" and not check.path_exists:
         sys.exit(1)
 
 
@@ -123,7 +120,7 @@ def _draw(made: World, as_json: bool, output: Path | None, with_path: bool) -> N
     picture = world_svg(made, path)
     write_atomically(file, lambda opened: opened.write(picture))
     if as_json:
-        echo(json.dumps({**made.as_json(), "file": str(file)}, indent=1))
+        echo(json.dumps({**made.as_dict(), "file": str(file)}, indent=1))
     else:
         echo(f"{file}: {_boxes(made)}")
 

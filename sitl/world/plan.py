@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import WorldError
+from mavfi_cli.core.files import plain
 from mavfi_cli.core.frames import Vector
 from sitl.world.world import World, distance_to_boxes
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 
 Mask = NDArray[np.bool_]
+Cell = tuple[int, int]
 
 # Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi).
 DEFAULT_CLEARANCE_M = 2.0
@@ -49,12 +51,10 @@ class _WorldCheck:
         """True if there is a path with the clearance."""
         return self.path_m is not None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Return the result without corners; a distance is None without boxes."""
-        keys = ("clearance_m", "path_exists", "path_m", "straight_m")
-        gaps = {"start": self.start_clearance_m, "goal": self.goal_clearance_m}
-        finite = {f"{at}_clearance_m": m if math.isfinite(m) else None for at, m in gaps.items()}
-        return {**{key: getattr(self, key) for key in keys}, **finite}
+        keys = ("clearance_m", "path_m", "straight_m", "start_clearance_m", "goal_clearance_m")
+        return {"path_exists": self.path_exists, **plain({key: getattr(self, key) for key in keys})}
 
 
 def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _WorldCheck:
@@ -68,21 +68,19 @@ def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _W
     cells = np.minimum(np.floor((ends - origin) / _CELL_M).astype(int), np.array(free.shape) - 1)
     start, goal = map(tuple, cells.tolist())
     path_cells = _shortest(free, start, goal)
-    plan = world.goal_enu_m[:2] - world.start_enu_m[:2]
-    path = np.zeros((0, 3))
-    if path_cells is not None:
+    path, path_m = np.zeros((0, 3)), None
+    if path_cells:
         corners = origin + (np.array(_straighten(free, path_cells)) + 0.5) * _CELL_M
         path = np.column_stack([corners, np.full(len(corners), height)])
+        path_m = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     start_gaps = distance_to_boxes(world.boxes_enu_m, world.start_enu_m, plan=True)
     goal_gaps = distance_to_boxes(world.boxes_enu_m, world.goal_enu_m)
     return _WorldCheck(
         clearance_m=clearance_m,
         start_clearance_m=float(start_gaps.min(initial=math.inf)),
         goal_clearance_m=float(goal_gaps.min(initial=math.inf)),
-        straight_m=float(np.hypot(*plan)),
-        path_m=None
-        if path_cells is None
-        else float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        straight_m=float(np.hypot(*(world.goal_enu_m - world.start_enu_m)[:2])),
+        path_m=path_m,
         path_enu_m=path,
     )
 
@@ -93,13 +91,11 @@ def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask,
     cells = np.maximum(1.0, np.ceil((world.bounds_enu_m[3:5] - origin) / _CELL_M))
     if math.prod(cells.tolist()) > _MOST_CELLS:
         raise WorldError(
-            f"world {world.name!r} is too large to check: its grid would have "
-            f"{cells[0]:g} x {cells[1]:g} cells, more than {_MOST_CELLS:g}"
+            f"world {world.name!r} is too large to check: its grid must be at most "
+            f"{_MOST_CELLS:g} cells, got {cells[0]:g} x {cells[1]:g}"
         )
-    count = cells.astype(int)
-    x = origin[0] + (np.arange(count[0]) + 0.5) * _CELL_M
-    y = origin[1] + (np.arange(count[1]) + 0.5) * _CELL_M
-    free = np.ones((count[0], count[1]), dtype=np.bool_)
+    x, y = (at + (np.arange(int(n)) + 0.5) * _CELL_M for at, n in zip(origin, cells, strict=True))
+    free = np.ones((len(x), len(y)), dtype=np.bool_)
     for box in world.boxes_enu_m:
         dz = max(box[2] - height_m, height_m - box[5], 0.0)
         dx = np.maximum(0.0, np.maximum(box[0] - x, x - box[3]))[:, None]
@@ -109,17 +105,13 @@ def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask,
     return free, origin
 
 
-def _shortest(
-    free: Mask, start: tuple[int, int], goal: tuple[int, int]
-) -> list[tuple[int, int]] | None:
-    """Return the cells of a shortest path, found by A* with the straight line as heuristic."""
+def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell]:
+    """Return the cells of a shortest path, none if there is none, by A* with straight distances."""
     shape = free.shape
     if not (free[start] and free[goal]):
-        return None
-    best = {start: 0.0}
-    parent: dict[tuple[int, int], tuple[int, int]] = {}
+        return []
+    best, parent, closed = {start: 0.0}, dict[Cell, Cell](), set[Cell]()
     queue = [(math.dist(start, goal), start)]
-    closed: set[tuple[int, int]] = set()
     while queue:
         _, here = heapq.heappop(queue)
         if here == goal:
@@ -139,25 +131,20 @@ def _shortest(
                 best[there] = cost
                 parent[there] = here
                 heapq.heappush(queue, (cost + math.dist(there, goal), there))
-    return None
+    return []
 
 
-def _straighten(free: Mask, cells: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Remove corners: connect each to the last one in line of sight."""
-    corners = [cells[0]]
-    at = 0
-    while at < len(cells) - 1:
-        seen = at + 1
-        for ahead in range(len(cells) - 1, at + 1, -1):
-            if _sees(free, cells[at], cells[ahead]):
-                seen = ahead
-                break
-        at = seen
+def _straighten(free: Mask, cells: list[Cell]) -> list[Cell]:
+    """Return the corners of a path of cells: after a cell, the last one in line of sight."""
+    corners, at, last = [cells[0]], 0, len(cells) - 1
+    while at < last:
+        ahead = (place for place in range(last, at, -1) if _sees(free, cells[at], cells[place]))
+        at = next(ahead, at + 1)
         corners.append(cells[at])
     return corners
 
 
-def _sees(free: Mask, a: tuple[int, int], b: tuple[int, int]) -> bool:
+def _sees(free: Mask, a: Cell, b: Cell) -> bool:
     count = 4 * max(abs(b[0] - a[0]), abs(b[1] - a[1])) + 1
     line = np.rint(np.linspace(a, b, count)).astype(int)
     return bool(free[line[:, 0], line[:, 1]].all())
@@ -191,16 +178,15 @@ def world_svg(world: World, path_enu_m: Vector | None = None) -> bytes:
         if path_enu_m is not None and len(path_enu_m):
             axes.plot(
                 path_enu_m[:, 0], path_enu_m[:, 1], color=_PATH, linewidth=1.0,
-                linestyle=(0, (4, 2)), label="way with clearance", zorder=3,
+                linestyle=(0, (4, 2)), label="path with clearance", zorder=3,
             )  # fmt: skip
         _draw_places(axes, world)
-        axes.set_xlim(west, east)
-        axes.set_ylim(south, north)
-        axes.set_aspect("equal")
-        axes.set_xlabel("east, m")
-        axes.set_ylabel("north, m")
-        axes.tick_params(width=0.6, length=3)
         title = f"{world.name}, seed {world.seed}"
+        axes.set(
+            xlim=(west, east), ylim=(south, north), aspect="equal", xlabel="east, m",
+            ylabel="north, m",
+        )  # fmt: skip
+        axes.tick_params(width=0.6, length=3)
         axes.set_title(title, fontsize=10, loc="left")
         figure.legend(
             loc="outside lower center", ncols=4, frameon=False, fontsize=8, handletextpad=0.5

@@ -32,8 +32,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import load_toml, toml_text
-from mavfi_cli.core.errors import PlaceError, RecordError, UnknownName, WorldError
-from mavfi_cli.core.files import write_json
+from mavfi_cli.core.errors import PlaceError, UnknownName, WorldError
+from mavfi_cli.core.files import write_json, writing
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
@@ -48,23 +48,22 @@ _MAX_SPAN_M = 1000.0
 _TRIES = 2000
 
 _SCENES = ("factory", "farm")
-_DEFAULT_START_ENU_M = (0.0, 0.0, 0.0)
-_DEFAULT_GOAL_ENU_M = (30.0, 40.0, 5.0)
+_DEFAULT_START_ENU_M = np.array([0.0, 0.0, 0.0])
+_DEFAULT_GOAL_ENU_M = np.array([30.0, 40.0, 5.0])
 
 
-def show(place: Vector) -> str:
+def format_place(place: Vector) -> str:
     """Format a point like (30, 40, 5)."""
     return "(" + ", ".join(f"{float(c):g}" for c in place) + ")"
 
 
 def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector, *, plan: bool = False) -> Vector:
-    """Return the distance (n,), m, from a point (3,) to each box (n, 6); zero inside.
+    """Return the distances (n,), m, from a point (3,) to boxes (n, 6); zero inside.
 
     In `plan` only the horizontal distance counts.
     """
-    below = boxes_enu_m[:, :3] - place_enu_m
-    above = place_enu_m - boxes_enu_m[:, 3:]
-    apart = np.maximum(0.0, np.maximum(below, above))
+    apart = np.maximum(boxes_enu_m[:, :3] - place_enu_m, place_enu_m - boxes_enu_m[:, 3:])
+    apart = np.maximum(0.0, apart)
     if plan:
         apart[:, 2] = 0.0
     gaps: Vector = np.linalg.norm(apart, axis=1)
@@ -101,26 +100,21 @@ class World:
         for what, place in (("start", self.start_enu_m), ("goal", self.goal_enu_m)):
             _refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the world for a record, lengths in m."""
-        arrays = ("bounds", "start", "goal", "boxes")
-        return {
-            "name": self.name,
-            "seed": self.seed,
-            **{key: getattr(self, f"{key}_enu_m").tolist() for key in arrays},
-        }
+    def as_dict(self) -> dict[str, Any]:
+        """Return the world for a record in JSON, lengths in m."""
+        keys = ("bounds", "start", "goal", "boxes")
+        arrays = {key: getattr(self, f"{key}_enu_m").tolist() for key in keys}
+        return {"name": self.name, "seed": self.seed, **arrays}
 
     def toml(self) -> str:
         """Return the text of a world file, which reads back as the same world."""
-        places = {
-            key: getattr(self, key).tolist()
-            for key in ("bounds_enu_m", "start_enu_m", "goal_enu_m")
-        }
+        keys = ("bounds_enu_m", "start_enu_m", "goal_enu_m")
+        places = {key: getattr(self, key).tolist() for key in keys}
         boxes = [{"min_enu_m": box[:3], "max_enu_m": box[3:]} for box in self.boxes_enu_m.tolist()]
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def briefing(self, camera_mount_flu_m: Sequence[float]) -> Briefing:
-        """Return what a companion knows before the first message."""
+        """Return the companion's data before the first message."""
         places = (self.start_enu_m, self.goal_enu_m, self.bounds_enu_m, camera_mount_flu_m)
         start, goal, bounds, mount = (np.array(place, np.float64) for place in places)
         return Briefing(
@@ -128,11 +122,9 @@ class World:
         )
 
     def write_briefing(self, camera_mount_flu_m: Sequence[float], folder: Path) -> None:
-        """Write the briefing, or raise RecordError."""
-        try:
+        """Write the briefing to a folder. Raises RecordError."""
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecordError(f"{folder}: {error.strerror or error}") from None
         briefing = dataclasses.asdict(self.briefing(camera_mount_flu_m))
         del briefing["hfov_rad"]  # the camera reports its own
         write_json(folder / "briefing.json", briefing)
@@ -143,23 +135,23 @@ def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place
 
     A start is blocked if a box (n, 6) is too near to stand there, a goal if it is inside a box.
     """
+    subject = f"world {name!r}: {what} {format_place(place)}"
     if not _inside(bounds, place):
         raise PlaceError(
-            f"world {name!r}: {what} {show(place)} is outside the world, which reaches "
-            f"from {show(bounds[:3])} to {show(bounds[3:])} m"
+            f"{subject} is outside the world, which reaches "
+            f"from {format_place(bounds[:3])} to {format_place(bounds[3:])} m"
         )
     gaps = distance_to_boxes(boxes, place)
     if not gaps.size:
         return
-    if what == "start" and gaps.min() < _START_CLEAR_M:
+    gap_m, box = gaps.min(), int(gaps.argmin())
+    if what == "start" and gap_m < _START_CLEAR_M:
         raise PlaceError(
-            f"world {name!r}: start {show(place)} is blocked: box {int(gaps.argmin())} is "
-            f"{gaps.min():.2f} m away, {_START_CLEAR_M:g} m needed"
+            f"{subject} is blocked: its distance from box {box} must be at least "
+            f"{_START_CLEAR_M:g} m, got {gap_m:.2f} m"
         )
-    if what == "goal" and gaps.min() <= 0.0:
-        raise PlaceError(
-            f"world {name!r}: goal {show(place)} is inside an obstacle (box {int(gaps.argmin())})"
-        )
+    if what == "goal" and gap_m <= 0.0:
+        raise PlaceError(f"{subject} is inside an obstacle (box {box})")
 
 
 def _inside(bounds_enu_m: Vector, place_enu_m: Vector) -> bool:
@@ -185,12 +177,12 @@ def load_world(
         ConfigError: The file cannot be used. Names file, line and key.
     """
     if seed < 0:
-        raise WorldError(f"seed {seed} is negative")
+        raise WorldError(f"seed must not be negative, got {seed}")
     start, goal = _place("start", start_enu_m), _place("goal", goal_enu_m)
     pair = _GENERATED.get(name_or_path) or _pair_of_spec(name_or_path)
     if pair is not None:
-        start = np.array(_DEFAULT_START_ENU_M) if start is None else start
-        goal = np.array(_DEFAULT_GOAL_ENU_M) if goal is None else goal
+        start = _DEFAULT_START_ENU_M if start is None else start
+        goal = _DEFAULT_GOAL_ENU_M if goal is None else goal
         return _generate(name_or_path, pair, seed, start, goal)
     if name_or_path in _SCENES:
         return _world_of_scene(_shipped(name_or_path), name_or_path, seed, start, goal)
@@ -237,11 +229,10 @@ class _Pair:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
-            raise WorldError(f"density {self.density:g} is not a probability (0 to 1)")
+            raise WorldError(f"density must be 0 to 1, got {self.density:g}")
         if not 0.0 < self.size_m <= _CELL_M:
-            raise WorldError(
-                f"size {self.size_m:g} m does not fit a cell (above 0, to {_CELL_M:g})"
-            )
+            limits = f"above 0 and at most {_CELL_M:g} m"
+            raise WorldError(f"size must be {limits}, got {self.size_m:g}")
 
 
 # Pairs of the paper (section VI-A): two for evaluation, four for training.
@@ -274,7 +265,7 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
     places = np.array([start, goal])
     if (np.ptp(places, axis=0) > _MAX_SPAN_M).any():
         raise PlaceError(
-            f"start {show(start)} and goal {show(goal)} must be at most "
+            f"start {format_place(start)} and goal {format_place(goal)} must be at most "
             f"{_MAX_SPAN_M:g} m apart along each axis"
         )
     low = np.floor((places.min(axis=0) - _MARGIN_M) / _CELL_M)[:2]
@@ -296,9 +287,8 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
 
 
 def _occupied(pair: _Pair, seed: int, i: int, j: int) -> bool:
-    stream = Stream.WORLD.generator(
-        seed, pair.family, f"{pair.density:g}", f"{pair.size_m:g}", i, j
-    )
+    numbers = f"{pair.density:g}", f"{pair.size_m:g}"
+    stream = Stream.WORLD.generator(seed, pair.family, *numbers, i, j)
     return bool(stream.random() < pair.density)
 
 
@@ -343,7 +333,7 @@ def _shipped(name: str) -> _Scene:
 def _world_of_scene(
     scene: _Scene, name: str, seed: int, start: Vector | None, goal: Vector | None
 ) -> World:
-    """A given start or goal replaces the scene's own."""
+    """Return the world of a scene; a start or goal (3,) replaces the scene's own."""
     boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():

@@ -131,7 +131,7 @@ def test_what_cannot_be_lifted_is_a_row(command_line, tmp_path, lawn):
     assert "tmr: not flown: vehicle 'weak' cannot lift its compute: 7.50 N of rotor pull" in out
     assert "dmr: not flown: " in out
     assert "7.5 N of thrust for 0.3 kg + 0.4 kg payload" in out
-    assert "at least 1.15 is needed" in out
+    assert "thrust-to-weight ratio must be at least 1.15, got" in out
 
 
 @pytest.mark.parametrize(

@@ -322,7 +322,7 @@ def test_a_vehicle_takes_any_frame_and_says_only_what_can_be_encoded(
         client.send_tick()
     Codec(1, 1).decode(far.receive(0.0))
     assert np.isfinite(simulation.vehicle.truth.position_ned_m).all()
-    if simulation.autopilot.restart_asked:
+    if simulation.autopilot.restart_requested:
         simulation.restart()
         client.rejoin()
 

@@ -113,7 +113,7 @@ def test_silent_companion_is_an_error_in_one_line(companion):
     vehicle.receive_tick()
     _, errors = vehicle.process.communicate(timeout=30)
     assert vehicle.process.returncode == 1
-    assert errors == "error: the companion gave no answer to 0 ms within 0.3 s\n"
+    assert errors == "error: the companion did not answer the tick at 0 ms within 0.3 s\n"
 
 
 def test_garbage_between_frames_changes_nothing(companion):

@@ -157,7 +157,7 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_keeps_the_old_files(
 ) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    with pytest.raises(RecordError, match="cannot write the truth log"):
+    with pytest.raises(RecordError, match="Not a directory"):
         referee().save(blocked / "truth")
 
     watcher = referee(WALL)

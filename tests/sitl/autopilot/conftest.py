@@ -91,7 +91,8 @@ class Bench:
 
     def tick(self):
         self.autopilot.fly()
-        self.vehicle.move(self.autopilot.setpoint, self.autopilot.motors_on, TICK_US * 1e-6)
+        now = self.autopilot.snapshot
+        self.vehicle.move(now.setpoint, now.motors_on, TICK_US * 1e-6)
         self.stamp_us += TICK_US
         self.autopilot.observe(self.stamp_us, self.vehicle)
         self.modes.append(self.mode)

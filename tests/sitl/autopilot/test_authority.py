@@ -27,12 +27,12 @@ def test_the_first_of_two_companions_commands_until_it_is_silent(flying, velocit
         flying.send(velocity_target(north=1.0))
         handle(autopilot, as_sender(velocity_target(north=-5.0), 7), link)
         flying.tick()
-        assert autopilot.setpoint[3] == 1.0
+        assert autopilot.snapshot.setpoint[3] == 1.0
     assert flying.texts().count((4, "Setpoints of 7/191 ignored: 245/190 commands")) == 1
     for _ in range(150):  # a second of silence, and a second until the failsafe ends
         handle(autopilot, as_sender(velocity_target(north=2.0), 7), link)
         flying.tick()
-    assert autopilot.setpoint[3] == 2.0
+    assert autopilot.snapshot.setpoint[3] == 2.0
     assert flying.mode is FlightMode.OFFBOARD
     assert (4, "7/191 commands instead of 245/190") in flying.texts()
 
@@ -79,7 +79,7 @@ def test_a_reboot_is_only_that_of_the_autopilot(make_bench, number):
     bench.run(5.0)
     bench.command(246, number)
     assert bench.acks() == [(246, 3)]
-    assert not bench.autopilot.restart_asked
+    assert not bench.autopilot.restart_requested
 
 
 def test_a_reboot_needs_a_vehicle_that_is_disarmed_or_lost(make_bench):
@@ -95,7 +95,7 @@ def test_a_reboot_needs_a_vehicle_that_is_disarmed_or_lost(make_bench):
     bench.commander.terminate("Collision: ground")
     bench.command(246, 1)
     assert bench.acks() == [(246, 0)]
-    assert bench.autopilot.restart_asked
+    assert bench.autopilot.restart_requested
 
 
 def test_in_lockstep_there_is_no_reboot(bench):

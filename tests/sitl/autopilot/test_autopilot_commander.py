@@ -231,7 +231,7 @@ def test_landing_disarms_two_seconds_later_and_shows_every_state(bench):
 def test_termination_stops_the_motors_for_good(flying):
     flying.commander.terminate("Collision: box 3 at 1.0 2.0 3.0")
     flying.run(0.1)
-    assert not flying.autopilot.motors_on
+    assert not flying.autopilot.snapshot.motors_on
     assert flying.texts() == [(0, "Collision: box 3 at 1.0 2.0 3.0")]
     assert flying.commander.system_status == dialect.MAV_STATE_FLIGHT_TERMINATION
     flying.run_until(lambda: not flying.commander.armed)

@@ -65,7 +65,7 @@ def messages(draw):
 
 
 def check_sane(bench):
-    assert not np.isinf(bench.autopilot.setpoint).any()
+    assert not np.isinf(bench.autopilot.snapshot.setpoint).any()
     assert np.isfinite(bench.vehicle.position_ned_m).all()
 
 

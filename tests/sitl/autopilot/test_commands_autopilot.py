@@ -128,4 +128,4 @@ def test_speed_change_is_the_cruise_parameter(flying):
 def test_termination_by_command(flying):
     flying.command(d.MAV_CMD_DO_FLIGHTTERMINATION, 1)
     flying.run(0.1)
-    assert not flying.autopilot.motors_on
+    assert not flying.autopilot.snapshot.motors_on

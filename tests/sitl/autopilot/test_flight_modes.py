@@ -66,7 +66,7 @@ def test_motors_spool_up_before_takeoff(bench):
     ready(bench)
     bench.command(TAKEOFF)
     armed_us = bench.stamp_us
-    bench.run_until(lambda: bench.autopilot.motors_on)
+    bench.run_until(lambda: bench.autopilot.snapshot.motors_on)
     assert bench.stamp_us - armed_us == pytest.approx(1e6, abs=4e4)
 
 
@@ -83,7 +83,7 @@ def test_armed_on_the_ground_the_motors_rest(bench, velocity_target):
     bench.command(dialect.MAV_CMD_DO_SET_MODE, 1, 6, 0)
     bench.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1)
     bench.run(3.0, lambda: velocity_target(north=2.0))
-    assert not bench.autopilot.motors_on
+    assert not bench.autopilot.snapshot.motors_on
     bench.run(2.0, lambda: velocity_target(down=-1.0))
     assert height(bench) > 1.0
 

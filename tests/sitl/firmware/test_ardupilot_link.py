@@ -55,15 +55,15 @@ def ends() -> Iterator[tuple[ArduPilotLink, ArduPilot]]:
 
 def test_it_is_heard_once_it_sends_its_outputs(ends: tuple[ArduPilotLink, ArduPilot]) -> None:
     link, firmware = ends
-    assert not link.heard(0.01)
+    assert not link.has_called(0.01)
     firmware.send(frame(0, 1000, 1000, 1000, 1000))
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
 
 
 def test_pulses_are_throttles(ends: tuple[ArduPilotLink, ArduPilot], resting: Truth) -> None:
     link, firmware = ends
     firmware.send(frame(0))
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
     firmware.send(frame(1, 1000, 1250, 1500, 2100))
     assert link.exchange(2500, resting).tolist() == [0.0, 0.25, 0.5, 1.0]
 
@@ -73,7 +73,7 @@ def test_recorded_frames_are_answers_in_their_order(
 ) -> None:
     link, firmware = ends
     firmware.send(ARDUPILOT_FIRST[0])
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
     outputs = []
     for data in (ARDUPILOT_FIRST[1], *ARDUPILOT_CLIMB):
         firmware.send(data)
@@ -92,7 +92,7 @@ def test_a_repeated_frame_is_no_answer(
     link, firmware = ends
     for data in (frame(0), frame(0), frame(0)):
         firmware.send(data)
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
     firmware.send(frame(1, 1500))
     assert link.exchange(2500, resting)[0] == 0.5
 
@@ -100,7 +100,7 @@ def test_a_repeated_frame_is_no_answer(
 def test_other_datagrams_are_ignored(ends: tuple[ArduPilotLink, ArduPilot], resting: Truth) -> None:
     link, firmware = ends
     firmware.send(frame(0))
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
     for data in (b"", b"hello", frame(1, 1900)[:-1], frame(1, 1900, magic=29569)):
         firmware.send(data)
     firmware.send(frame(1, 1500))
@@ -113,7 +113,7 @@ def test_the_state_is_what_its_parser_reads(ends: tuple[ArduPilotLink, ArduPilot
     flat[T_QUATERNION : T_QUATERNION + 4] = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     link, firmware = ends
     firmware.send(frame(0))
-    assert link.heard(2.0)
+    assert link.has_called(2.0)
     firmware.send(frame(1))
     link.exchange(1_002_500, Truth(flat))
     text = firmware.state()
@@ -134,6 +134,6 @@ def test_an_ardupilot_that_stops_is_told(
     monkeypatch.setattr(ardupilot, "ANSWER_LIMIT_S", 0.05)
     link, firmware = ends
     firmware.send(frame(0))
-    assert link.heard(2.0)
-    with pytest.raises(VehicleProcessError, match="gave no outputs"):
+    assert link.has_called(2.0)
+    with pytest.raises(VehicleProcessError, match="sent no outputs"):
         link.exchange(2500, resting)

@@ -30,9 +30,9 @@ def _link(wire: Wire) -> tuple[Px4Link, socket.socket]:
 
 def test_px4_is_heard_once_it_has_said_hello(wire: Wire) -> None:
     link, theirs = _link(wire)
-    assert not link.heard(0.0)
+    assert not link.has_called(0.0)
     theirs.sendall(PX4_HELLO)
-    assert link.heard(0.0)
+    assert link.has_called(0.0)
 
 
 def test_motor_outputs_are_those_of_the_armed_frames(wire: Wire, resting: Truth) -> None:
