@@ -1,7 +1,8 @@
-"""What the programs of the vehicle's side share: types of options, signals and exit codes."""
+"""Types of options, options and signals that the programs of the vehicle's side share."""
 
 from __future__ import annotations
 
+import functools
 import math
 import signal
 from collections.abc import Callable
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+
+from mavfi_cli.core.option_types import Number
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True}
 Triple = tuple[float, ...]
@@ -44,34 +47,13 @@ class _Size(click.ParamType[tuple[int, int]]):
         return int(columns), int(rows)
 
 
-class Positive(click.ParamType[float]):
-    """A finite number above 0."""
-
-    name = "X"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the number, or fail with a usage error."""
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not 0.0 < number < math.inf:
-            self.fail(f"{value!r} is not a number above 0", param, ctx)
-        return number
-
-
+POSITIVE = Number(1.0e-6, 1.0e6)
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def _options(*each: Decorator) -> Decorator:
+def _options(*options: Decorator) -> Decorator:
     """Return one decorator for several options, in their order."""
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(each):
-            command = option(command)
-        return command
-
-    return decorate
+    return lambda command: functools.reduce(lambda f, option: option(f), options[::-1], command)
 
 
 def complete_world(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
@@ -110,8 +92,8 @@ def camera_options(prefix: str = "") -> Decorator:
             help="Size of the depth image, pixels.",
         ),
         click.option(
-            f"--{prefix}rate", "camera_rate_hz", type=Positive(), default=10.0,
-            help="Frame rate for clients that ask for no interval, Hz.",
+            f"--{prefix}rate", "camera_rate_hz", type=POSITIVE, default=10.0,
+            help="Frame rate for clients that request no interval, Hz.",
         ),
         click.option(
             "--camera-heartbeat", "camera_heartbeat_hz", type=click.FloatRange(0.0, 50.0),
@@ -134,8 +116,8 @@ signing = _options(
 
 
 def stop_on_signals() -> Callable[[], bool]:
-    """Return a function that tells whether SIGINT or SIGTERM has arrived from now on."""
-    seen: list[int] = []
+    """Handle SIGINT and SIGTERM. Return a function that returns True once one has arrived."""
+    received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, _frame: seen.append(signum))
-    return lambda: bool(seen)
+        signal.signal(number, lambda signum, _frame: received.append(signum))
+    return lambda: bool(received)

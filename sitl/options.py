@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
-from mavfi_cli.core.output_paths import OutFolder
+from mavfi_cli.core.option_types import OutFolder
 from sitl.autopilot.telemetry import Preset
-from sitl.command_line import CONTEXT, Positive, Triple, camera_options, signing, world_and_vehicle
+from sitl.command_line import CONTEXT, POSITIVE, Triple, camera_options, signing, world_and_vehicle
 
 _FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
-# As a PX4 SITL: to the companion's port, to the ground station's, and TCP for whoever calls.
+# As a PX4 SITL: to the ports of companion and ground station, and a TCP server for any client.
 _DEFAULT_LINKS = (
     "onboard=udpout:127.0.0.1:14540",
     "gcs=udpout:127.0.0.1:14550",
@@ -42,12 +42,12 @@ class _Link(click.ParamType[tuple[Preset, str]]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """What is simulated: world, vehicle, camera and autopilot.
+    """World, vehicle, camera and autopilot of a simulation.
 
     Attributes:
         camera_size: Columns and rows.
         firmware_kind: Real firmware that flies; None for our own autopilot.
-        firmware: Its SITL binary; None if somebody else starts it and sends to `firmware_link`.
+        firmware: Its SITL binary; None if the user starts it and has it send to `firmware_link`.
         trusted: MAVLink systems that may command; empty for all.
     """
 
@@ -69,7 +69,7 @@ class VehicleSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerOptions:
-    """The parsed options of the user."""
+    """The parsed command line."""
 
     setup: VehicleSetup
     links: Sequence[tuple[Preset, str]]
@@ -93,11 +93,11 @@ class ServerOptions:
 @click.option("--lockstep", is_flag=True, help="Wait for the companion on --fd at every tick.")
 @click.option("--realtime", is_flag=True, help="The same as --speed 1.")
 @click.option(
-    "--speed", type=Positive(),
+    "--speed", type=POSITIVE,
     help="Speed, in times real time  [1; in lockstep as fast as possible].",
 )  # fmt: skip
 @click.option(
-    "--answer-limit", "answer_limit_s", type=Positive(), default=120.0,
+    "--answer-limit", "answer_limit_s", type=POSITIVE, default=120.0,
     help="Time that the companion in lockstep may take for a tick, s.",
 )  # fmt: skip
 @click.option("--truth", type=OutFolder(), help="Folder for the referee's truth.")
@@ -134,13 +134,13 @@ def _sitl() -> None:
 def parse(arguments: Sequence[str]) -> ServerOptions:
     """Parse a command line.
 
-    Raises click.UsageError if it is not valid, and click.exceptions.Exit if it asks for help.
+    Raises click.UsageError if it is not valid, and click.exceptions.Exit if it requests help.
     """
     given = _sitl.make_context("mavfi sitl", list(arguments)).params
     hil, backend, realtime = (given.pop(name) for name in ("hil", "json_backend", "realtime"))
     kind, lockstep, fd = hil or backend, given["lockstep"], given["fd"]
     links, speed = given.pop("links"), given.pop("speed")
-    names = [each.name for each in fields(VehicleSetup) if each.name in given]
+    names = [field.name for field in fields(VehicleSetup) if field.name in given]
     setup = VehicleSetup(firmware_kind=kind, **{name: given.pop(name) for name in names})
     for is_wrong, problem in (
         (hil and backend, "--hil and --json exclude each other"),

@@ -31,7 +31,7 @@ from mavfi_cli.cli.parameters import (
     UPSETS,
     Number,
 )
-from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
 from mavfi_cli.report.table import FORMATS

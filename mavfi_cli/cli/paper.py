@@ -11,8 +11,8 @@ from typing import Any
 import click
 
 from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
-from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS, Number
-from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS
+from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, note
 
 _what = partial(click.option, cls=GroupedOption, group="Missions")

@@ -15,20 +15,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from mavfi_cli.core.files import PACKAGE
-from mavfi_cli.core.output_paths import OutFolder
+from mavfi_cli.core.option_types import Number, OutFolder
 
 # Numbers ------------------------------------------------------------------------------------------
-
-
-class Number(click.FloatRange):
-    """A finite number within two bounds; click's own range accepts NaN."""
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """Convert as click does, and reject NaN."""
-        number = float(super().convert(value, param, ctx))
-        return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
 JOBS = click.IntRange(1, 1024)

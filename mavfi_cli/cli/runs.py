@@ -11,7 +11,7 @@ import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import NUMBER, OUT, RunPath
-from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
 

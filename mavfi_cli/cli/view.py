@@ -12,7 +12,7 @@ from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import RunPath
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import reading
-from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, note
 
 if TYPE_CHECKING:

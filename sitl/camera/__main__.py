@@ -12,7 +12,7 @@ import click
 import numpy as np
 
 from mavfi_cli.core.errors import LinkLost
-from mavfi_cli.core.output_paths import OutFolder
+from mavfi_cli.core.option_types import OutFolder
 from mavfi_cli.core.terminal import exit_code, note
 from mavfi_cli.link.codec import signing_from_file
 from sitl.camera.component import Camera

@@ -31,7 +31,6 @@ _MAX_RANGE_M = 25.5
 
 _NEAR_M = 1e-6
 _TOUCHING_M = 1e-3
-_INFINITY = math.inf
 _EDGES = np.array(
     [[a, a | bit] for bit in (1, 2, 4) for a in range(8) if not a & bit], dtype=np.int64
 )  # (12, 2) pairs of corners that share an edge; bit 0 is x, 1 is y, 2 is z
@@ -63,7 +62,7 @@ def render_depth(
     image = np.empty((rows, columns), dtype=np.uint8)
     boxes = np.ascontiguousarray(boxes_enu_m, dtype=np.float64)
     rotation = rotation_matrix(quaternion_flu_enu)
-    _render(boxes, position_enu_m, rotation, focal_px, _EDGES, depth, image)
+    _render(boxes, position_enu_m, rotation, focal_px, depth, image)
     return image
 
 
@@ -73,7 +72,6 @@ def _render(
     position: Vector,
     rotation: Vector,
     focal_px: float,
-    edges: NDArray[np.int64],
     depth: Vector,
     image: Image,
 ) -> None:
@@ -91,7 +89,7 @@ def _render(
         elif corners[:, 0].max() < 0.0 or corners[:, 0].min() > _MAX_RANGE_M:
             continue
         else:
-            _window(corners, edges, focal_px, depth.shape, window)
+            _window(corners, focal_px, depth.shape, window)
         _paint(boxes[box], position, rotation, focal_px, window, depth)
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
@@ -109,7 +107,7 @@ def _ground(position: Vector, rotation: Vector, focal_px: float, depth: Vector) 
         for column in range(columns):
             left = (columns / 2.0 - column - 0.5) / focal_px
             dz = rotation[2, 0] + rotation[2, 1] * left + rotation[2, 2] * up
-            depth[row, column] = max(0.0, position[2]) / -dz if dz < 0.0 else _INFINITY
+            depth[row, column] = max(0.0, position[2]) / -dz if dz < 0.0 else math.inf
 
 
 @compiled
@@ -135,21 +133,17 @@ def _touches(box: Vector, position: Vector) -> bool:
 
 @compiled
 def _window(
-    corners: Vector,
-    edges: NDArray[np.int64],
-    focal_px: float,
-    shape: tuple[int, int],
-    window: NDArray[np.int64],
+    corners: Vector, focal_px: float, shape: tuple[int, int], window: NDArray[np.int64]
 ) -> None:
-    """Return the rows and columns (first, end, first, end) that can see the box, plus a pixel.
+    """Write the rows and columns (first, end, first, end) that can see the box, plus a pixel.
 
     The part of the box beyond the near plane is convex. Its vertices are the corners in front and
     the cut edges, so their projections bound it.
     """
     rows, columns = shape
-    top, bottom, first, last = _INFINITY, -_INFINITY, _INFINITY, -_INFINITY
-    for edge in range(edges.shape[0]):
-        a, b = corners[edges[edge, 0]], corners[edges[edge, 1]]
+    top, bottom, first, last = math.inf, -math.inf, math.inf, -math.inf
+    for edge in range(_EDGES.shape[0]):
+        a, b = corners[_EDGES[edge, 0]], corners[_EDGES[edge, 1]]
         if a[0] < _NEAR_M and b[0] < _NEAR_M:
             continue
         for end in range(2):
@@ -190,7 +184,7 @@ def _paint(
                 below, above = box[axis] - position[axis], box[axis + 3] - position[axis]
                 if slope == 0.0:
                     if below > 0.0 or above < 0.0:
-                        enter = _INFINITY
+                        enter = math.inf
                         break
                     continue
                 near, far = below / slope, above / slope

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from mavfi_cli.core.files import require_output, write_atomically, write_text
-from mavfi_cli.core.output_paths import OutFile
+from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, exit_code
 from sitl.command_line import CONTEXT, Triple, complete_world, places
 from sitl.world.plan import DEFAULT_CLEARANCE_M, check_world, world_svg

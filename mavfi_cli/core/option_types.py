@@ -1,4 +1,4 @@
-"""Types of options: files and folders that a command writes."""
+"""Types of options: bounded numbers, and files and folders that a command writes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ import click
 
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import require_folder, require_output
+
+
+class Number(click.FloatRange):
+    """A finite number within two bounds; click's own range accepts NaN."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Convert as click does, and reject NaN."""
+        number = float(super().convert(value, param, ctx))
+        return self.fail(f"{value} is not a number.", param, ctx) if number != number else number
 
 
 class _OutPath(click.Path):
