@@ -143,13 +143,13 @@ def parse(arguments: Sequence[str]) -> ServerOptions:
     names = [field.name for field in fields(VehicleSetup) if field.name in given]
     setup = VehicleSetup(firmware_kind=kind, **{name: given.pop(name) for name in names})
     for is_wrong, problem in (
-        (hil and backend, "--hil and --json exclude each other"),
+        (hil and backend, "--hil cannot be combined with --json"),
         (setup.firmware and not kind, "--firmware needs --hil or --json"),
-        (kind and setup.trusted, "--trust is for our own autopilot"),
-        (kind and lockstep, "--lockstep is for our own autopilot"),
-        (realtime and speed is not None, "--realtime and --speed exclude each other"),
+        (kind and setup.trusted, "--trust cannot be combined with --hil or --json"),
+        (kind and lockstep, "--lockstep cannot be combined with --hil or --json"),
+        (realtime and speed is not None, "--realtime cannot be combined with --speed"),
         (lockstep and fd is None, "--lockstep needs --fd"),
-        (lockstep and links, "--lockstep serves the companion on --fd only, without --link"),
+        (lockstep and links, "--lockstep cannot be combined with --link"),
     ):
         if is_wrong:
             raise click.UsageError(problem)

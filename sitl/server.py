@@ -1,8 +1,8 @@
 """The server: a simulation in lockstep with one companion, or in real time for any clients.
 
-In lockstep, simulated time stands still while the companion computes. Each control tick everything
-due goes out in one send that ends with LOCAL_POSITION_NED. The next tick begins when the companion
-has sent SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms.
+In lockstep, simulated time stands still while the companion computes. At every control tick, all
+due messages are sent at once, LOCAL_POSITION_NED last. The next tick begins when the companion has
+sent SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms.
 """
 
 from __future__ import annotations

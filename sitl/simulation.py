@@ -96,7 +96,7 @@ class Simulation:
         self.autopilot.parameters.restore(before.parameters)
 
     def handle(self, message: Any, link: Link) -> None:
-        """Give the autopilot a message of a client."""
+        """Pass a client's message to the autopilot."""
         assert isinstance(self.autopilot, Autopilot)
         services.handle(self.autopilot, message, link)
 

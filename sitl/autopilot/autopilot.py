@@ -20,7 +20,7 @@ from sitl.vehicle.truth import Truth
 COMPONENT = 1
 _PARAMETERS_A_TICK = 20  # about 1000 per second, as in PX4
 _STRAIGHT_DOWN_MPS = 0.3
-_TEXTS_A_TICK = 10  # further texts are lost, so that a flood of mistakes is not one of texts
+_TEXTS_A_TICK = 10  # further texts are dropped, so that bad messages cannot cause a flood of them
 
 
 class Autopilot(Links):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,15 +24,12 @@ _NOT_REQUESTABLE = dialect.MAVLINK_MSG_ID_MISSION_CURRENT  # as in PX4, though s
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
+# Coordinate frames and bits of the type mask of a setpoint.
 _LOCAL_NED, _BODY_NED = 1, 8
 _ABSOLUTE_ALTITUDE = (0, 5)
 _ABOVE_HOME = (3, 6, 10, 11)  # includes above terrain, because the ground is flat
-_IGNORE_POSITION = 0x0007
-_IGNORE_VELOCITY = 0x0038
-_IGNORE_ACCELERATION = 0x01C0
-_FORCE = 0x0200
-_IGNORE_YAW = 0x0400
-_IGNORE_YAW_RATE = 0x0800
+_IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_ACCELERATION = 0x0007, 0x0038, 0x01C0
+_FORCE, _IGNORE_YAW, _IGNORE_YAW_RATE = 0x0200, 0x0400, 0x0800
 _STEEPEST = 100.0  # m/s^2 or rad/s
 
 
@@ -58,7 +56,7 @@ def _acknowledge(message: Any, number: int, result: Result) -> Any:
 
 
 def _refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer a sender that may not command: commands are denied, a parameter keeps its value."""
+    """Answer a sender that is not trusted: deny a command, send a parameter's present value."""
     name = message.get_type()
     if name == "SET_MODE" or name.startswith("COMMAND_"):
         number = getattr(message, "command", dialect.MAV_CMD_DO_SET_MODE)
@@ -88,13 +86,12 @@ def _horizontal(autopilot: Autopilot, message: Any) -> tuple[float, float] | Non
 
 def _down(autopilot: Autopilot, message: Any) -> float:
     """Return a command's height as local down, m; NaN if it has none."""
-    is_long = message.get_type() == "COMMAND_LONG"
-    altitude_m = message.param7 if is_long else message.z
+    now, is_long = autopilot.snapshot, message.get_type() == "COMMAND_LONG"
+    altitude_m = float(message.param7 if is_long else message.z)
     if not abs(altitude_m) < _FARTHEST_M:
         return math.nan
-    if not is_long and message.frame in _ABOVE_HOME:
-        return float(autopilot.snapshot.home_ned_m[2]) - float(altitude_m)
-    return autopilot.snapshot.origin.altitude_amsl_m - float(altitude_m)
+    is_above_home = not is_long and message.frame in _ABOVE_HOME
+    return float(now.home_ned_m[2] if is_above_home else now.origin.altitude_amsl_m) - altitude_m
 
 
 def _arm_disarm(autopilot: Autopilot, message: Any, _link: Link) -> Result | None:
@@ -347,8 +344,7 @@ def _manual_control(autopilot: Autopilot, message: Any, _link: Link) -> None:
 def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
     """Start to list all parameters: the hash first, then a few per tick."""
     link.send(autopilot.parameters.hash_message())
-    link.parameters_left.clear()
-    link.parameters_left.extend(range(len(autopilot.parameters)))
+    link.parameters_left = deque(range(len(autopilot.parameters)))
 
 
 def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
@@ -378,7 +374,7 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Accept to clear the mission, also by an empty upload. No item and no upload exists."""
+    """Accept the clearing of the mission, which an empty upload is, too. Refuse anything else."""
     result = dialect.MAV_MISSION_ACCEPTED
     if message.get_type().startswith("MISSION_REQUEST"):
         result = dialect.MAV_MISSION_INVALID_SEQUENCE
@@ -390,10 +386,8 @@ def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
 def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
     """Answer with a NAK, as there are no files, to stop the client's retries."""
     sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
-    reply = struct.pack(
-        "<HBBBBBxIB", (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0,
-        _FTP_FILE_NOT_FOUND,
-    ).ljust(251, b"\0")  # fmt: skip
+    head = (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0, _FTP_FILE_NOT_FOUND
+    reply = struct.pack("<HBBBBBxIB", *head).ljust(251, b"\0")
     link.send(dialect.MAVLink_file_transfer_protocol_message(0, *_sender(message), reply))
 
 

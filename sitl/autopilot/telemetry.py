@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
+from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
 from sitl.autopilot.commander import Commander, FlightMode
 from sitl.autopilot.parameters import Parameters
 from sitl.geodesy import Origin
+from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.truth import Truth
 
 TICK_US = 20_000  # period of the control loop
@@ -85,10 +86,6 @@ class Snapshot:
         """Return the altitude above sea level of a local height, m."""
         return self.origin.altitude_amsl_m - down_m
 
-    def in_body(self, vector_ned: Vector) -> Vector:
-        """Turn a vector (3,) from NED into the body's FRD."""
-        return rotate(rotation_matrix(self.truth.quaternion_frd_ned).T, vector_ned)
-
     @property
     def thrust(self) -> float:
         """Mean motor command; added one by one, as `sum` rounds otherwise from Python 3.12 on."""
@@ -137,7 +134,6 @@ _ESTIMATOR_GOOD, _ESTIMATOR_NO_POSITION = 0x33F, 0x027
 _ZERO_MASKS = ((0, 0x007), (3, 0x038))
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
 _STANDARD_PRESSURE_HPA = 1013.25
-_GRAVITY_MPS2 = 9.80665
 
 
 def _heartbeat(s: Snapshot) -> Any:
@@ -231,11 +227,11 @@ def _position_target_local_ned(s: Snapshot) -> Any:
 
 def _highres_imu(s: Snapshot) -> Any:
     """Specific force and rates in FRD, without a magnetometer."""
-    force_ned = s.truth.acceleration_ned_mps2 - np.array([0.0, 0.0, _GRAVITY_MPS2])
+    force_ned = s.truth.acceleration_ned_mps2 - np.array([0.0, 0.0, GRAVITY_MPS2])
     height = s.amsl_m(float(s.truth.position_ned_m[2]))
     ratio = max(1.0 - 2.25577e-5 * height, 0.0)  # ISA troposphere
     return dialect.MAVLink_highres_imu_message(
-        s.stamp_us, *s.in_body(force_ned).tolist(),
+        s.stamp_us, *s.truth.in_body(force_ned).tolist(),
         *s.truth.rates_frd_radps.tolist(), 0.0, 0.0, 0.0, _STANDARD_PRESSURE_HPA * ratio**5.25588,
         0.0, height, 25.0, 0x1A3F & ~0x1C0,
     )  # fmt: skip
@@ -285,7 +281,7 @@ def _odometry(s: Snapshot) -> Any:
     return dialect.MAVLink_odometry_message(
         s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD,
         *truth.position_ned_m.tolist(), truth.quaternion_frd_ned.tolist(),
-        *s.in_body(truth.velocity_ned_mps).tolist(), *truth.rates_frd_radps.tolist(),
+        *truth.in_body(truth.velocity_ned_mps).tolist(), *truth.rates_frd_radps.tolist(),
         _UNKNOWN_COVARIANCE, _UNKNOWN_COVARIANCE, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100,
     )  # fmt: skip
 

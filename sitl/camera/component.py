@@ -196,7 +196,7 @@ class Camera:
         return [captured, handshake, *data]
 
     def _command(self, message: Message) -> list[Message]:
-        """Requested messages come before the acknowledgement."""
+        """Execute a command. Return the requested messages, then the acknowledgement."""
         number = int(message.command)
         answers: list[Message] = []
         if number == dialect.MAV_CMD_REQUEST_MESSAGE or number in _LEGACY_REQUESTS:

@@ -27,7 +27,6 @@ from sitl.vehicle.truth import Truth
 
 PORT = 9002
 _LOOPBACK = "127.0.0.1"
-STEP_S = 0.0025  # ArduCopter's main loop runs at 400 Hz
 _SERVOS = struct.Struct("<HHI16H")
 _MAGIC = 18458
 _LEAST_US, _SPAN_US = 1000.0, 1000.0
@@ -42,7 +41,7 @@ class ArduPilotLink:
     Raises LinkError if the port cannot be opened.
     """
 
-    step_s = STEP_S
+    step_s = 0.0025  # ArduCopter's main loop runs at 400 Hz
     settle_s = 0.0  # its boot takes the same simulated time in every flight
     echoes = False
 

@@ -1,4 +1,4 @@
-"""Real firmware in the place of the autopilot: its messages go to the clients, theirs to it."""
+"""Real firmware in place of the autopilot: exchanges messages between it and the clients."""
 
 from __future__ import annotations
 
@@ -137,7 +137,8 @@ class FirmwareAutopilot(Links):
         while self._receive(0.0):
             self._heard_us = stamp_us
         if stamp_us - self._heard_us > _SILENCE_US:
-            raise VehicleProcessError("the firmware sends no MAVLink")
+            limit_s = _SILENCE_US / 1e6
+            raise VehicleProcessError(f"the firmware sent no MAVLink for {limit_s:g} s")
 
     def _receive(self, timeout_s: float) -> bool:
         try:
@@ -219,7 +220,7 @@ def _plain(line: str) -> str:
 
 
 class FirmwareProcess:
-    """A running firmware. Its folder and everything that it started end with it.
+    """A running firmware. Its folder and its child processes end with it.
 
     It works in the folder, with additions to the environment. Raises VehicleProcessError if it
     cannot be started.

@@ -28,8 +28,6 @@ from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.truth import Truth
 
 PORT = 4560
-STEP_S = 0.004  # PX4's SITL takes inertial samples at 250 Hz
-SETTLE_S = 12.0  # its boot ends at another time in every flight, its estimator settles by then
 _MAG_STEPS = 5  # 50 Hz
 _BARO_STEPS = 10  # 25 Hz
 _FIX_STEPS = 25  # 10 Hz
@@ -66,8 +64,8 @@ mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
 class Px4Link:
     """One PX4 on the simulator link. The port of its connection numbers the instances of PX4."""
 
-    step_s = STEP_S
-    settle_s = SETTLE_S
+    step_s = 0.004  # PX4's SITL takes inertial samples at 250 Hz
+    settle_s = 12.0  # its boot ends at another time in every flight, its estimator settles by then
     echoes = True
 
     def __init__(self, transport: Transport, sensors: Sensors, port: int = PORT) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
+from mavfi_cli.core.frames import Vector
 from sitl.geodesy import Origin
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.truth import Truth
@@ -49,13 +49,12 @@ class Sensors:
         """Return rates (3,), rad/s, and specific force (3,), m/s^2, both in body FRD."""
         noise = self._noise.standard_normal(6)
         rates = truth.rates_frd_radps + GYRO_RADPS * noise[:3]
-        felt_ned = truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2
-        force = rotate(rotation_matrix(truth.quaternion_frd_ned).T, felt_ned)
+        force = truth.in_body(truth.acceleration_ned_mps2 - _GRAVITY_NED_MPS2)
         return rates, force + ACCELEROMETER_MPS2 * noise[3:]
 
     def magnetic_field(self, truth: Truth) -> Vector:
         """Return the magnetic field (3,), body FRD, gauss."""
-        field = rotate(rotation_matrix(truth.quaternion_frd_ned).T, FIELD_NED_GAUSS)
+        field = truth.in_body(FIELD_NED_GAUSS)
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
     def barometer(self, truth: Truth) -> tuple[float, float]:

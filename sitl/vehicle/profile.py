@@ -31,14 +31,9 @@ _MIDDLE = 0.3
 _LARGEST = 1e12  # of all values, in their units
 _ANY_SIGN = ("camera_mount_flu_m", "rotor.height_m", "energy.")
 _MAY_BE_ZERO = (
-    "extra_payload_kg",
-    "drag.linear_nspm",
-    "drag.quadratic_ns2pm2",
-    "gear.friction",
-    "rotor.motor_no_load_current_a",
-    "battery.resistance_ohm",
-    "battery.avionics_w",
-)
+    "extra_payload_kg", "drag.linear_nspm", "drag.quadratic_ns2pm2", "gear.friction",
+    "rotor.motor_no_load_current_a", "battery.resistance_ohm", "battery.avionics_w",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,20 +192,15 @@ class VehicleProfile:
     def __post_init__(self) -> None:
         for key, value in _numbers(self):
             _check_number(key, value)
-        self._check_lift()
-        self._check_ranges()
-
-    def _check_lift(self) -> None:
-        ratio = self.max_thrust_n / (self.total_mass_kg * GRAVITY_MPS2)
+        weight_n = self.total_mass_kg * GRAVITY_MPS2
+        ratio = self.max_thrust_n / weight_n
         if not ratio >= MIN_THRUST_TO_WEIGHT:
             raise ConfigError(
                 f"vehicle {self.name!r} cannot fly: {self.max_thrust_n:.1f} N of thrust for "
-                f"{self.mass_kg:g} kg + {self.extra_payload_kg:g} kg payload "
-                f"({self.total_mass_kg * GRAVITY_MPS2:.1f} N). The thrust-to-weight ratio must be "
-                f"at least {MIN_THRUST_TO_WEIGHT:g}, got {ratio:.2f}"
+                f"{self.mass_kg:g} kg + {self.extra_payload_kg:g} kg payload ({weight_n:.1f} N). "
+                f"The thrust-to-weight ratio must be at least {MIN_THRUST_TO_WEIGHT:g}, "
+                f"got {ratio:.2f}"
             )
-
-    def _check_ranges(self) -> None:
         for key, value, most in (
             ("limits.tilt_deg", self.limits.tilt_deg, LARGEST_TILT_DEG),
             ("battery.drive_efficiency", self.battery.drive_efficiency, 1.0),

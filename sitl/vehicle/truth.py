@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mavfi_cli.core.frames import Vector
+from mavfi_cli.core.frames import Vector, rotate, rotation_matrix
 
 T_STAMP = 0
 T_POSITION = 1  # NED, m
@@ -72,6 +72,10 @@ class Truth:
             math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
             math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
         )
+
+    def in_body(self, vector_ned: Vector) -> Vector:
+        """Turn a vector (3,) from NED into the body's FRD."""
+        return rotate(rotation_matrix(self.quaternion_frd_ned).T, vector_ned)
 
     def wreck(self) -> Truth:
         """Return the state of a vehicle that stays where it is with its motors stopped."""

@@ -132,7 +132,7 @@ def test_a_silent_firmware_is_told(
     theirs.sendall(PX4_HEARTBEAT)
     autopilot.observe(20_000, resting)
     autopilot.observe(60_000_000, resting)
-    with pytest.raises(VehicleProcessError, match="sends no MAVLink"):
+    with pytest.raises(VehicleProcessError, match="sent no MAVLink for 60 s"):
         autopilot.observe(60_100_000, resting)
 
 
