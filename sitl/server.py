@@ -208,10 +208,8 @@ def _await_answer(
 
 
 def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
-    return any(
-        message.get_msgId() == _SETPOINT and message.time_boot_ms == stamp_ms
-        for message in messages
-    )
+    setpoints = (message for message in messages if message.get_msgId() == _SETPOINT)
+    return any(setpoint.time_boot_ms == stamp_ms for setpoint in setpoints)
 
 
 class EmbeddedVehicle:

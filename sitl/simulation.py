@@ -70,11 +70,9 @@ class Simulation:
     def _set_up(self) -> None:
         world, profile = self._world, self._profile
         to_goal = world.goal_enu_m - world.start_enu_m
+        yaw_rad = math.atan2(to_goal[1], to_goal[0])
         self.vehicle = Quadrotor(
-            profile,
-            position_enu_m=world.start_enu_m,
-            yaw_enu_rad=math.atan2(to_goal[1], to_goal[0]),
-            dt_s=self._step_s,
+            profile, position_enu_m=world.start_enu_m, yaw_enu_rad=yaw_rad, dt_s=self._step_s
         )
         self.autopilot: Autopilot | FirmwareAutopilot = self._firmware_autopilot or Autopilot(
             self.vehicle.truth, system_id=self._system_id, trusted=self._trusted

@@ -29,9 +29,8 @@ from mavfi_cli.cli.parameters import (
     SCALE,
     SHARE,
     UPSETS,
-    Number,
 )
-from mavfi_cli.core.option_types import OutFile
+from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, note
 from mavfi_cli.report.drawing import PICTURES
 from mavfi_cli.report.table import FORMATS

@@ -27,10 +27,10 @@ from mavfi_cli.cli.parameters import (
     SEED,
     SITE,
     WORLD,
-    Number,
 )
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.option_types import Number
 from mavfi_cli.core.terminal import echo, note
 
 if TYPE_CHECKING:

@@ -237,11 +237,6 @@ class Commander:
             self._auto_disarm()
         self._watch_battery(truth.battery_remaining)
 
-    def takeoff_finished(self) -> None:
-        """Change from AUTO.TAKEOFF to AUTO.LOITER at the take-off height."""
-        if self.mode is FlightMode.TAKEOFF:
-            self.user_mode = FlightMode.LOITER
-
     def _detect_landing(self, truth: Truth, *, wants_up: bool) -> None:
         """Update `landed`, with PX4's LNDMC_TRIG_TIME as hysteresis."""
         before = self.landed

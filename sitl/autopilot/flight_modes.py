@@ -115,7 +115,7 @@ def _take_off(target_down_m: float) -> Guidance:
             place = np.array(now.truth.position_ned_m)
             place[2] = min(target_down_m, float(place[2]) + 0.5)
             now.hold = place, math.nan
-            now.commander.takeoff_finished()
+            now.commander.user_mode = FlightMode.LOITER
             return
         if now.spooled_up:
             climbing_s += now.elapsed_s
@@ -190,7 +190,7 @@ def _return_height_m(now: Snapshot) -> float:
 
 
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
-    """OFFBOARD: the newest accepted setpoint; an axis that it leaves free stands still."""
+    """OFFBOARD: the newest accepted setpoint, with zero velocity along an axis without a value."""
     out[:] = now.offboard
     out[3:6][np.isnan(out[:3]) & np.isnan(out[3:6])] = 0.0
     _limit_velocity(out, now.parameters)

@@ -182,11 +182,12 @@ class Camera:
             _PAYLOAD_BYTES, 100,
         )  # fmt: skip
         padded = pixels.ljust(packets * _PAYLOAD_BYTES, b"\0")
+        starts = range(0, len(padded), _PAYLOAD_BYTES)
         data = [
             dialect.MAVLink_encapsulated_data_message(
-                number, padded[number * _PAYLOAD_BYTES : (number + 1) * _PAYLOAD_BYTES]
+                number, padded[start : start + _PAYLOAD_BYTES]
             )
-            for number in range(packets)
+            for number, start in enumerate(starts)
         ]
         self.images += 1
         if self._frames_left:

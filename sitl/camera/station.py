@@ -406,15 +406,13 @@ class Station:
             return
         self._request_at_s = self._clock() + _REQUEST_AGAIN_S
         present = self._tracker.has_quaternion, self._tracker.has_position, self._placed
-        self._send(
-            [
-                dialect.MAVLink_command_long_message(
-                    self._autopilot, *request, _POSE_INTERVAL_US, *[0.0] * 5
-                )
-                for request, is_present in zip(_REQUESTS, present, strict=True)
-                if not is_present
-            ]
-        )
+        values = _POSE_INTERVAL_US, *[0.0] * 5
+        requests = [
+            dialect.MAVLink_command_long_message(self._autopilot, *request, *values)
+            for request, is_present in zip(_REQUESTS, present, strict=True)
+            if not is_present
+        ]
+        self._send(requests)
 
     def _send_text(self, text: str, text_id: int) -> None:
         self._send([*text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), text_id)])

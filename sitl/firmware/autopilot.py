@@ -90,7 +90,7 @@ class FirmwareAutopilot(Links):
         return link.take()
 
     def forget(self) -> None:
-        """Drop what no client has collected."""
+        """Drop the messages that no client has collected."""
         for link in self._links:
             link.outbox.clear()
 
@@ -130,7 +130,7 @@ class FirmwareAutopilot(Links):
             self._receive(_ECHO_LIMIT_S)
 
     def observe(self, stamp_us: int, _truth: Truth) -> None:
-        """Take everything that the firmware has sent up to a stamp.
+        """Handle all messages that the firmware has sent up to a stamp.
 
         Raises VehicleProcessError if it closed its link, or has been silent for a minute.
         """

@@ -352,11 +352,8 @@ def _torque(
             state[S_RATE_INTEGRAL + axis] = _clip(
                 integral, -RATE_INTEGRAL_LIMIT_RADPS2, RATE_INTEGRAL_LIMIT_RADPS2
             )
-        angular[axis] = (
-            gains[G_RATE_P + axis] * error
-            + state[S_RATE_INTEGRAL + axis]
-            - gains[G_RATE_D + axis] * derivative
-        )
+        angular[axis] = gains[G_RATE_P + axis] * error + state[S_RATE_INTEGRAL + axis]
+        angular[axis] -= gains[G_RATE_D + axis] * derivative
     p, q, r = measurement[T_RATES : T_RATES + 3]
     ix, iy, iz = gains[G_INERTIA : G_INERTIA + 3]
     result = np.empty(3)

@@ -1,4 +1,4 @@
-"""The plan of a world: a check that it is flyable, and its drawing from above as SVG.
+"""Checks that a world can be flown, and draws it from above as SVG.
 
 The path is searched on an 8-connected flat grid at the goal's height. A cell is free if its centre
 keeps the clearance from every box that reaches into the slab of that height. The result has the

@@ -24,6 +24,7 @@ of a fixed scene thus gives a different mission.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -270,14 +271,9 @@ def _generate(name: str, pair: _Pair, seed: int, start: Vector, goal: Vector) ->
         )
     low = np.floor((places.min(axis=0) - _MARGIN_M) / _CELL_M)[:2]
     high = np.ceil((places.max(axis=0) + _MARGIN_M) / _CELL_M)[:2]
-    boxes = np.array(
-        [
-            _cuboid(i, j, pair.size_m)
-            for i in range(int(low[0]), int(high[0]))
-            for j in range(int(low[1]), int(high[1]))
-            if _occupied(pair, seed, i, j)
-        ]
-    ).reshape(-1, 6)
+    cells = itertools.product(*(range(int(a), int(b)) for a, b in zip(low, high, strict=True)))
+    cuboids = [_cuboid(i, j, pair.size_m) for i, j in cells if _occupied(pair, seed, i, j)]
+    boxes = np.array(cuboids).reshape(-1, 6)
     for place in (start, goal):
         boxes = boxes[distance_to_boxes(boxes, place, plan=True) >= CLEAR_RADIUS_M]
     return World(

@@ -17,7 +17,7 @@ GUIDE, GUIDE_COMPONENT = 245, 190
 class PointVehicle:
     """A vehicle without dynamics: it flies what is asked, and stands on the ground."""
 
-    euler_rad = Truth.euler_rad
+    euler_rad, in_body = Truth.euler_rad, Truth.in_body
 
     def __init__(self):
         self.position_ned_m = np.array([0.0, 0.0, -REST_M])
