@@ -12,13 +12,12 @@ with `mavbench` alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from exported import arguments
 
-from mavfi_cli.paper.beyond import PLAIN, arms
+from mavfi_cli.paper.beyond import PLAIN, Arm, arms
 from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.stats.shares import Share
 
@@ -28,23 +27,21 @@ def cell(share: Share) -> str:
     return f"{share.count} of {share.total}" if share.total else ""
 
 
-def lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
+def lines(found: Sequence[Arm]) -> list[str]:
     """A row an arm: lost of golden flights, at each site, in all; McNemar's p against none."""
-    sites = list(found[0]["by_site"])
+    sites = list(found[0].by_site)
     titles = ["arm", "golden", *sites, "all", "p"]
     printed = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for arm in found:
-        counts = " | ".join(
-            cell(each) for each in (arm["golden"], *(arm["by_site"][s] for s in sites))
-        )
-        whole = arm["lost"]
+        counts = " | ".join(cell(each) for each in (arm.golden, *(arm.by_site[s] for s in sites)))
+        whole = arm.lost
         told = f"{cell(whole)}, {whole.share:.0%} ({whole.low:.0%} to {whole.high:.0%})"
-        p = 1.0 if arm["p_value"] is None else arm["p_value"]
-        printed.append(f"| {arm['name']} | {counts} | {told} | {p:.2g} |")
+        p = 1.0 if arm.p_value is None else arm.p_value
+        printed.append(f"| {arm.name} | {counts} | {told} | {p:.2g} |")
     return printed
 
 
-def draw(found: Sequence[Mapping[str, Any]], path: Path) -> None:
+def draw(found: Sequence[Arm], path: Path) -> None:
     """Bars of the share of lost missions, with intervals."""
     import matplotlib as mpl
 
@@ -53,12 +50,12 @@ def draw(found: Sequence[Mapping[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(7.0, 3.4), layout="constrained")
-    names = [arm["name"] for arm in reversed(found)]
+    names = [arm.name for arm in reversed(found)]
     for place, arm in enumerate(reversed(found)):
-        whole = arm["lost"]
+        whole = arm.lost
         value = 100.0 * whole.share
-        watched = "#2166ac" if "AD" in arm["name"] else "#7f8c8d"
-        colour = "#b2182b" if arm["name"] == PLAIN else watched
+        watched = "#2166ac" if "AD" in arm.name else "#7f8c8d"
+        colour = "#b2182b" if arm.name == PLAIN else watched
         axes.barh(place, value, color=colour, height=0.6)
         axes.errorbar(
             value, place, xerr=[[value - 100.0 * whole.low], [100.0 * whole.high - value]],

@@ -94,24 +94,26 @@ def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool)
     from mavfi_cli.report.page import render, require_page
 
     require_page(output)  # before what takes long
+    from mavfi_cli.cli.progress import steps_view
     from mavfi_cli.core.files import write_text
     from mavfi_cli.paper.document import document
     from mavfi_cli.paper.sources import Evidence
 
-    evidence = Evidence.gather(places)
-    for problem in evidence.problems:
-        note(f"note: {problem}")
-    content = document(evidence, upsets)
-    page = render(content)
-    write_text(output, page)
+    with steps_view() as step:
+        step("reading the missions")
+        evidence = Evidence.gather(places)
+        for problem in evidence.problems:
+            note(f"note: {problem}")
+        content = document(evidence, upsets, step)
+        step("writing the page")
+        page = render(content)
+        write_text(output, page)
     missions, size = len(evidence.flights()), len(page.encode())
     if as_json:
-        verdicts = {
-            where: {verdict.value: count for verdict, count in counts.items()}
-            for where, counts in content["verdicts"].items()
-        }
-        summary = {"file": str(output), "bytes": size, "missions": missions, "verdicts": verdicts,
+        summary = {"file": str(output), "bytes": size, "missions": missions,
+                   "answer": content.answer, "verdicts": content.verdicts(),
                    "problems": [*evidence.problems]}  # fmt: skip
         echo(json.dumps(summary, indent=2))
     else:
+        echo(content.answer)
         echo(f"{missions:,} missions in {output} ({size / 1e6:.1f} MB)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -196,3 +196,11 @@ def missions_view(*, quiet: bool) -> Iterator[Spectator]:
         return
     with _screen(0.0) as screen:
         yield _MissionsView(screen)
+
+
+@contextmanager
+def steps_view() -> Iterator[Callable[[str], None]]:
+    """Show the current step of a computation on stderr; takes the name of each step."""
+    begun_s = time.monotonic()
+    with _screen(PLAIN_EVERY_S) as screen:
+        yield lambda name: screen.update(f"{name} ...", time.monotonic() - begun_s)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,28 @@ _MEASURES = (
 )  # fmt: skip
 
 
-def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list[dict[str, Any]]:
-    """The flow from kernel to mission, a row for each kernel that instruction-level faults struck.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelFlow:
+    """From a struck kernel to the mission.
 
-    A row has the kernel, the lost missions among those of each fate, the lost and the harmed of
-    all, the share of silent corruption of the isolated kernel, and the probability that a mission
-    is lost given such corruption, with the ends of its interval. The last two are None where they
-    are not known.
+    Attributes:
+        fates: lost missions among those of each of FATES.
+        lost, harmed: among all missions with a fault in the kernel.
+        silent: silent corruption of the isolated kernel; None if it was not run.
+        given_silent: probability that a mission is lost given such corruption, with the ends of its
+            interval; None if it is not known.
+    """
+
+    kernel: str
+    fates: Mapping[str, Share]
+    lost: Share
+    harmed: Share
+    silent: Share | None
+    given_silent: tuple[float, ...] | None
+
+
+def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list[KernelFlow]:
+    """The flow of each kernel that instruction-level faults struck.
 
     Args:
         alone: silent corruptions and faults of each isolated kernel.
@@ -46,7 +62,7 @@ def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list
     kernels = {name: those for (name,), those in hit.items() if name}
     return [
         _flow(name, kernels[name], own, alone.get(name))
-        for name in sorted(kernels, key=lambda each: (_ORDER.get(each, 9), each))
+        for name in sorted(kernels, key=lambda name: (_ORDER.get(name, 9), name))
     ]
 
 
@@ -55,19 +71,19 @@ _ORDER = {"point_cloud": 0, "octomap": 1, "collision_check": 2, "rrtstar": 3, "c
 
 def _flow(
     name: str, flights: Flights, own: Mapping[str, Row], alone: tuple[int, int] | None
-) -> dict[str, Any]:
-    of_fate = flights.grouped(_fate_of(each, own[each["pair"]]) for each in flights.rows())
+) -> KernelFlow:
+    of_fate = flights.grouped(_fate_of(row, own[row["pair"]]) for row in flights.rows())
     fates = {fate: of_fate[fate].share() if fate in of_fate else wilson(0, 0) for fate in FATES}
     lived = fates[_SAME].count + fates[_CHANGED].count
     layers = None if alone is None else cross_layer(*alone, lived, len(flights))
-    return {
-        "kernel": name,
-        "fates": fates,
-        "lost": flights.share(),
-        "harmed": flights.share("harmed"),
-        "silent": layers and layers.corruption,
-        "given_silent": layers and layers.failure_given_corruption,
-    }
+    return KernelFlow(
+        kernel=name,
+        fates=fates,
+        lost=flights.share(),
+        harmed=flights.share("harmed"),
+        silent=layers.corruption if layers else None,
+        given_silent=layers.failure_given_corruption if layers else None,
+    )
 
 
 def _fate_of(flight: Row, own: Row) -> str:
@@ -95,20 +111,30 @@ _BITS = {  # lowest bit of each class, highest class first
 BIT_CLASSES = tuple(tuple(name for name, _ in kinds) for kinds in _BITS.values())
 
 
-def state_map(flights: Flights) -> dict[tuple[str, str, str], dict[str, Share]]:
-    """The harmed and the lost missions by state, class of bits and phase.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapCell:
+    """The harmed and the lost missions of faults in a class of bits of a state, in a phase."""
 
-    It counts source-level faults without a detector whose golden flights succeed.
+    state: str
+    bits: str
+    phase: str
+    harmed: Share
+    lost: Share
 
-    A fault in several components is told by its group, and by the highest bit that it flips.
+
+def state_map(flights: Flights) -> list[MapCell]:
+    """The cells of all states, classes of bits and phases that faults struck, sorted.
+
+    It counts source-level faults without a detector whose golden flights succeed. A fault in
+    several components counts for their group and for the highest bit that it flips.
     """
     hit = flights.struck(level="source", own_lost=False)
     hit = hit.where([bool(x["struck_state"] and any(x["struck_bits"] or ())) for x in hit.rows()])
     places = ((_state(x), _class(x), x["strike_phase"] or "") for x in hit.rows())
-    return {
-        place: {"harmed": those.share("harmed"), "lost": those.share()}
-        for place, those in sorted(hit.grouped(places).items())
-    }
+    return [
+        MapCell(state=state, bits=bits, phase=phase, harmed=mine.share("harmed"), lost=mine.share())
+        for (state, bits, phase), mine in sorted(hit.grouped(places).items())
+    ]
 
 
 def _state(flight: Row) -> str:
@@ -126,22 +152,33 @@ def _class(flight: Row) -> str:
 # Failures a flight hour ---------------------------------------------------------------------------
 
 
-def hourly_failures(flights: Flights, upsets_per_hour: float) -> Iterator[dict[str, Any]]:
-    """Failures of missions a flight hour, a row for each kind of fault in one world.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HourlyFailures:
+    """Failures per flight hour of one kind of fault in one world, by detector; empty means none.
 
-    A row says where a fault strikes, and for each detector the share of faults that lose a mission
-    whose golden flight succeeds, and the rate: point, low and high. The empty name is no detector.
+    Attributes:
+        where: what a fault strikes, and where it flies.
+        lost: share of faults that lose a mission whose golden flight succeeds.
+        per_hour: rate, low and high.
+    """
+
+    where: str
+    lost: Mapping[str, Share]
+    per_hour: Mapping[str, tuple[float, float, float]]
+
+
+def hourly_failures(flights: Flights, upsets_per_hour: float) -> Iterator[HourlyFailures]:
+    """Failures per flight hour for each kind of fault in one world.
 
     Args:
-        upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
+        upsets_per_hour: bit flips that reach the injection sites per flight hour.
     """
     hit = flights.comparable.chosen(struck=True, own_lost=False)
-    for place, those in sorted(hit.grouped(map(_kind, hit.rows())).items()):
-        lost = dict(
-            sorted((name or "", each.share()) for (name,), each in those.by("detector").items())
-        )
-        hourly = {name: each.per_hour(upsets_per_hour) for name, each in lost.items()}
-        yield {"where": place, "lost": lost, "per_hour": hourly}
+    for place, mine in sorted(hit.grouped(map(_kind, hit.rows())).items()):
+        by_detector = mine.by("detector").items()
+        lost = dict(sorted((name or "", those.share()) for (name,), those in by_detector))
+        hourly = {name: share.per_hour(upsets_per_hour) for name, share in lost.items()}
+        yield HourlyFailures(where=place, lost=lost, per_hour=hourly)
 
 
 _COMPONENTS = Counter(state.group for state in BY_NAME.values())
@@ -170,13 +207,27 @@ _WORDS, _ = read_toml(Path(__file__).parent / "arms.toml")
 PLAIN = _WORDS["stacks"][""]
 
 
-def arms(flights: Flights) -> list[dict[str, Any]]:
-    """The arms of a campaign, the unprotected one first; none unless it flew several stacks.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arm:
+    """A stack with or without a detector.
 
-    A row has the arm's name, its lost golden flights, its lost missions of each injection site and
-    of all, and the p-value of McNemar's exact test against the unprotected arm, None of that arm
-    itself, also as corrected by Holm over all arms.
+    Attributes:
+        golden: lost golden flights.
+        lost: lost missions of all faults; `by_site` of each injection site.
+        p_value: of McNemar's exact test against the unprotected arm; None of that arm itself.
+        corrected_p: by Holm over all arms.
     """
+
+    name: str
+    golden: Share
+    by_site: Mapping[str, Share]
+    lost: Share
+    p_value: float | None
+    corrected_p: float | None
+
+
+def arms(flights: Flights) -> list[Arm]:
+    """The arms of a campaign, the unprotected one first; none unless it flew several stacks."""
     if len(set(flights["stack"])) < 2:
         return []
     golden: dict[str, list[Row]] = {}
@@ -187,25 +238,26 @@ def arms(flights: Flights) -> list[dict[str, Any]]:
             golden.setdefault(name, []).append(flight)
         elif name:
             trials.setdefault(name, {})[_trial_of(flight)] = flight
-    read = (each for each, x in trials.get(PLAIN, {}).items() if x["activation"] == "read")
+    plain = trials.get(PLAIN, {}).items()
+    read = (trial for trial, flight in plain if flight["activation"] == "read")
     shared = sorted(set(read).intersection(*trials.values()))
     if not shared or len(trials) < 2:
         return []
     order = sorted(trials, key=lambda name: name != PLAIN)
     kept = {name: [trials[name][trial] for trial in shared] for name in order}
-    won = {name: [not each["lost"] for each in those] for name, those in kept.items()}
+    won = {name: [not flight["lost"] for flight in mine] for name, mine in kept.items()}
     tests = {name: McNemar.of(won[PLAIN], won[name]).p_value for name in order if name != PLAIN}
     corrected = dict(zip(tests, holm([*tests.values()]), strict=True))
     return [
-        {
-            "name": name,
-            "golden": _lost(golden.get(name, [])),
-            "by_site": _by_site(those),
-            "lost": _lost(those),
-            "p_value": tests.get(name),
-            "corrected_p": corrected.get(name),
-        }
-        for name, those in kept.items()
+        Arm(
+            name=name,
+            golden=_lost(golden.get(name, [])),
+            by_site=_by_site(mine),
+            lost=_lost(mine),
+            p_value=tests.get(name),
+            corrected_p=corrected.get(name),
+        )
+        for name, mine in kept.items()
     ]
 
 

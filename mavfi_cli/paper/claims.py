@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from operator import attrgetter
@@ -18,61 +18,23 @@ from typing import Any
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.paper.measures import MEASURES, NOT_FLOWN, OF_KERNELS, WITHOUT_FATES, Kernels
-from mavfi_cli.paper.verdicts import Finding, Judgement, Verdict, judge, margin
+from mavfi_cli.paper.verdicts import (
+    ISOLATED,
+    Claim,
+    Finding,
+    JudgedClaim,
+    Judgement,
+    Verdict,
+    judge,
+    margin,
+)
 from mavfi_cli.stats.paired import Count, recovered_share
 from mavfi_cli.stats.shares import Interval, wilson
 
-ISOLATED = "isolated kernels"
 _FILE = Path(__file__).parent / "claims.toml"
 _FACTOR = 3.0  # a size is reproduced from a third of it to so many times it
 _NONE = {Fate.SILENT: "none of the faults is silent", Fate.DEAD: "none of the faults ends a node"}
 _WHOLE = ("points", "percent")  # units of shares, which end at 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A claim of the paper, as claims.toml explains.
-
-    Attributes:
-        item: table, figure or section, such as `fig6`.
-        find: the finding of a stack's flights and of the isolated kernels.
-        low, high: ends of the range of the effect.
-        rule: the range, and where it comes from, in words.
-        isolated: whether it is about isolated kernels and no flights.
-        fates: what the faults may do to their nodes; each is judged by itself.
-    """
-
-    name: str
-    item: str
-    words: str
-    effect: str
-    find: Callable[[Flights, Kernels], Finding]
-    low: float
-    high: float
-    rule: str
-    paper: str = "no number printed"
-    unit: str = "points"
-    paper_tells: str = "drawn only, without counts"
-    premise: str = ""
-    isolated: bool = False
-    fates: tuple[Fate, ...] = tuple(Fate)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JudgedClaim:
-    """A claim with its verdicts.
-
-    Attributes:
-        judgements: of each stack, or of ISOLATED, by what the faults do to their nodes.
-    """
-
-    claim: Claim
-    judgements: Mapping[str, Mapping[Fate, Judgement]]
-
-    def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
-        """The verdict on a stack, or of ISOLATED; None if it is not judged there."""
-        found = self.judgements.get(place, {}).get(fate)
-        return None if found is None else found.verdict
 
 
 def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim]:

@@ -1,289 +1,317 @@
-"""The whole report as plain values; `mavfi_cli.report.page` makes the page of them."""
+"""The content of the page of results; `mavfi_cli.report.page` fills the template with it."""
 
 from __future__ import annotations
 
+import base64
 import json
+import math
 import shlex
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.pairs import LONGER, Balance, Fate, Flights
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
+from mavfi_cli.mission.run_folder import RunFolder
+from mavfi_cli.paper.answers import (
+    LEVELS,
+    REASONS,
+    Delays,
+    DetectorBalance,
+    Disagreement,
+    Family,
+    Safeguard,
+    answer,
+    crash_sentence,
+    delay_sentence,
+    delays,
+    detector_balances,
+    disagreements,
+    families,
+    judgement_of,
+    protections,
+    short_name,
+)
 from mavfi_cli.paper.beyond import (
     BIT_CLASSES,
-    FATES,
+    Arm,
+    HourlyFailures,
+    KernelFlow,
+    MapCell,
     arms,
     hourly_failures,
     kernel_flows,
     state_map,
 )
-from mavfi_cli.paper.claims import ISOLATED, JudgedClaim, judged
+from mavfi_cli.paper.claims import judged
 from mavfi_cli.paper.figures import OVER_GOLDEN, draw, panel
-from mavfi_cli.paper.items import BY_NAME, ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
+from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
 from mavfi_cli.paper.layouts import of_flights
-from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence
+from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence, KernelSource
 from mavfi_cli.paper.status import of_kernels, of_model
-from mavfi_cli.paper.verdicts import Verdict
+from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Verdict
+from mavfi_cli.report.charts import (
+    ForestRow,
+    Picture,
+    draw_arms,
+    draw_delays,
+    draw_flows,
+    draw_forest,
+)
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperTable, draw_strips
-from mavfi_cli.stats.paired import excess_over_mean
-from mavfi_cli.stats.shares import Share, wilson
+from mavfi_cli.report.table import Table
 
 if TYPE_CHECKING:
-    pass
+    from matplotlib.figure import Figure
 
 _DETECTORS = {None: "no detector"} | DETECTOR_TITLES
 _LONGEST = 5  # flights of a campaign that are listed although they succeed
-_Cells = Mapping[tuple[str, str, str], Mapping[str, Share]]  # by state, class of bits and phase
+_PICTURES, _LARGEST_PICTURE = 40, 500_000  # of kept flights in the page; bytes
+Step = Callable[[str], object]  # is called with the name of each step
 
 
-def document(evidence: Evidence, upsets_per_hour: float = 1.0) -> dict[str, Any]:
-    """All parts of the report.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StateMatrix:
+    """The state map of a phase: states as rows, classes of bits as columns; None where empty."""
+
+    stack: str
+    phase: str
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[MapCell | None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ItemPart:
+    """What one stack, the isolated kernels or the model show of an item.
+
+    Attributes:
+        picture: None if it needs run folders that are not there.
+    """
+
+    place: str
+    table: PaperTable
+    picture: Picture | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ShownItem:
+    """An item of the paper with its parts, and the places that show nothing of it."""
+
+    item: Item
+    parts: Sequence[_ItemPart]
+    missing: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ListedMission:
+    """A mission that is worth a look.
+
+    Attributes:
+        ratio: flight time over the golden one's; None if it is lost.
+        command: repeats the flight.
+        picture: its view from above as a data URL; empty if it was not kept.
+    """
+
+    number: int
+    fault: str
+    world: str
+    seed: int
+    outcome: str
+    ratio: float | None
+    command: str
+    picture: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _CampaignMissions:
+    """The lost missions of a campaign, and the longest of the others."""
+
+    name: str
+    lost: Sequence[_ListedMission]
+    longest: Sequence[_ListedMission]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Document:
+    """The whole page. `stack` is the first stack that has flights; the others fold away."""
+
+    version: str
+    stacks: Sequence[str]
+    answer: str
+    crashes: str
+    extent: str
+    problems: Sequence[str]
+    claims: Sequence[JudgedClaim]
+    families: Sequence[Family]
+    forest: Picture | None
+    disagreements: Sequence[Disagreement]
+    protections: Sequence[Safeguard]
+    balances: Sequence[DetectorBalance]
+    delays: Picture | None
+    delay_sentence: str
+    spreads: Sequence[Picture]
+    items: Sequence[_ShownItem]
+    left_out: Mapping[str, str]
+    flows: Mapping[str, Sequence[KernelFlow]]
+    flow_pictures: Sequence[Picture]
+    maps: Sequence[_StateMatrix]
+    map_csv: str
+    upsets_per_hour: float
+    hourly: Mapping[str, Sequence[HourlyFailures]]
+    arms: Mapping[str, Sequence[Arm]]
+    arm_pictures: Mapping[str, Picture]
+    sources: Sequence[CampaignSource]
+    kernel_sources: Sequence[KernelSource]
+    missions: Sequence[_CampaignMissions]
+
+    @property
+    def stack(self) -> str:
+        """The stack whose verdicts are shown first."""
+        return self.stacks[0]
+
+    reasons = REASONS
+
+    def verdicts(self) -> dict[str, dict[str, int]]:
+        """How many claims have which verdict, by stack and of isolated kernels."""
+        found = {
+            place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
+        }
+        return {
+            place: {verdict.value: verdicts.count(verdict) for verdict in Verdict}
+            for place, verdicts in found.items()
+        }
+
+
+def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str) -> Document:
+    """Compute the content of the page.
 
     Args:
-        upsets_per_hour: bit flips that reach the injection sites in an hour of flight.
+        upsets_per_hour: bit flips that reach the injection sites per flight hour.
     """
     flown = {stack: evidence.flights(stack) for stack in STACKS}
-    as_paper = {stack: those.chosen(as_paper=True) for stack, those in flown.items()}
+    stacks = sorted(STACKS, key=lambda stack: not len(flown[stack]))
+    as_paper = {stack: flown[stack].chosen(as_paper=True) for stack in stacks}
     flights = {stack: those.chosen(at=(None, "random")) for stack, those in as_paper.items()}
     kernels = evidence.isolated
-    sdc = {name: each["outcomes"]["sdc"] for name, each in kernels.items()}
-    silent = {name: (each["count"], each["of"]) for name, each in sdc.items()}
+    sdc = {name: part["outcomes"]["sdc"] for name, part in kernels.items()}
+    silent = {name: (share["count"], share["of"]) for name, share in sdc.items()}
+    step("judging the claims")
     claims = judged(flights, kernels)
-    maps = {stack: state_map(as_paper[stack]) for stack in STACKS}
-    return {
-        "version": __version__,
-        "stacks": STACKS,
-        "extent": _extent(flights, kernels, claims),
-        "summary": _summary(flights, claims),
-        "problems": evidence.problems,
-        "claims": claims,
-        "verdicts": {where: _counted(claims, where) for where in _PLACES},
-        "worst": [row for stack in STACKS for row in _worst_flights(stack, flights[stack])],
-        "balances": [row for stack in STACKS for row in _balances(stack, flights[stack])],
-        "spreads": {stack: _spread(flights[stack]) for stack in STACKS},
-        "flows": {stack: kernel_flows(flights[stack], silent) for stack in STACKS},
-        "fates": FATES,
-        "maps": [part for stack in STACKS for part in _matrices(stack, maps[stack])],
-        "map_rows": [row for stack in STACKS for row in _map_rows(stack, maps[stack])],
-        "item_titles": {
-            name: f"{printed_name(name)}: {BY_NAME[name].title}"
-            if name in BY_NAME
-            else printed_name(name)
-            for name in dict.fromkeys(each.claim.item for each in claims)
-        },
-        "items": [*_shown_items(evidence, flown)],
-        "left_out": {printed_name(name): why for name, why in LEFT_OUT.items()},
-        "detectors": ("", *DETECTOR_TITLES),
-        "upsets_per_hour": upsets_per_hour,
-        "hourly": {s: [*hourly_failures(flights[s], upsets_per_hour)] for s in STACKS},
-        "arms": [
-            {"campaign": each.name, "arms": found}
-            for each in evidence.campaigns
-            if (found := arms(each.flights.comparable))
-        ],
-        "sources": evidence.campaigns,
-        "kernel_sources": evidence.kernels,
-        "missions": [_worth_a_look(each) for each in evidence.campaigns if len(each.flights)],
+    step("counting what protects")
+    maps = {stack: state_map(as_paper[stack]) for stack in stacks}
+    flows = {stack: kernel_flows(flights[stack], silent) for stack in stacks}
+    by_arm = {
+        source.name: found
+        for source in evidence.campaigns
+        if (found := arms(source.flights.comparable))
     }
-
-
-# Claims -------------------------------------------------------------------------------------------
-
-
-def _counted(claims: Sequence[JudgedClaim], where: str) -> dict[Verdict, int]:
-    counts = Counter(claim.verdict(where) for claim in claims)
-    return {verdict: counts[verdict] for verdict in Verdict}
-
-
-# Five sentences -----------------------------------------------------------------------------------
+    added = [*delays(stacks[0], flights[stacks[0]])]
+    step("drawing the figures")
+    return Document(
+        version=__version__,
+        stacks=stacks,
+        answer=answer(claims, stacks[0]),
+        crashes=crash_sentence(claims, stacks[0], flights[stacks[0]]),
+        extent=_extent(flights, kernels, claims),
+        problems=evidence.problems,
+        claims=claims,
+        families=families(claims),
+        forest=_forest(claims, stacks),
+        disagreements=disagreements(claims, stacks[0]),
+        protections=protections(flights),
+        balances=[row for stack in stacks for row in detector_balances(stack, flights[stack])],
+        delays=_delay_picture(added),
+        delay_sentence=delay_sentence(added),
+        spreads=[part for stack in stacks if (part := _spread(stack, flights[stack]))],
+        items=[*_shown_items(evidence, {stack: flown[stack] for stack in stacks})],
+        left_out={printed_name(name): why for name, why in LEFT_OUT.items()},
+        flows=flows,
+        flow_pictures=[_flow_picture(stack, mine) for stack, mine in flows.items() if mine],
+        maps=[part for stack in stacks for part in _matrices(stack, maps[stack])],
+        map_csv=Table.of_records(_map_rows(maps)).csv(),
+        upsets_per_hour=upsets_per_hour,
+        hourly={s: [*hourly_failures(flights[s], upsets_per_hour)] for s in stacks},
+        arms=by_arm,
+        arm_pictures={name: _arm_picture(name, mine) for name, mine in by_arm.items()},
+        sources=evidence.campaigns,
+        kernel_sources=evidence.kernels,
+        missions=[*_missions(evidence.campaigns)],
+    )
 
 
 def _extent(
     flights: Mapping[str, Flights], kernels: Mapping[str, Any], claims: Sequence[JudgedClaim]
 ) -> str:
-    """What the page judges, and by how much."""
-    missions = sum(len(those) for those in flights.values())
-    runs = sum(each["runs"] for each in kernels.values())
+    """How many claims are judged, and by what."""
+    missions = sum(map(len, flights.values()))
+    runs = sum(part["runs"] for part in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
-    decided = sum(
-        any(claim.verdict(where) not in (None, Verdict.NOT_DECIDABLE) for where in _PLACES)
+    places = (*flights, ISOLATED)
+    count = sum(
+        any(claim.verdict(place) not in (None, Verdict.NOT_DECIDABLE) for place in places)
         for claim in claims
     )
-    return f"{decided} of {len(claims)} claims are judged by {missions:,} missions{attacked}."
+    return f"{missions:,} missions{attacked} judge {count} of {len(claims)} claims."
 
 
-def _summary(flights: Mapping[str, Flights], claims: Sequence[JudgedClaim]) -> list[str]:
-    return [
-        _verdict_sentence(claims),
-        _cost_sentence(flights),
-        _saved_sentence(flights, "instruction", "an instruction"),
-        _saved_sentence(flights, "source", "a state"),
-        _crash_sentence(flights),
-    ]
+# Pictures of answers ------------------------------------------------------------------------------
 
 
-def _verdict_sentence(claims: Sequence[JudgedClaim]) -> str:
-    parts = []
-    for name in _PLACES:
-        found = _counted(claims, name)
-        known = sum(found[each] for each, _ in _VERDICTS)
-        if known:
-            place = f"about {name}" if name == ISOLATED else f"flown on {name}"
-            verdicts = [f"{_are(found[each])} {told}" for each, told in _VERDICTS if found[each]]
-            claims_told = f"of {known} claim{'s'[known == 1 :]} {place}"
-            parts.append(f"{claims_told}, {_listed_in_words(verdicts)}")
-    if not parts:
-        return "None of the claims has been flown yet."
-    return _sentence(parts)
-
-
-_PLACES = (*STACKS, ISOLATED)
-_VERDICTS = (
-    (Verdict.REPRODUCED, "reproduced"),
-    (Verdict.CONTRADICTED, "contradicted"),
-    (Verdict.UNDECIDED, "undecided"),
-)
-
-
-def _are(number: int) -> str:
-    return f"{number} {'is' if number == 1 else 'are'}"
-
-
-def _listed_in_words(parts: Sequence[str]) -> str:
-    *first, last = parts
-    return f"{', '.join(first)} and {last}" if first else last
-
-
-def _cost_sentence(flights: Mapping[str, Flights]) -> str:
-    parts = []
-    for stack, those in flights.items():
-        instructions = _instruction_faults(those)
-        kind = "an instruction" if len(instructions) else "a state"
-        hit = instructions if len(instructions) else those.struck(level="source")
-        hit = hit.chosen(own_lost=False)
-        if len(hit):
-            parts.append(
-                f"on {stack}, a bit flip in {kind} loses {_rate(hit.share())} of the "
-                "missions whose golden flight succeeds"
-            )
-    if not parts:
-        return "No flight with a fault has a golden flight beside it, so the cost is not known."
-    return _sentence(parts)
-
-
-def _instruction_faults(flights: Flights) -> Flights:
-    return flights.struck(level="instruction", platform="x86")
-
-
-def _saved_sentence(flights: Mapping[str, Flights], level: str, kind: str) -> str:
-    """What the detectors save of faults of one level, on the first stack flown with one."""
-    for stack, those in flights.items():
-        saved = []
-        for detector, name in (("gad", "the Gaussian detector"), ("aad", "the autoencoder")):
-            found = those.protected(detector, level=level, bare_lost=True).share(value=False)
-            saved += [f"{name} saves {_rate(found)}"] if found.total else []
-        if saved:
-            place = f"On {stack}, of the missions that a fault in {kind} loses"
-            return f"{place}, {_listed_in_words(saved)}."
-    return f"No mission that a fault in {kind} loses was flown again with a detector."
-
-
-def _crash_sentence(flights: Mapping[str, Flights]) -> str:
-    lost = [_instruction_faults(x).chosen(own_lost=False, lost=True) for x in flights.values()]
-    nodes = [each for those in lost for each in those["node_ended"]]
-    if not nodes:
-        return "No fault in an instruction has lost a mission."
-    ended = wilson(sum(map(bool, nodes)), len(nodes))
-    if ended.count == ended.total:
-        return (
-            f"All {ended.total:,} missions that a fault in an instruction loses follow a node that "
-            "crashed or hung, and none follows silent corruption."
+def _forest(claims: Sequence[JudgedClaim], stacks: Sequence[str]) -> Picture | None:
+    rows = [
+        ForestRow(
+            label=short_name(judged_claim),
+            low=judged_claim.claim.low,
+            high=judged_claim.claim.high,
+            number=judged_claim.claim.unit == "number",
+            effects=[
+                judgement.effect if judgement else None
+                for stack in (stacks[:1] if judged_claim.claim.isolated else stacks)
+                for judgement in [judgement_of(judged_claim, stack)]
+            ],
+            verdict=judgement_of(judged_claim, stacks[0]).verdict.value,  # type: ignore[union-attr]
         )
-    return (
-        f"Of the {ended.total:,} missions that a fault in an instruction loses, {_rate(ended)} "
-        "follow a node that crashed or hung; the others follow silent corruption."
-    )
+        for judged_claim in claims
+    ]
+    rows = [row for row in rows if any(row.effects)]
+    if not rows:
+        return None
+    csv = Table.of_records(
+        {"claim": row.label, "range_low": row.low, "range_high": row.high, "stack": stack,
+         "effect": effect.value, "low": effect.low, "high": effect.high, "n": effect.count}
+        for row in rows
+        for stack, effect in zip(stacks, row.effects, strict=False)
+        if effect
+    ).csv()  # fmt: skip
+    title = "Effects with their 95 % intervals beside the ranges that the paper's claims give"
+    return Picture.of("forest", title, draw_forest(rows, stacks), csv)
 
 
-def _sentence(parts: Sequence[str]) -> str:
-    text = "; ".join(parts) + "."
-    return text[0].upper() + text[1:]
+def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
+    """Shares of faulty flights that take longer than golden by more than a number of seconds."""
+    if not parts:
+        return None
+    curves = {
+        f"{part.stack}: faults in {LEVELS[part.level]}": [
+            (_DETECTORS[name], name or "none", added) for name, added in part.added_s.items()
+        ]
+        for part in parts
+    }
+    golden_s = [part.golden_s for part in parts]
+    csv = Table.of_records(
+        {"stack": part.stack, "level": part.level, "detector": name or "",
+         "added_s": "lost" if added == float("inf") else f"{added:.3f}"}
+        for part in parts
+        for name, values in part.added_s.items()
+        for added in values
+    ).csv()  # fmt: skip
+    title = "Share of faulty flights that take longer than golden by more than so many seconds"
+    return Picture.of("delays", title, draw_delays(curves, golden_s), csv)
 
 
-def _rate(found: Share) -> str:
-    ends = f"{100 * found.low:.0f} to {100 * found.high:.0f}"
-    return f"{100 * found.share:.0f} % ({found.counts}; 95 % interval {ends} %)"
-
-
-# Worst cases and spreads --------------------------------------------------------------------------
-
-
-def _worst_flights(stack: str, flights: Flights) -> Iterator[dict[str, Any]]:
-    """The longest flights of each setting, paired and unpaired, as the paper may have read them."""
-    hit = flights.comparable.timed.chosen(struck=True, detector=(*_DETECTORS,))
-    groups = hit.by("detector", "level", "world", "platform")
-    order = [*_DETECTORS]
-    for place in sorted(groups, key=lambda each: (*map(str, each[1:]), order.index(each[0]))):
-        detector, level, world, platform = place
-        those = groups[place]
-        golden = dict(zip(those["pair"], those["own_flight_time_s"], strict=True)).values()
-        longest_golden, longest = excess_over_mean([*golden], those["flight_time_s"])
-        found = those.ratios
-        yield {
-            "stack": stack,
-            "level": level,
-            "world": world,
-            "platform": platform,
-            "detector": detector,
-            "flights": len(found),
-            "longer": float((found > LONGER).mean()),
-            "paired": found.max() - 1.0,
-            "unpaired": longest,
-            "golden": longest_golden,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DetectorBalance:
-    """What a detector undoes and what it causes on the same faults.
-
-    Attributes:
-        level: `source` or `instruction`.
-        fate: what the faults do to their nodes.
-        harmed, lost: of harmed and of lost missions.
-    """
-
-    stack: str
-    level: str
-    computer: str
-    detector: str
-    fate: Fate
-    harmed: Balance
-    lost: Balance
-
-
-def _balances(stack: str, flights: Flights) -> Iterator[DetectorBalance]:
-    """A row for each level, computer, detector and fate of which pairs were flown."""
-    watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
-    for level, computer, detector in sorted(watched.by("level", "platform", "detector"), key=str):
-        for fate in Fate:
-            where = {"level": level, "platform": computer}
-            harmed, lost = (
-                flights.of_fate(fate).balance(detector, column=column, **where)
-                for column in ("harmed", "lost")
-            )
-            if harmed.pairs:
-                yield DetectorBalance(
-                    stack=stack, level=level, computer=computer, detector=detector, fate=fate,
-                    harmed=harmed, lost=lost,
-                )  # fmt: skip
-
-
-def _spread(flights: Flights) -> dict[str, Any] | None:
+def _spread(stack: str, flights: Flights) -> Picture | None:
     """Every flight with a fault in a state over its own golden one, by world and detector."""
     seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
     hit = flights.comparable.timed.chosen(**seen)
@@ -293,71 +321,110 @@ def _spread(flights: Flights) -> dict[str, Any] | None:
         return None
     panels = {
         world: panel(
-            (told, name, hit.chosen(world=world, detector=name))
-            for name, told in _DETECTORS.items()
+            (title, name, hit.chosen(world=world, detector=name))
+            for name, title in _DETECTORS.items()
         )
         for world, _ in places
     }
-    rows = [
+    csv = Table.of_records(
         {"world": world, "detector": detector or "", "over_golden": f"{ratio:.4f}"}
         for world, detector in places
         for ratio in groups[world, detector].ratios
-    ]
-    return {"figure": draw_strips(panels, OVER_GOLDEN), "rows": rows}
+    ).csv()
+    title = f"Faults in states, {stack}"
+    return Picture.of(f"states-{stack}", title, draw_strips(panels, OVER_GOLDEN), csv)
+
+
+def _flow_picture(stack: str, flows: Sequence[KernelFlow]) -> Picture:
+    csv = Table.of_records(
+        {"kernel": flow.kernel, "fate": fate, "missions": share.total, "lost": share.count}
+        for flow in flows
+        for fate, share in flow.fates.items()
+    ).csv()
+    bars = {flow.kernel.replace("_", " "): flow.fates for flow in flows}
+    return Picture.of(
+        f"kernels-{stack}", f"What struck kernels did, {stack}", draw_flows(bars), csv
+    )
+
+
+def _arm_picture(campaign: str, found: Sequence[Arm]) -> Picture:
+    csv = Table.of_records(
+        {"arm": arm.name, "lost": arm.lost.count, "of": arm.lost.total, "low": arm.lost.low,
+         "high": arm.lost.high, "p": arm.corrected_p}
+        for arm in found
+    ).csv()  # fmt: skip
+    figure = draw_arms([(arm.name, arm.lost, arm.corrected_p) for arm in found])
+    return Picture.of(f"arms-{campaign}", f"Lost missions of each arm of {campaign}", figure, csv)
 
 
 # Where a bit hurts --------------------------------------------------------------------------------
 
 
-def _matrices(stack: str, cells: _Cells) -> Iterator[dict[str, Any]]:
-    """A matrix a phase and a kind of state: states as rows, classes of bits as columns."""
-    for phase in sorted({phase for _, _, phase in cells}):
+def _matrices(stack: str, cells: Sequence[MapCell]) -> Iterator[_StateMatrix]:
+    """A matrix for each phase and kind of state."""
+    for phase in sorted({cell.phase for cell in cells}):
         for columns in BIT_CLASSES:
-            places = [each for each in cells if each[1] in columns and each[2] == phase]
-            used = [bits for bits in columns if any(each[1] == bits for each in places)]
-            rows = [
-                {"state": state, "cells": [cells.get((state, bits, phase)) for bits in used]}
-                for state in dict.fromkeys(state for state, _, _ in places)
-            ]
-            if rows:
-                yield {"stack": stack, "phase": phase, "columns": used, "rows": rows}
+            mine = [cell for cell in cells if cell.bits in columns and cell.phase == phase]
+            used = [bits for bits in columns if any(cell.bits == bits for cell in mine)]
+            place = {(cell.state, cell.bits): cell for cell in mine}
+            states = dict.fromkeys(cell.state for cell in mine)
+            if mine:
+                rows = {state: [place.get((state, bits)) for bits in used] for state in states}
+                yield _StateMatrix(stack=stack, phase=phase, columns=used, rows=rows)
 
 
-def _map_rows(stack: str, cells: _Cells) -> Iterator[dict[str, Any]]:
-    for (state, bits, phase), each in cells.items():
-        yield {"stack": stack, "state": state, "bits": bits, "phase": phase,
-               "faults": each["harmed"].total, "harmful": each["harmed"].count,
-               "lost": each["lost"].count}  # fmt: skip
+def _map_rows(maps: Mapping[str, Sequence[MapCell]]) -> Iterator[dict[str, Any]]:
+    for stack, cells in maps.items():
+        for cell in cells:
+            yield {"stack": stack, "state": cell.state, "bits": cell.bits, "phase": cell.phase,
+                   "faults": cell.harmed.total, "harmful": cell.harmed.count,
+                   "lost": cell.lost.count}  # fmt: skip
 
 
-# Where to look -----------------------------------------------------------------------------------
+# Missions to look at ------------------------------------------------------------------------------
 
 
-def _worth_a_look(source: CampaignSource) -> dict[str, Any]:
-    flights = source.flights
-    longest = sorted(flights.timed.rows(), key=lambda each: -each["over_own"])[:_LONGEST]
-    return {
-        "name": source.name,
-        "lost": [_listed(each, source.path) for each in flights.chosen(lost=True).rows()],
-        "longest": [_listed(each, source.path) for each in longest],
-    }
+def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions]:
+    left = _PICTURES
+    for source in campaigns:
+        flights = source.flights
+        longest = sorted(flights.timed.rows(), key=lambda row: -row["over_own"])[:_LONGEST]
+        lost = [_listed(row, source.path, left > place)
+                for place, row in enumerate(flights.chosen(lost=True).rows())]  # fmt: skip
+        left -= sum(bool(mission.picture) for mission in lost)
+        if len(flights):
+            yield _CampaignMissions(
+                name=source.name,
+                lost=lost,
+                longest=[_listed(row, source.path) for row in longest],
+            )
 
 
-def _listed(flight: Mapping[str, Any], source: Path) -> dict[str, Any]:
-    """One line of the list; the command repeats the flight."""
+def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> _ListedMission:
+    """A mission of a campaign; the command names its export by the name of the file."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
-    what = "golden" if flight["level"] is None else struck_state
-    place = (
-        [flight["path"]]
-        if _is_kept(flight["path"])
-        else [str(source), "--mission", str(flight["number"])]
+    fault = "golden" if flight["level"] is None else struck_state
+    kept = _is_kept(flight["path"])
+    place = source.name if source.suffix else str(source)
+    run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
+    return _ListedMission(
+        number=flight["number"],
+        fault=" + ".join(filter(None, (fault, flight["detector"]))),
+        world=flight["world"],
+        seed=flight["seed"],
+        outcome=flight["outcome"],
+        ratio=flight["over_own"],
+        command=shlex.join(["mavfi", "replay", *run]),
+        picture=_flight_picture(Path(flight["path"])) if kept and pictured else "",
     )
-    return {
-        **flight,
-        "what": " + ".join(filter(None, (what, flight["detector"]))),
-        "ratio": flight["over_own"],
-        "command": shlex.join(["mavfi", "replay", *place]),
-    }
+
+
+def _flight_picture(run: Path) -> str:
+    """The view from above of a kept run; a browser runs no script of a picture."""
+    path = RunFolder(run).picture
+    if path.is_symlink() or not path.is_file() or path.stat().st_size > _LARGEST_PICTURE:
+        return ""
+    return "data:image/svg+xml;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 # Tables and figures, from all flights that are of the same kind as an item's missions -------------
@@ -369,51 +436,60 @@ _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "faul
 _SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
-def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[dict[str, Any]]:
-    """Every item of the paper in its order: the stacks that show it, and those that do not.
-
-    A stack, or what else an item is computed from, has the table, the figure, and of flights their
-    setting and their time over that of the golden flight. Without the run folders that a figure
-    needs there is none.
+def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_ShownItem]:
+    """Every item of the paper in its order.
 
     Args:
         flights: of each stack, as `Evidence.flights`.
     """
     for item in ITEMS:
         if item.source is Source.FLIGHTS:
-            parts = {stack: _flown(item, stack, flights[stack], evidence) for stack in STACKS}
+            parts = {
+                stack: _flown(item, stack, those, evidence) for stack, those in flights.items()
+            }
         elif item.source is Source.MODEL:
-            parts = {"performance model": _drawn(of_model())}
+            parts = {"performance model": _drawn(item, "performance model", of_model())}
         else:
             kernels = [*evidence.isolated.values()]
-            parts = {ISOLATED: _drawn(of_kernels({"kernels": kernels})) if kernels else None}
-        yield {
-            "item": item,
-            "shown": [{"stack": stack, **part} for stack, part in parts.items() if part],
-            "missing": [stack for stack, part in parts.items() if part is None],
-        }
+            table = of_kernels({"kernels": kernels}) if kernels else None
+            parts = {ISOLATED: None if table is None else _drawn(item, ISOLATED, table)}
+        yield _ShownItem(
+            item=item,
+            parts=[part for part in parts.values() if part],
+            missing=[place for place, part in parts.items() if part is None],
+        )
 
 
-def _drawn(table: PaperTable) -> dict[str, Any]:
-    return {"table": table, "figure": draw(table, None, "one"), "flights": ()}
+def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
+    picture = _item_picture(item, place, draw(table, None, "one"), table.csv())
+    return _ItemPart(place=place, table=table, picture=picture)
 
 
-def _flown(item: Item, stack: str, flights: Flights, evidence: Evidence) -> dict[str, Any] | None:
+def _flown(item: Item, stack: str, flights: Flights, evidence: Evidence) -> _ItemPart | None:
     mine = _of_kind(item, stack, flights)
     if not any(mine["level"]) and not (len(mine) and item.name in _GOLDEN_ONLY):
         return None
-    told = of_flights(item.name, mine)
+    table = of_flights(item.name, mine)
     drawn = _with_runs(item, stack, evidence) if item.name in _NEED_RUNS else mine
-    if drawn is None:
-        return {"table": told, "figure": None, "flights": ()}
-    return {"table": told, "figure": draw(told, drawn, "one"), "flights": [*_over_own(mine)]}
+    picture = None
+    if drawn is not None:
+        rows = [*_over_own(mine)]
+        csv = Table.of_records(rows).csv() if rows else table.csv()
+        picture = _item_picture(item, stack, draw(table, drawn, "one"), csv)
+    known = tuple(row for row in table.rows if any(math.isfinite(cell.value) for cell in row.cells))
+    return _ItemPart(place=stack, table=replace(table, rows=known), picture=picture)
+
+
+def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
+    name = f"{item.name}-{place}".replace(" ", "-")
+    return Picture.of(name, f"{item.paper}: {item.title}, {place}", figure, csv)
 
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
     """The item's flights in the first campaign that has kept the run folders of all of them."""
-    several = (Flights.pooled([each.flights], stack) for each in evidence.campaigns)
-    each_own = (_of_kind(item, stack, flights) for flights in several)
-    return next((own for own in each_own if len(own) and all(map(_is_kept, own["path"]))), None)
+    several = (Flights.pooled([source.flights], stack) for source in evidence.campaigns)
+    own = (_of_kind(item, stack, flights) for flights in several)
+    return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)
 
 
 def _is_kept(run: str | None) -> bool:

@@ -60,14 +60,13 @@ def panel(rows: Iterable[_Row], paper: float | None = None) -> list[Strip]:
         paper: the largest increase without a detector.
     """
     return [
-        Strip(
-            label=label,
-            values=flights.increases,
-            style=_STYLES[detector],
-            paper=None if detector else paper,
-        )
+        _strip(label, detector, flights, None if detector else paper)
         for label, detector, flights in rows
     ]
+
+
+def _strip(label: str, detector: str | None, flights: Flights, paper: float | None) -> Strip:
+    return Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
 
 
 def _number(name: str, *keys: object) -> float | None:
@@ -119,16 +118,19 @@ def _fig12(flights: Flights) -> _Panels:
 
 
 def _fig14(flights: Flights) -> _Panels:
+    """The paper gives shares of the worst increase that are recovered, which give what is left."""
     panels = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
-        rows: list[_Row] = [("no protection", None, here.faulty())]
-        rows += [
-            (f"{name.upper()} {_short(stages)}", name, here.faulty(name, protect=stages))
-            for name in DETECTOR_TITLES
-            for stages in PROTECTED
-        ]
-        panels[world] = panel(rows)
+        worst = _number("fig12", "worst_increase_percent", world)
+        strips = panel([("no protection", None, here.faulty())], worst)
+        for name in DETECTOR_TITLES:
+            for stages in PROTECTED:
+                share = _number("fig14", "recovered_percent", name, world, stages)
+                left = worst * (1.0 - share / PERCENT) if worst and share else None
+                mine = here.faulty(name, protect=stages)
+                strips.append(_strip(f"{name.upper()} {_short(stages)}", name, mine, left))
+        panels[world] = strips
     return panels
 
 

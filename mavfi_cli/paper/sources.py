@@ -26,7 +26,6 @@ from mavfi_cli.paper.status import of_kernels
 
 STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _EXPORT, _SPEC = ".parquet", ".toml"
-_Kernels = Mapping[str, Any]
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
 
 
@@ -70,16 +69,37 @@ class CampaignSource:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class KernelSource:
+    """Attacked kernels.
+
+    Attributes:
+        path: of the summary that `mavfi kernels --out` writes.
+        kernels: a part of the summary for each kernel.
+        seed: of the faults.
+        flight: the flight whose inputs the kernels had.
+    """
+
+    path: Path
+    kernels: Sequence[Mapping[str, Any]]
+    seed: int
+    flight: str
+
+    @property
+    def runs(self) -> int:
+        """Runs of all kernels."""
+        return sum(part["runs"] for part in self.kernels)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """All that was found.
 
     Attributes:
-        kernels: path and summary of attacked kernels, which `mavfi kernels --out` writes.
         problems: what could not be read, is incomplete, or does not fit, a sentence each.
     """
 
     campaigns: Sequence[CampaignSource]
-    kernels: Sequence[_Kernels]
+    kernels: Sequence[KernelSource]
     problems: Sequence[str]
 
     @classmethod
@@ -93,7 +113,7 @@ class Evidence:
             RecordError: a place does not exist, or nothing in them can be read.
         """
         campaigns: list[CampaignSource] = []
-        kernels: list[_Kernels] = []
+        kernels: list[KernelSource] = []
         problems: list[str] = []
         for place in places:
             before = len(campaigns) + len(kernels) + len(problems)
@@ -113,15 +133,16 @@ class Evidence:
         if not any(len(each.flights) for each in campaigns) and not kernels:
             none = (f"{each.path}: no mission has flown yet" for each in campaigns)
             raise RecordError("; ".join(each.rstrip(".") for each in problems or none))
-        problems += [*_incomplete(campaigns), *_mixed(campaigns), *_repeated(kernels)]
+        problems += [
+            *_incomplete(campaigns), *_unpaired(campaigns), *_mixed(campaigns),
+            *_repeated(kernels),
+        ]  # fmt: skip
         return cls(campaigns=campaigns, kernels=kernels, problems=problems)
 
     @property
     def isolated(self) -> Mapping[str, Mapping[str, Any]]:
         """The summary of each attacked kernel; of several, that of the last source."""
-        return {
-            part["kernel"]: part for each in self.kernels for part in each["summary"]["kernels"]
-        }
+        return {part["kernel"]: part for source in self.kernels for part in source.kernels}
 
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
@@ -150,7 +171,7 @@ def _inside_campaign(path: Path, place: Path) -> bool:
     return any((each / LEDGER).is_file() for each in above)
 
 
-def _read(path: Path) -> CampaignSource | _Kernels:
+def _read(path: Path) -> CampaignSource | KernelSource:
     if path.name == LEDGER:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
@@ -167,12 +188,15 @@ def _from_ledger(folder: Path) -> CampaignSource:
     return _campaign(folder, spec, table, origin, name=origin["name"] or folder.name, again=again)
 
 
-def _from_summary(path: Path) -> _Kernels:
+def _from_summary(path: Path) -> KernelSource:
     summary = kernel_summary(path)
-    # All that the page shows of it.
-    of_kernels(summary), [part["runs"] + 0 for part in summary["kernels"]]
-    summary["plan"]["seed"], summary["plan"]["flight"]
-    return {"path": path, "summary": summary}
+    of_kernels(summary)  # needs all that the page shows of it
+    plan = summary["plan"]
+    source = KernelSource(
+        path=path, kernels=summary["kernels"], seed=plan["seed"], flight=plan["flight"]
+    )
+    source.runs + 0
+    return source
 
 
 def _from_export(path: Path) -> CampaignSource:
@@ -215,14 +239,37 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
             yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
 
 
-def _repeated(kernels: Sequence[_Kernels]) -> Iterator[str]:
+def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
+    """Flights that tell nothing of the paper: without golden flights, or of other missions."""
+    pooled = Flights.pooled([source.flights for source in campaigns])
+    paired = {
+        changes
+        for changes, own in zip(pooled["changes"], pooled["own_lost"], strict=True)
+        if own is not None
+    }
+    for source in campaigns:
+        faulty = source.flights.chosen(level=("source", "instruction"))
+        alone = sum(changes not in paired for changes in faulty["changes"])
+        if alone:
+            yield (
+                f"{source.path.name}: {alone:,} of {len(faulty):,} flights with a fault have no "
+                "golden flight of the same mission here, so they show no effect of the fault."
+            )
+        if len(source.flights) and not any(source.flights["as_paper"]):
+            yield (
+                f"{source.path.name}: no flight is like the paper's (its vehicle, speed and "
+                "sensors, and one flip of drawn bits), so none judges a claim."
+            )
+
+
+def _repeated(kernels: Sequence[KernelSource]) -> Iterator[str]:
     first: dict[str, Path] = {}
-    for each in kernels:
-        for part in each["summary"]["kernels"]:
+    for source in kernels:
+        for part in source.kernels:
             name = part["kernel"]
             if name in first:
-                yield f"{first[name]} and {each['path']} both have {name}; the latter counts."
-            first[name] = each["path"]
+                yield f"{first[name]} and {source.path} both have {name}; the latter counts."
+            first[name] = source.path
 
 
 def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""What an effect with its interval says about the range that a claim gives.
+"""Claims, and what an effect with its interval says about the range that a claim gives.
 
 The range was written before the data, in claims.toml. A verdict is a test of the nearest end of the
 range. The tests of one figure or table are a family, corrected by S. Holm (Scand. J. Statistics 6,
@@ -8,13 +8,16 @@ range. The tests of one figure or table are a family, corrected by S. Holm (Scan
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
+from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.shares import Interval, wilson, z_of
 
+ISOLATED = "isolated kernels"
 LEVEL = 0.05  # of a family
 _FAMILY = 4  # claims of a figure or table that `margin` allows for
 _STEP = 0.005  # margins are multiples of half a point
@@ -65,6 +68,52 @@ class Judgement:
     why: str = ""
     p: float = 1.0
     needed: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claim:
+    """A claim of the paper, as claims.toml explains.
+
+    Attributes:
+        item: table, figure or section, such as `fig6`.
+        find: the finding of a stack's flights and of the isolated kernels.
+        low, high: ends of the range of the effect.
+        rule: the range, and where it comes from, in words.
+        isolated: whether it is about isolated kernels and no flights.
+        fates: what the faults may do to their nodes; each is judged by itself.
+    """
+
+    name: str
+    item: str
+    words: str
+    effect: str
+    find: Callable[[Flights, Mapping[str, Mapping[str, Any]]], Finding]
+    low: float
+    high: float
+    rule: str
+    paper: str = "no number printed"
+    unit: str = "points"
+    paper_tells: str = "drawn only, without counts"
+    premise: str = ""
+    isolated: bool = False
+    fates: tuple[Fate, ...] = tuple(Fate)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgedClaim:
+    """A claim with its verdicts.
+
+    Attributes:
+        judgements: of each stack, or of ISOLATED, by what the faults do to their nodes.
+    """
+
+    claim: Claim
+    judgements: Mapping[str, Mapping[Fate, Judgement]]
+
+    def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
+        """The verdict on a stack, or of ISOLATED; None if it is not judged there."""
+        found = self.judgements.get(place, {}).get(fate)
+        return None if found is None else found.verdict
 
 
 def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) -> list[Judgement]:

@@ -193,6 +193,7 @@ _PAPER: dict[str, Any] = {
     "markeredgewidth": 0.9, "linestyle": "none",
 }  # fmt: skip
 _TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
+_OUTLIER, _LINEAR = 200.0, 20.0  # %; beyond the first the axis is logarithmic from the second on
 _LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
 _NAME = 36  # characters in a line of a row's name
 
@@ -312,12 +313,25 @@ def draw_strips(
     for axes, strips in zip(drawn, panels.values(), strict=True):
         for y, strip in enumerate(strips):
             _strip(axes, y, strip)
+    longest = (strip.values.max() for x in panels.values() for strip in x if len(strip.values))
+    if max(longest, default=0.0) > _OUTLIER:
+        _compress(drawn[0])  # the panels share their horizontal axis
     figure.supxlabel(quantity, fontsize=SMALLEST + 0.5, color=INK)
     printed = any(strip.paper is not None for strips in panels.values() for strip in strips)
     ours = drawn[0].plot([], [], "|", color=INK, markersize=7, label="longest", markeredgewidth=1.4)
     paper = "paper's longest" if printed else ""
     _explain(figure, ours, paper, "upper", columnspacing=1.0, handletextpad=0.3)
     return figure
+
+
+def _compress(axes: Axes) -> None:
+    """Make the horizontal axis logarithmic beyond _LINEAR."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    axes.set_xscale("symlog", linthresh=_LINEAR)
+    axes.xaxis.set_major_locator(FixedLocator([-100, -_LINEAR, 0, _LINEAR, 100, 1000, 10000]))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
 
 
 def _strip(axes: Axes, y: int, strip: Strip) -> None:

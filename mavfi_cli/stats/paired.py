@@ -280,15 +280,3 @@ def recovered_share(
     loss = rates[0] - rates[1]
     value = (rates[2] - rates[1]) / loss if loss else math.nan
     return Interval(value=value, low=float(low), high=float(high), count=faulty[1])
-
-
-def excess_over_mean(golden: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
-    """The longest of the golden and of the other flights over the mean golden one, minus 1.
-
-    Unpaired: the reading that the paper's words allow. The first number is what the flights differ
-    by without any fault. NaN if either has no flight.
-    """
-    if not golden or not others:
-        return math.nan, math.nan
-    reference = math.fsum(golden) / len(golden)
-    return max(golden) / reference - 1.0, max(others) / reference - 1.0

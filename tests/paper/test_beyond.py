@@ -24,19 +24,19 @@ def test_a_struck_kernel_is_told_by_the_flight():
         struck_kernel(6, **LOST),
     ]
     (flow,) = kernel_flows(flights(rows), {"rrtstar": (30, 100)})
-    counts = {fate: (each.count, each.total) for fate, each in flow["fates"].items()}
+    counts = {fate: (each.count, each.total) for fate, each in flow.fates.items()}
     assert counts == {
         "never read": (0, 1), "same flight": (0, 1), "changed flight": (1, 2), "crashed": (1, 1),
         "hung": (0, 1),
     }  # fmt: skip
-    assert (flow["lost"].count, flow["harmed"].count) == (2, 2)
-    assert flow["given_silent"][0] == pytest.approx((1 / 6) / 0.3)  # one lost without a crash
+    assert (flow.lost.count, flow.harmed.count) == (2, 2)
+    assert flow.given_silent[0] == pytest.approx((1 / 6) / 0.3)  # one lost without a crash
 
 
 def test_a_quotient_above_1_is_no_probability():
     rows = [row(seed=1), struck_kernel(1, **LOST)]
     (flow,) = kernel_flows(flights(rows), {"rrtstar": (1, 100)})
-    assert flow["given_silent"] is None
+    assert flow.given_silent is None
 
 
 def test_a_state_is_told_by_its_highest_bit():
@@ -49,12 +49,13 @@ def test_a_state_is_told_by_its_highest_bit():
         row("planning", seed=3, struck_state="plan_trajectory_seq", struck_bits=[[15]], **where),
     ]  # fmt: skip
     cells = state_map(flights(rows))
-    assert cells.keys() == {
+    found = {(each.state, each.bits, each.phase): each.lost.count for each in cells}
+    assert found.keys() == {
         ("waypoint_x", "exponent 62 to 57", "flying"),
         ("waypoint_position", "bit 63, sign", "flying"),
         ("plan_trajectory_seq", "bits 15 to 8", "flying"),
     }
-    assert cells["waypoint_x", "exponent 62 to 57", "flying"]["lost"].count == 1
+    assert found["waypoint_x", "exponent 62 to 57", "flying"] == 1
 
 
 def test_failures_an_hour_follow_the_rate_and_the_detector():
@@ -62,9 +63,9 @@ def test_failures_an_hour_follow_the_rate_and_the_detector():
     rows += [row("planning", seed=1, **LOST), row("planning", seed=2)]
     rows += [row("planning", seed=seed, detector="aad") for seed in (1, 2)]
     (found,) = hourly_failures(flights(rows), 0.5)
-    assert found["where"] == "state: planning, sparse"
-    assert found["per_hour"][""][0] == pytest.approx(0.25)
-    assert found["per_hour"]["aad"][0] == 0.0
+    assert found.where == "state: planning, sparse"
+    assert found.per_hour[""][0] == pytest.approx(0.25)
+    assert found.per_hour["aad"][0] == 0.0
 
 
 def test_faults_of_other_kinds_are_counted_apart():
@@ -73,7 +74,7 @@ def test_faults_of_other_kinds_are_counted_apart():
         row("waypoint_position", seed=1, fault=how, **LOST)
         for how in ({}, {"field": "exponent", "together": True}, {"bits": 5})
     ]
-    found = {each["where"]: each["lost"][""].total for each in hourly_failures(flights(rows), 1.0)}
+    found = {each.where: each.lost[""].total for each in hourly_failures(flights(rows), 1.0)}
     assert found == {
         "state: waypoint_position, sparse": 1,
         "state: waypoint_position, exponent, all components, sparse": 1,
@@ -87,7 +88,7 @@ def test_a_detector_of_one_stage_is_not_counted_as_one_of_all_stages():
     rows.append(row("planning", seed=1, detector="gad"))
     rows += [row("planning", seed=1, detector="gad", protect=("control",), **LOST)]
     (found,) = hourly_failures(flights(rows), 1.0)
-    assert (found["lost"]["gad"].count, found["lost"]["gad"].total) == (0, 1)
+    assert (found.lost["gad"].count, found.lost["gad"].total) == (0, 1)
 
 
 def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
@@ -99,12 +100,12 @@ def test_arms_are_counted_on_the_faults_that_the_unprotected_flight_read():
         rows += [row(seed=seed), row("waypoint_position", seed=seed, activation=read, **lost)]
         rows += [row("waypoint_position", seed=seed, **guard)]
     plain, guarded = arms(flights(rows))
-    assert (plain["name"], guarded["name"]) == ("unprotected", "tracking guard")
-    assert (plain["lost"].count, plain["lost"].total) == (5, 6)
-    assert (guarded["lost"].count, guarded["lost"].total) == (0, 6)
-    assert guarded["by_site"]["position"].total == 6
-    assert guarded["p_value"] == guarded["corrected_p"] == pytest.approx(2 / 2**5)
-    assert plain["p_value"] is None
+    assert (plain.name, guarded.name) == ("unprotected", "tracking guard")
+    assert (plain.lost.count, plain.lost.total) == (5, 6)
+    assert (guarded.lost.count, guarded.lost.total) == (0, 6)
+    assert guarded.by_site["position"].total == 6
+    assert guarded.p_value == guarded.corrected_p == pytest.approx(2 / 2**5)
+    assert plain.p_value is None
 
 
 def test_variants_of_the_stack_with_all_checks_are_arms_of_their_own():
@@ -112,7 +113,7 @@ def test_variants_of_the_stack_with_all_checks_are_arms_of_their_own():
     for stack in ("mavbench-protected", "mavbench-protected:guards_tracking=true"):
         lost = LOST if ":" in stack else {}
         rows.append(row("planning", seed=1, config={"stack": stack}, **lost))
-    found = {arm["name"]: arm["lost"].count for arm in arms(flights(rows))}
+    found = {arm.name: arm.lost.count for arm in arms(flights(rows))}
     assert found == {"unprotected": 1, "all four checks": 0, "all four checks, tracking guard": 1}
 
 

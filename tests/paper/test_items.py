@@ -20,6 +20,7 @@ def shown(monkeypatch):
     """What is shown of Fig. 13 on `mavbench`, and the run folders that are drawn."""
     monkeypatch.setattr(document, "ITEMS", [FIG13])
     monkeypatch.setattr(document, "draw", lambda *given: given[1]["path"])
+    monkeypatch.setattr(document.Picture, "of", lambda *given: given[2])
 
     def of(*exports):
         tables = [Flights.of(each) for each in exports]
@@ -28,8 +29,8 @@ def shown(monkeypatch):
             for each in tables
         ]
         evidence = Evidence(campaigns=campaigns, kernels=[], problems=[])
-        shown = document.document(evidence)["items"]
-        return next(each for item in shown for each in item["shown"] if each["stack"] == "mavbench")
+        shown = document.document(evidence).items
+        return next(each for item in shown for each in item.parts if each.place == "mavbench")
 
     return of
 
@@ -53,11 +54,11 @@ def export(seed, folder=None):
 
 def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):
     found = shown(export(1), export(2, tmp_path))
-    assert found["figure"] == [str(tmp_path)] * len(KINDS)
-    assert found["table"] is not None
+    assert found.picture == [str(tmp_path)] * len(KINDS)
+    assert found.table is not None
 
 
 def test_without_run_folders_there_is_a_table_and_no_picture(shown, tmp_path):
     found = shown(export(1), export(2, tmp_path / "gone"))
-    assert found["figure"] is None
-    assert found["table"] is not None
+    assert found.picture is None
+    assert found.table is not None

@@ -1,15 +1,20 @@
 """The report as plain values: its sentences, its tables, its commands."""
 
+import re
 from pathlib import Path
 
 import pytest
-from made_flights import export_table, row
+from made_flights import export_table, flights, row
 
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Fate, Flights
+from mavfi_cli.paper.answers import REASONS, delay_sentence, delays, disagreements, protections
+from mavfi_cli.paper.claims import CLAIMS
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.sources import CampaignSource, Evidence
 from mavfi_cli.paper.verdicts import Verdict
+
+LOST = {"outcome": "timeout"}
 
 
 def evidence(rows, name="mine", problems=()):
@@ -39,32 +44,26 @@ def effect_of(judged, stack="mavbench"):
     return by_fate[Fate.ALL].effect if by_fate else None
 
 
-def test_five_sentences_say_what_was_counted(told):
-    assert told["extent"] == "4 of 69 claims are judged by 30 missions."
-    verdicts, cost, saved, saved_of_states, crashes = told["summary"]
-    judged = {each.claim.name for each in told["claims"] if effect_of(each)}
+def test_the_answer_counts_what_is_judged(told):
+    assert told.extent == "30 missions judge 4 of 69 claims."
+    judged = {each.claim.name for each in told.claims if effect_of(each)}
     assert judged == {"table4-golden-dense", "table4-dense", "fig12-dense", "fig13-planning"}
-    assert verdicts.startswith("Of 4 claims flown on mavbench, ")
-    assert cost == (
-        "On mavbench, a bit flip in an instruction loses 20 % (2 of 10; 95 % interval 6 to 51 %) "
-        "of the missions whose golden flight succeeds."
+    assert re.match(r"(Yes|No|Only in part|Not known yet): of the 4 claims", told.answer)
+    assert sum(map(int, re.findall(r"(\d+) (?:is|are)", told.answer))) == 4
+    counts = told.verdicts()["mavbench"]
+    assert sum(counts.values()) - counts["not decidable"] == 4
+
+
+def test_lost_missions_are_told_to_follow_dead_nodes(told):
+    assert told.crashes.endswith(
+        "2 of 2 missions that a fault in an instruction loses follow a node that crashed or hung."
     )
-    assert saved == (
-        "On mavbench, of the missions that a fault in an instruction loses, the autoencoder saves "
-        "50 % (1 of 2; 95 % interval 9 to 91 %)."
-    )
-    assert saved_of_states == (
-        "No mission that a fault in a state loses was flown again with a detector."
-    )
-    assert crashes.startswith("All 2 missions that a fault in an instruction loses follow a node")
 
 
 def test_a_mission_that_is_lost_without_a_fault_is_not_lost_by_it():
     rows = [row(seed=1, outcome="collision")]
     rows.append(row("planning", seed=1, instruction=True, outcome="collision"))
-    assert document(evidence(rows))["summary"][-1] == (
-        "No fault in an instruction has lost a mission."
-    )
+    assert document(evidence(rows)).crashes == ""
 
 
 def test_missions_unlike_the_papers_judge_no_claim():
@@ -73,31 +72,20 @@ def test_missions_unlike_the_papers_judge_no_claim():
     first = {"seed": 1, "fault": {"at": "invocation=1"}, "outcome": "timeout", **where}
     rows = [row(seed=1), row("planning", seed=1), row("waypoint_x", **first)]
     told = document(evidence(rows))
-    assert told["extent"] == "1 of 69 claims are judged by 2 missions."
-    assert [each["where"] for each in told["hourly"]["mavbench"]] == ["state: planning, sparse"]
-    assert [each["lost"] for each in told["map_rows"]] == [1]
+    assert told.extent == "2 missions judge 1 of 69 claims."
+    assert [each.where for each in told.hourly["mavbench"]] == ["state: planning, sparse"]
+    assert told.map_csv.splitlines()[1].endswith(",1,1,1")
 
 
 def test_the_picture_of_faults_in_states_has_the_flights_of_its_data():
     rows = [row(seed=1), row("planning", seed=1)]
     rows += [row("planning", seed=1, detector=name) for name in ("aad", "range")]
-    spread = document(evidence(rows))["spreads"]["mavbench"]
-    assert {each["detector"] for each in spread["rows"]} == {"", "aad"}
-
-
-def test_the_longest_flight_is_paired_and_unpaired():
-    times = {1: (20.0, 30.0), 2: (10.0, 18.0)}  # golden, with a fault
-    rows = [row(seed=seed, time_s=own) for seed, (own, _) in times.items()]
-    rows += [row("planning", seed=seed, time_s=longer) for seed, (_, longer) in times.items()]
-    (worst,) = document(evidence(rows))["worst"]
-    assert worst["paired"] == pytest.approx(0.8)  # 18 over its own 10
-    assert worst["unpaired"] == pytest.approx(1.0)  # 30 over the mean of 20 and 10
-    assert worst["golden"] == pytest.approx(20 / 15 - 1)
-    assert (worst["longer"], worst["flights"]) == (1.0, 2)
+    (spread,) = document(evidence(rows)).spreads
+    assert {line.split(",")[1] for line in spread.csv.splitlines()[1:]} == {"", "aad"}
 
 
 def test_what_a_detector_undoes_and_causes_stands_by_level_and_by_fate(told):
-    rows = {row.fate: row for row in told["balances"]}
+    rows = {row.fate: row for row in told.balances}
     assert {(row.level, row.computer, row.detector) for row in rows.values()} == {
         ("instruction", "x86", "aad")
     }
@@ -107,32 +95,73 @@ def test_what_a_detector_undoes_and_causes_stands_by_level_and_by_fate(told):
     assert [row.lost.caused for row in rows.values()] == [0, 0, 0]
 
 
-def test_what_detectors_save_of_states_has_a_sentence_of_its_own():
-    rows = [row(seed=1), row("planning", seed=1, outcome="timeout")]
-    rows += [row("planning", seed=1, detector="gad")]
-    assert document(evidence(rows))["summary"][3] == (
-        "On mavbench, of the missions that a fault in a state loses, the Gaussian detector saves "
-        "100 % (1 of 1; 95 % interval 21 to 100 %)."
+def test_added_time_is_that_of_the_same_faults():
+    rows = [row(seed=seed) for seed in (1, 2, 3)]
+    for seed, time_s in ((1, 20.0), (2, 23.0), (3, 20.5)):
+        lost = {"outcome": "timeout"} if seed == 3 else {}
+        rows.append(row("planning", seed=seed, time_s=time_s, **lost))
+    rows += [row("planning", seed=seed, detector="gad", time_s=22.0) for seed in (1, 2)]
+    (delay,) = delays("mavbench", flights(rows))
+    assert [*delay.added_s[None]] == [0.0, pytest.approx(3.0)]  # seed 3 has no flight with GAD
+    assert [*delay.added_s["gad"]] == [pytest.approx(2.0)] * 2
+    assert delay.golden_s == pytest.approx(20.0)
+    assert delay_sentence([delay]) == (
+        "Of 2 faults in states, 1 lose the mission or delay it by over 1 s without a detector, "
+        "2 with the Gaussian detector."
     )
 
 
-def test_nothing_flown_is_said_in_sentences_too():
+def test_a_lost_mission_is_longer_than_any():
+    (delay,) = delays("mavbench", flights([row(seed=1), row("planning", seed=1, **LOST)]))
+    assert [*delay.added_s[None]] == [float("inf")]
+
+
+@pytest.mark.parametrize(
+    ("lost", "saved", "effect"),
+    [(8, True, "helps"), (3, True, "no proven effect"), (8, False, "harms"),
+     (0, True, "nothing to undo")],
+)  # fmt: skip
+def test_a_protection_helps_or_harms_beyond_chance(lost, saved, effect):
+    rows = [row(seed=seed) for seed in range(1, 11)]
+    for seed in range(1, 11):
+        end = LOST if seed <= lost else {}
+        rows.append(row("planning", seed=seed, **(end if saved else {})))
+        rows.append(row("planning", seed=seed, detector="gad", **({} if saved else end)))
+    (gad,) = protections({"mavbench": flights(rows)})
+    cell = gad.against["a wrong value in a state"]
+    undone, caused = (lost, 0) if saved else (0, lost)
+    before = lost if saved else 0
+    assert cell.effect == effect
+    assert cell.counts == f"{undone} of {before} undone, {caused} caused; 10 pairs"
+    assert gad.against["a fault in an instruction, silent"] is None
+
+
+def test_another_stack_is_compared_in_the_same_scenes():
+    one, two = [], []
+    for seed in range(1, 21):
+        for stack, rows in (("mavbench", one), ("hardened", two)):
+            if stack == "mavbench" or seed > 10:
+                config = {"stack": stack}
+                end = LOST if stack == "mavbench" else {}
+                rows += [row(seed=seed, config=config),
+                         row("planning", seed=seed, config=config, **end)]  # fmt: skip
+    (other,) = protections({"mavbench": flights(one), "hardened": flights(two)})
+    cell = other.against["a wrong value in a state"]
+    assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10, not 10 of 10")
+
+
+def test_nothing_judged_is_said():
     found = document(evidence([row(config={"world": "nowhere"})]))
-    assert found["summary"] == [
-        "None of the claims has been flown yet.",
-        "No flight with a fault has a golden flight beside it, so the cost is not known.",
-        "No mission that a fault in an instruction loses was flown again with a detector.",
-        "No mission that a fault in a state loses was flown again with a detector.",
-        "No fault in an instruction has lost a mission.",
-    ]
+    assert found.answer == "Nothing here decides a claim of the paper."
+    assert (found.crashes, found.forest, found.delays, found.protections) == ("", None, None, [])
 
 
 def test_every_claim_is_judged_on_each_stack(told):
-    assert told["problems"] == ["something is missing."]
-    for each in told["claims"]:
+    assert told.problems == ["something is missing."]
+    for each in told.claims:
         stacks = {"isolated kernels"} if each.claim.isolated else {"mavbench", "hardened"}
         assert each.judgements.keys() == stacks
-    by_name = {each.claim.name: each for each in told["claims"]}
+    by_name = {each.claim.name: each for each in told.claims}
     assert by_name["table4-dense"].judgements["hardened"][Fate.ALL].why == "not flown"
     assert by_name["fig15-tmr"].verdict("mavbench") is Verdict.NOT_DECIDABLE
 
@@ -141,34 +170,62 @@ def test_an_effect_without_an_interval_is_no_number():
     """The mean cost of one flight."""
     costs = dict.fromkeys(COSTS, 0.01)
     told = document(evidence([row("planning", instruction=True, detector="gad", **costs)]))
-    (gad,) = (each for each in told["claims"] if each.claim.name == "table5-gad")
+    (gad,) = (each for each in told.claims if each.claim.name == "table5-gad")
     assert effect_of(gad) is None
     assert gad.verdict("mavbench") is Verdict.NOT_DECIDABLE
 
 
 def test_failures_an_hour_are_at_the_rate(told):
-    (hourly,) = told["hourly"]["mavbench"]
-    assert hourly["per_hour"][""][0] == pytest.approx(0.4)
+    (hourly,) = told.hourly["mavbench"]
+    assert hourly.per_hour[""][0] == pytest.approx(0.4)
 
 
 def test_lost_and_longest_missions_have_their_command(told):
-    (mine,) = told["missions"]
-    assert [each["number"] for each in mine["lost"]] == [1, 4, 5]
-    assert mine["lost"][0]["command"] == "mavfi replay mine.parquet --mission 1"
-    assert mine["longest"][0]["number"] == 28  # seed 10: 21 s
-    assert mine["longest"][0]["ratio"] == pytest.approx(1.05)
+    (mine,) = told.missions
+    assert [each.number for each in mine.lost] == [1, 4, 5]
+    assert mine.lost[0].command == "mavfi replay mine.parquet --mission 1"
+    assert mine.longest[0].number == 28  # seed 10: 21 s
+    assert mine.longest[0].ratio == pytest.approx(1.05)
 
 
 def test_a_command_can_be_pasted_whatever_the_name_of_the_folder():
-    (mine,) = document(evidence([row(outcome="crash")], name="my flights"))["missions"]
-    assert mine["lost"][0]["command"] == "mavfi replay 'my flights.parquet' --mission 0"
+    (mine,) = document(evidence([row(outcome="crash")], name="my flights")).missions
+    assert mine.lost[0].command == "mavfi replay 'my flights.parquet' --mission 0"
 
 
 def test_a_kept_run_is_replayed_from_its_folder_as_long_as_it_is_there(tmp_path):
     rows = [row(), row("planning", outcome="crash", path=str(tmp_path))]
     rows.append(row("control", outcome="crash", path=str(tmp_path / "removed")))
-    (mine,) = document(evidence(rows))["missions"]
-    assert [each["command"] for each in mine["lost"]] == [
+    (mine,) = document(evidence(rows)).missions
+    assert [each.command for each in mine.lost] == [
         f"mavfi replay {tmp_path}",
         "mavfi replay mine.parquet --mission 2",
     ]
+
+
+def test_a_kept_flight_has_its_picture_and_a_link_to_a_file_is_none(tmp_path):
+    secret = tmp_path / "secret.svg"
+    secret.write_text("<svg>secret</svg>")
+    rows = [row()]
+    for place, name in enumerate(("kept", "link", "none")):
+        run = tmp_path / name
+        run.mkdir()
+        if name == "kept":
+            (run / "flight.svg").write_text("<svg></svg>")
+        elif name == "link":
+            (run / "flight.svg").symlink_to(secret)
+        rows.append(row("planning", seed=place + 1, outcome="crash", path=str(run)))
+    (mine,) = document(evidence(rows)).missions
+    assert [bool(each.picture) for each in mine.lost] == [True, False, False]
+    assert mine.lost[0].picture.startswith("data:image/svg+xml;base64,")
+
+
+def test_reasons_are_of_claims_and_grouped(told):
+    assert REASONS.keys() <= {claim.name for claim in CLAIMS}
+    groups = disagreements(told.claims, "mavbench")
+    assert all(each.claims for each in groups)
+    names = [name for each in groups for name in each.names]
+    assert names == [
+        each.claim.name for each in told.claims
+        if each.verdict("mavbench") is Verdict.CONTRADICTED
+    ]  # fmt: skip

@@ -188,8 +188,8 @@ def test_a_kernel_in_two_places_counts_once(tmp_path):
     assert first["runs"] == 7
     assert len(found.problems) == 2
     assert found.problems[0].endswith(f"both have {first['kernel']}; the latter counts.")
-    fig6 = next(each for each in document(found)["items"] if each["item"].name == "fig6")
-    assert [len(part["table"].rows) for part in fig6["shown"]] == [2]
+    fig6 = next(each for each in document(found).items if each.item.name == "fig6")
+    assert [len(part.table.rows) for part in fig6.parts] == [2]
 
 
 def test_a_mission_in_two_places_counts_once(export):
@@ -217,14 +217,28 @@ def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
     rows.append(row("waypoint_position", seed=7, fault={"field": "sign"}))  # not all components
     found = Evidence.gather([export("a.parquet", *rows)])
     shown = {
-        (each["item"].name, part["stack"]): part
-        for each in document(found)["items"]
-        for part in each["shown"]
+        (each.item.name, part.place): part for each in document(found).items for part in each.parts
     }
     found = shown["fig9", "mavbench"]
-    counts = {line.labels[0]: line.cells[0].count for line in found["table"].rows}
+    counts = {line.labels[0]: line.cells[0].count for line in found.table.rows}
     assert counts == {"golden": 2, "sign": 2, "mantissa": 2}
-    assert {each["fault_field"] for each in found["flights"]} == {"sign", "mantissa"}
+    assert "fault_field" in found.picture.csv.partition("\n")[0]
     absent = {("fig9", "hardened"), ("table4", "mavbench"), ("fig6", "isolated kernels")}
     assert not absent & shown.keys()
-    assert shown["fig15", "performance model"]["figure"] is not None
+    assert shown["fig15", "performance model"].picture is not None
+
+
+def test_flights_without_their_golden_ones_are_said_to_show_nothing(export):
+    alone = Evidence.gather([export("alone.parquet", row("planning", seed=1))])
+    assert any("1 of 1 flights with a fault have no golden flight" in x for x in alone.problems)
+    both = Evidence.gather([
+        export("faults.parquet", row("planning", seed=1)), export("golden.parquet", row(seed=1)),
+    ])  # fmt: skip
+    assert not any("no golden flight" in problem for problem in both.problems)
+
+
+def test_missions_of_another_paper_are_said_to_judge_nothing(export):
+    config = {"v_max_mps": 0.6}
+    rows = [row(seed=1, config=config), row("planning", seed=1, config=config)]
+    found = Evidence.gather([export("slow.parquet", *rows)])
+    assert any("slow.parquet: no flight is like the paper's" in x for x in found.problems)

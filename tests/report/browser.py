@@ -13,9 +13,9 @@ _PROBE = """
 <script>
 const found = {claims: [], overlaps: [], cut: [], wide: document.documentElement.scrollWidth,
   width: window.innerWidth, errors: window.pageErrors};
-for (const row of document.querySelectorAll('tr[id^="claim-"]'))
+for (const row of document.querySelectorAll('[id^="claim-"]'))
   found.claims.push({name: row.id.slice(6), words: row.querySelector('.words').innerText,
-    verdicts: [...row.querySelectorAll('.verdict')].map(each => each.innerText.trim())});
+    verdicts: [...row.querySelectorAll('.verdict')].map(each => each.textContent.trim())});
 for (const picture of document.querySelectorAll('figure svg')) {
   const frame = picture.getBoundingClientRect();
   const texts = [...picture.querySelectorAll('text')].filter(each => each.textContent.trim());
@@ -30,6 +30,9 @@ for (const picture of document.querySelectorAll('figure svg')) {
     }
   });
 }
+document.getElementById('show-contradicted').checked = true;
+found.filtered = [...document.querySelectorAll('details.claim')]
+  .filter(each => each.offsetParent !== null).map(each => each.id.slice(6));
 const outside = parent.document;
 outside.body.innerHTML = '<pre id="probe"></pre>';
 outside.getElementById('probe').textContent = JSON.stringify(found);

@@ -10,7 +10,6 @@ from scipy import stats
 
 from mavfi_cli.stats.paired import (
     McNemar,
-    excess_over_mean,
     net_share,
     paired_difference,
     recovered_share,
@@ -71,11 +70,6 @@ def test_recovered_is_a_ratio_whose_interval_is_wide_at_the_papers_n():
     sure = recovered_share((10_000, 10_000), (7_000, 10_000), (9_000, 10_000))
     half = stats.norm.ppf(0.975) * math.sqrt(0.09 + 0.21 / 9) / 100 / 0.3  # the delta method
     assert (sure.low, sure.high) == pytest.approx((2 / 3 - half, 2 / 3 + half), abs=1e-3)
-
-
-def test_the_longest_over_the_mean():
-    assert excess_over_mean([10.0, 20.0, 30.0], [40.0]) == (0.5, 1.0)
-    assert all(map(math.isnan, excess_over_mean([], [40.0])))
 
 
 def test_without_clusters_a_paired_difference_is_that_of_mcnemars_counts():

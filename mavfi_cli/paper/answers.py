@@ -1,0 +1,368 @@
+"""The answers on top of the page: does it reproduce the paper, where not and why, what helps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.pairs import Balance, Fate, Flights
+from mavfi_cli.core.config import read_toml
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.paper.items import BY_NAME, printed_name
+from mavfi_cli.paper.verdicts import ISOLATED, LEVEL, JudgedClaim, Judgement, Verdict
+from mavfi_cli.report.paper import DETECTOR_TITLES
+from mavfi_cli.stats.shares import Share, wilson
+
+LEVELS = {"source": "states", "instruction": "instructions"}
+_COMPUTER = "x86"  # of what protects; the table of balances has all computers
+_KINDS = {  # of faults: level, and what they do to their nodes
+    "a wrong value in a state": ("source", Fate.ALL),
+    "a fault in an instruction, silent": ("instruction", Fate.SILENT),
+    "a fault in an instruction that ends its node": ("instruction", Fate.DEAD),
+}
+
+
+def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
+    """The judgement on a stack, or of isolated kernels; None if there is none for this fate."""
+    place = ISOLATED if judged.claim.isolated else stack
+    return judged.judgements.get(place, {}).get(fate)
+
+
+def short_name(judged: JudgedClaim) -> str:
+    """A claim in two or three words, such as `Fig. 8 velocity`."""
+    item, _, rest = judged.claim.name.partition("-")
+    return f"{printed_name(item)} {rest.replace('-', ' ')}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """The claims of a figure, table or section."""
+
+    name: str
+    title: str
+    claims: Sequence[JudgedClaim]
+
+    @property
+    def short(self) -> str:
+        """The paper's name of it, such as `Fig. 6`."""
+        return printed_name(self.name)
+
+
+def families(claims: Sequence[JudgedClaim]) -> list[Family]:
+    """The claims by figure, table or section, in order."""
+    found = []
+    for name, members in groupby(claims, lambda judged: judged.claim.item):
+        title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
+        found.append(Family(name=name, title=printed_name(name) + title, claims=[*members]))
+    return found
+
+
+# Does it reproduce the paper? ---------------------------------------------------------------------
+
+
+def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
+    """One sentence about a stack and the isolated kernels."""
+    counts = _count_verdicts(claims, stack)
+    yes, no, open_ = (
+        counts[verdict] for verdict in (Verdict.REPRODUCED, Verdict.CONTRADICTED, Verdict.UNDECIDED)
+    )
+    if not yes + no + open_:
+        return "Nothing here decides a claim of the paper."
+    begin = "Only in part" if yes and no else "Yes" if yes else "No" if no else "Not known yet"
+    return (
+        f"{begin}: of the {yes + no + open_} claims that are judged, {yes} {_are(yes)} reproduced, "
+        f"{no} {_are(no)} contradicted, and {open_} {_are(open_)} undecided at this number of "
+        "missions."
+    )
+
+
+def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
+    """How far verdicts and lost missions rest on nodes that die; empty if no fault tells."""
+    parts = []
+    pairs = [
+        (of_all, silent)
+        for judged in claims
+        if (of_all := judgement_of(judged, stack))
+        and (silent := judgement_of(judged, stack, Fate.SILENT))
+    ]
+    yes = [silent.verdict for of_all, silent in pairs if of_all.verdict is Verdict.REPRODUCED]
+    if yes:
+        kept = yes.count(Verdict.REPRODUCED)
+        parts.append(
+            f"Of the {len(yes)} reproduced claims about faults, {kept} {_are(kept)} also "
+            "reproduced by silent faults alone, which the paper studies."
+        )
+    hit = flights.struck(level="instruction", platform=_COMPUTER).chosen(own_lost=False, lost=True)
+    if len(hit):
+        ended = wilson(sum(hit["ended"]), len(hit))
+        parts.append(
+            f"{ended.counts} missions that a fault in an instruction loses follow a node that "
+            "crashed or hung."
+        )
+    return " ".join(parts)
+
+
+def _count_verdicts(claims: Sequence[JudgedClaim], stack: str) -> Counter[Verdict]:
+    """How many claims have which verdict on a stack and for isolated kernels."""
+    found = (judgement_of(judged, stack) for judged in claims)
+    return Counter(judgement.verdict for judgement in found if judgement)
+
+
+def _are(number: int) -> str:
+    return "is" if number == 1 else "are"
+
+
+# Disagreements ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disagreement:
+    """Contradicted claims that one sentence explains.
+
+    Attributes:
+        reason: empty if none is known.
+    """
+
+    claims: Sequence[JudgedClaim]
+    reason: str
+
+    @property
+    def names(self) -> Mapping[str, str]:
+        """The short names of its claims by their names; those of one item begin with it once."""
+        found, item = {}, ""
+        for judged in self.claims:
+            short, item_before, item = short_name(judged), item, judged.claim.item
+            same = f"{printed_name(item)} " if item == item_before else ""
+            found[judged.claim.name] = short.removeprefix(same)
+        return found
+
+
+def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
+    """The contradicted claims by their reason, in the order of the claims."""
+    by_reason: dict[str, list[JudgedClaim]] = {}
+    for judged in claims:
+        judgement = judgement_of(judged, stack)
+        if judgement and judgement.verdict is Verdict.CONTRADICTED:
+            reason = REASONS.get(judged.claim.name, "")
+            by_reason.setdefault(reason or judged.claim.name, []).append(judged)
+    return [
+        Disagreement(claims=mine, reason=REASONS.get(mine[0].claim.name, ""))
+        for mine in by_reason.values()
+    ]
+
+
+def _read_reasons() -> Mapping[str, str]:
+    data, _ = read_toml(Path(__file__).parent / "reasons.toml")
+    return {name: reason["words"] for reason in data["reason"] for name in reason["claims"]}
+
+
+REASONS = _read_reasons()
+"""Why claims are contradicted, by their names; written after the data."""
+
+
+# What a designer should do ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorBalance:
+    """What a detector undoes and what it causes on the same faults.
+
+    Attributes:
+        level: `source` or `instruction`.
+        fate: what the faults do to their nodes.
+        harmed, lost: of harmed and of lost missions.
+    """
+
+    stack: str
+    level: str
+    computer: str
+    detector: str
+    fate: Fate
+    harmed: Balance
+    lost: Balance
+
+
+def detector_balances(stack: str, flights: Flights) -> Iterator[DetectorBalance]:
+    """A balance for each level, computer, detector and fate of which pairs were flown."""
+    watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
+    for level, computer, detector in sorted(watched.by("level", "platform", "detector"), key=str):
+        for fate in Fate if level == "instruction" else (Fate.ALL,):
+            where = {"level": level, "platform": computer}
+            harmed, lost = (
+                flights.of_fate(fate).balance(detector, column=column, **where)
+                for column in ("harmed", "lost")
+            )
+            if harmed.pairs:
+                yield DetectorBalance(
+                    stack=stack, level=level, computer=computer, detector=detector, fate=fate,
+                    harmed=harmed, lost=lost,
+                )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Against:
+    """What a protection does against a kind of fault.
+
+    Attributes:
+        effect: `helps`, `harms`, `no proven effect` or `nothing to undo`, by a test at LEVEL.
+        counts: what it rests on.
+    """
+
+    effect: str
+    counts: str
+
+    @classmethod
+    def of_pairs(cls, balance: Balance) -> _Against | None:
+        """On the same faults, by McNemar's test; None without pairs."""
+        if not balance.pairs:
+            return None
+        counts = (
+            f"{balance.undone:,} of {balance.before:,} undone, {balance.caused:,} caused; "
+            f"{balance.pairs:,} pairs"
+        )
+        ill = balance.before + balance.caused
+        proven = balance.p_value < LEVEL
+        return cls(effect=_effect(ill, balance.undone > balance.caused, proven), counts=counts)
+
+    @classmethod
+    def of_shares(cls, before: Share, after: Share) -> _Against | None:
+        """In the same scenes, by the interval of the difference; None if one is empty."""
+        if not (before.total and after.total):
+            return None
+        change = after.minus(before)
+        proven = change.high < 0.0 or change.low > 0.0
+        counts = f"harmful {after.counts}, not {before.counts}"
+        return cls(
+            effect=_effect(before.count + after.count, change.value < 0, proven), counts=counts
+        )
+
+
+def _effect(ill: int, better: bool, proven: bool) -> str:
+    if not ill:
+        return "nothing to undo"
+    return ("helps" if better else "harms") if proven else "no proven effect"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Safeguard:
+    """What a detector, or another stack, does against each kind of fault, and its cost.
+
+    Attributes:
+        against: by the kind of fault; None where it was not flown.
+        costs: mean share of the flight time, by the words of the level; empty if not measured.
+    """
+
+    name: str
+    against: Mapping[str, _Against | None]
+    costs: Mapping[str, float]
+
+
+def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
+    """The detectors on the first stack, and each other stack instead of the first."""
+    (name, first), *others = flights.items()
+    found = [
+        Safeguard(
+            name=f"{title} detector",
+            against={
+                kind: _Against.of_pairs(
+                    first.of_fate(fate).balance(detector, level=level, platform=_COMPUTER)
+                )
+                for kind, (level, fate) in _KINDS.items()
+            },
+            costs=_costs(first, detector),
+        )
+        for detector, title in DETECTOR_TITLES.items()
+    ]
+    for other, second in others:
+        shares = [_harmed(*both) for both in ((first, second), (second, first))]
+        against = {kind: _Against.of_shares(*(mine[kind] for mine in shares)) for kind in _KINDS}
+        found.append(Safeguard(name=f"{other} instead of {name}", against=against, costs={}))
+    return [protection for protection in found if any(protection.against.values())]
+
+
+def _costs(flights: Flights, detector: str) -> dict[str, float]:
+    """The mean share of the flight time that detection and recovery take, by level."""
+    seen = flights.comparable.struck(detector=detector, platform=_COMPUTER)
+    shares = {level: seen.chosen(level=level).known(*COSTS) for level in LEVELS}
+    return {LEVELS[level]: float(mine.mean()) for level, mine in shares.items() if len(mine)}
+
+
+def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
+    """The harmed missions by kind of fault, in the scenes that other flights share."""
+    scenes = {*zip(others["world"], others["seed"], strict=True)}
+    mine = flights.struck(platform=_COMPUTER)
+    mine = mine.where(scene in scenes for scene in mine.seeds)
+    return {
+        kind: mine.of_fate(fate).chosen(level=level).share("harmed")
+        for kind, (level, fate) in _KINDS.items()
+    }
+
+
+# Added time ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delays:
+    """Added seconds of the same faults without and with detectors.
+
+    Attributes:
+        level: `source` or `instruction`.
+        added_s: by detector, None for none, (n,); infinite of a lost mission.
+        golden_s: mean flight time of the golden flights.
+    """
+
+    stack: str
+    level: str
+    added_s: Mapping[str | None, FloatArray]
+    golden_s: float
+
+
+def delays(stack: str, flights: Flights) -> Iterator[Delays]:
+    """The delays at each level, of the faults that were flown with every detector."""
+    hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
+    for level in ("source", "instruction"):
+        mine = hit.chosen(level=level)
+        by_detector = {
+            name: those
+            for name in (None, *DETECTOR_TITLES)
+            if len(those := mine.chosen(detector=name))
+        }
+        if None not in by_detector:
+            continue
+        shared = set.intersection(*(set(those.faults) for those in by_detector.values()))
+        added = {
+            name: np.sort([
+                np.inf if lost else added
+                for fault, lost, added in zip(
+                    those.faults, those["lost"], those.numbers("added_s"), strict=True
+                )
+                if fault in shared
+            ])
+            for name, those in by_detector.items()
+        }  # fmt: skip
+        golden_s = float(np.nanmean(mine.numbers("own_flight_time_s")))
+        yield Delays(stack=stack, level=level, added_s=added, golden_s=golden_s)
+
+
+def delay_sentence(parts: Sequence[Delays]) -> str:
+    """How many flights take a second longer with a detector than without; empty without one."""
+    sentences = []
+    for part in parts:
+        longer = {name: int((added > 1.0).sum()) for name, added in part.added_s.items()}
+        if len(longer) > 1:
+            bare, faults = longer.pop(None), len(part.added_s[None])
+            watched = " and ".join(
+                f"{count:,} with the {DETECTOR_TITLES[name or '']} detector"
+                for name, count in longer.items()
+            )
+            sentences.append(
+                f"Of {faults:,} faults in {LEVELS[part.level]}, {bare:,} lose the mission or delay "
+                f"it by over 1 s without a detector, {watched}."
+            )
+    return " ".join(sentences)

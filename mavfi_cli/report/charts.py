@@ -1,0 +1,237 @@
+"""Charts of the page: SVG in the page's own font and colours, each with its data as CSV."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mavfi_cli.core.types import FloatArray
+from mavfi_cli.report.drawing import DETECTORS, GRID, INK, NONE, NOTE, legend_above, new_figure, svg
+from mavfi_cli.report.paper import PALETTE, SMALLEST, WIDTHS_IN, print_axes
+from mavfi_cli.stats.shares import Interval, Share
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LOST, _BAND = "#b2182b", "#d8dee6"
+_VERDICTS = {"reproduced": "#1b6b42", "contradicted": "#a3262f", "undecided": "#7a5b01"}
+_THEME = {INK: "var(--ink)", NOTE: "var(--note)", GRID: "var(--rule)", "#ffffff": "none",
+          PALETTE[0]: "var(--deep)", _BAND: "var(--band)",
+          **{colour: f"var(--{name})" for name, colour in _VERDICTS.items()}}  # fmt: skip
+_OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not unique in a page
+_FONT = re.compile(r"font: (?:[a-z0-9]+ )*?([0-9.]+px)[^;\"]*")
+
+
+Curve = tuple[str, str, FloatArray]  # label, detector, sorted added seconds; infinite: lost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """A chart of the page.
+
+    Attributes:
+        name: of its CSV file, without suffix.
+        title: its caption and alt text.
+        markup: an SVG element.
+        csv: its numbers.
+    """
+
+    name: str
+    title: str
+    markup: str
+    csv: str
+
+    @classmethod
+    def of(cls, name: str, title: str, figure: Figure, csv: str) -> Picture:
+        """The picture of a figure, in the page's font and colours."""
+        text = svg(figure)
+        markup = _OWN_ID.sub("", text[text.index("<svg") :])
+        markup = _FONT.sub(r"font-size: \1", markup)
+        for colour, variable in _THEME.items():
+            markup = markup.replace(colour, variable)
+        return cls(name=name, title=title, markup=markup.strip(), csv=csv)
+
+
+# Effects beside ranges ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForestRow:
+    """A claim in the forest plot.
+
+    Attributes:
+        low, high: ends of the claimed range; infinite where it has no end.
+        number: whether the effect is a plain number; otherwise it is a share.
+        effects: of each stack; None if it was not flown or has no number.
+        verdict: of the first stack.
+    """
+
+    label: str
+    low: float
+    high: float
+    number: bool
+    effects: Sequence[Interval | None]
+    verdict: str
+
+
+def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str]) -> Figure:
+    """A row for each claim: the claimed range as a band, the effects of the stacks upon it."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    parts = [part for kind in (False, True) if (part := [x for x in rows if x.number is kind])]
+    heights = [len(part) + 1 for part in parts]
+    figure = new_figure(4.3, 0.7 + 0.117 * sum(heights))
+    grid = figure.subplots(len(parts), 1, height_ratios=heights, squeeze=False)
+    for axes, part in zip(grid[:, 0], parts, strict=True):
+        numbers = part[0].number
+        scale, ends = (1.0, (-1.2, 1.2)) if numbers else (100.0, (-100.0, 130.0))
+        print_axes(axes)
+        axes.tick_params(labelsize=6.2, labeltop=True, top=False)
+        if not numbers:
+            axes.set_xscale("symlog", linthresh=1.0, linscale=0.6)
+            ticks = [-100, -10, -1, 0, 1, 10, 100]
+            axes.xaxis.set_major_locator(FixedLocator(ticks))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+            axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlim(*ends)
+        axes.axvline(0.0, color=NOTE, linewidth=0.6)
+        for y, row in enumerate(part):
+            low, high = (min(max(scale * end, ends[0]), ends[1]) for end in (row.low, row.high))
+            axes.barh(y, high - low, left=low, height=0.86, color=_BAND, linewidth=0)
+            for place, effect in enumerate(row.effects):
+                if effect is not None:
+                    _effect(axes, y, effect, scale, place, row.verdict)
+        axes.set_yticks(range(len(part)), [row.label for row in part], fontsize=6.2)
+        axes.set_ylim(len(part) - 0.4, -0.6)
+        axes.set_xlabel("a number" if numbers else "points or per cent (logarithmic beyond 1)",
+                        fontsize=6.2, labelpad=1)  # fmt: skip
+    marks: list[Patch | Line2D] = [Patch(color=_BAND, label="the paper's range")]
+    marks += [
+        Line2D([], [], marker=mark, markersize=size, color=NOTE, linewidth=0.9, label=stack,
+               markerfacecolor=NOTE if not place else "none")
+        for place, (stack, mark, size) in enumerate(zip(stacks, "oD", (3.2, 2.4), strict=False))
+        if any(any(row.effects[place : place + 1]) for row in rows)
+    ]  # fmt: skip
+    legend_above(figure, handles=marks, ncols=3, fontsize=6.2, handlelength=1.4, columnspacing=1.0)
+    return figure
+
+
+def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
+    """An effect with its interval; that of the first stack has the colour of the verdict."""
+    colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
+    height = y - 0.14 if not place else y + 0.26
+    width, size = (1.3, 3.2) if not place else (0.6, 2.2)
+    low, high = scale * effect.low, scale * effect.high
+    axes.hlines(height, low, high, color=colour, linewidth=width)
+    axes.plot(scale * effect.value, height, "o" if not place else "D", color=colour,
+              markersize=size, markerfacecolor=colour if not place else "none",
+              markeredgewidth=0.6)  # fmt: skip
+
+
+# Added time ---------------------------------------------------------------------------------------
+
+
+def draw_delays(panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float]) -> Figure:
+    """The share of flights that are longer by more than so many seconds, and so many per cent.
+
+    Args:
+        panels: curves by title.
+        golden_s: mean flight time of the golden flights of each panel.
+    """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    across = min(2, len(panels))
+    down = math.ceil(len(panels) / across)
+    figure = new_figure(WIDTHS_IN["two"], 0.45 + 1.75 * down)
+    grid = figure.subplots(down, across, squeeze=False)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    for axes, (title, curves), mean_s in zip(grid.flat, panels.items(), golden_s, strict=False):
+        print_axes(axes, title)
+        for (label, detector, added_s), style in zip(curves, ("-", "--", ":"), strict=False):
+            count = len(added_s)
+            seconds = np.geomspace(0.02, 200.0, 400)
+            share = 100.0 * (1.0 - np.searchsorted(added_s, seconds, "right") / count)
+            colour = NOTE if detector == "none" else DETECTORS[detector]
+            axes.step(seconds, share, style, where="post", color=colour, linewidth=1.5,
+                      label=label)  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_xlim(0.02, 200.0)
+        axes.set_ylim(bottom=0.0)
+        axes.axvline(0.1 * mean_s, color=INK, linewidth=0.6, linestyle=(0, (2, 2)))
+        rates = axes.secondary_xaxis("top", functions=_per_cent_of(mean_s))
+        rates.set_xticks([0.1, 1, 10, 100], ["0.1 %", "1 %", "10 %", "100 % of golden"])
+        rates.minorticks_off()
+        rates.tick_params(labelsize=SMALLEST - 0.5, color=GRID, length=2.5, pad=1)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylabel("flights, %", fontsize=SMALLEST)
+    figure.supxlabel("longer than golden by more than, s; a lost mission is longer than any",
+                     fontsize=SMALLEST + 0.5, color=INK)  # fmt: skip
+    most = max(panels.values(), key=len)
+    shown = grid.flat[[*panels.values()].index(most)]
+    legend_above(figure, *shown.get_legend_handles_labels(), fontsize=SMALLEST)
+    return figure
+
+
+def _per_cent_of(
+    mean_s: float,
+) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
+    """From seconds to per cent of a time, and back."""
+    return lambda added_s: 100.0 * added_s / mean_s, lambda rate: rate * mean_s / 100.0
+
+
+# Arms and kernels ---------------------------------------------------------------------------------
+
+
+def draw_arms(arms: Sequence[tuple[str, Share, float | None]]) -> Figure:
+    """The lost missions of each arm.
+
+    Args:
+        arms: name, lost missions, and corrected p-value; None of the unprotected arm.
+    """
+    figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, (_, lost, p) in enumerate(arms):
+        colour = _LOST if p is None else DETECTORS["gad"] if p < 0.05 else NONE
+        axes.hlines(place, 100 * lost.low, 100 * lost.high, color=colour, linewidth=1.4)
+        axes.plot(100 * lost.share, place, "o", color=colour, markersize=4)
+    axes.set_yticks(range(len(arms)), [name for name, _, _ in arms], fontsize=SMALLEST)
+    axes.set_ylim(len(arms) - 0.4, -0.6)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("missions lost, % (95 % interval)", fontsize=SMALLEST)
+    return figure
+
+
+_FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "#6a4fb3",
+          "crashed": "#e4572e", "hung": "#f2b134"}  # fmt: skip
+
+
+def draw_flows(flows: Mapping[str, Mapping[str, Share]]) -> Figure:
+    """What struck kernels did: shares of each fate, by kernel."""
+    figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
+    axes = figure.add_subplot()
+    print_axes(axes)
+    for place, fates in enumerate(flows.values()):
+        total, left = sum(share.total for share in fates.values()), 0.0
+        for fate, share in fates.items():
+            part = 100.0 * share.total / total
+            axes.barh(place, part, left=left, height=0.66, color=_FATES[fate],
+                      label=fate if not place else None)  # fmt: skip
+            left += part
+    axes.set_yticks(range(len(flows)), list(flows), fontsize=SMALLEST)
+    axes.set_ylim(len(flows) - 0.5, -0.5)
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("share of struck kernels, %", fontsize=SMALLEST)
+    look = {"handlelength": 1.0, "columnspacing": 1.0, "labelcolor": INK}
+    legend_above(figure, ncols=3, fontsize=SMALLEST, **look)
+    return figure
