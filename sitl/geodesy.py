@@ -1,4 +1,4 @@
-"""Conversion between the local NED frame and latitude, longitude and altitude.
+"""Conversion between the local NED frame and latitude, longitude and altitude; air pressure.
 
 The conversion is an azimuthal equidistant projection on a sphere of 6,371,000 m (Snyder, Map
 Projections: A Working Manual, 1987, equations 25-15 and 20-14), as in PX4.
@@ -10,6 +10,20 @@ import math
 from dataclasses import dataclass
 
 EARTH_RADIUS_M = 6_371_000.0
+
+# International standard atmosphere up to 11 km
+_SEA_LEVEL_PA, _LAPSE_PER_M, _EXPONENT = 101_325.0, 2.25577e-5, 5.25588
+
+
+def standard_pressure_pa(altitude_m: float) -> float:
+    """Return the air pressure, Pa, at an altitude above sea level, m; 0 above the atmosphere."""
+    return float(_SEA_LEVEL_PA * max(1.0 - _LAPSE_PER_M * altitude_m, 0.0) ** _EXPONENT)
+
+
+def pressure_altitude_m(pressure_pa: float) -> float:
+    """Return the altitude above sea level, m, of an air pressure, Pa; below 0 counts as 0."""
+    share = max(pressure_pa, 0.0) / _SEA_LEVEL_PA
+    return float((1.0 - share ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
 
 
 def _sine_cosine(angle_deg: float) -> tuple[float, float]:

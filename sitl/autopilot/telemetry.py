@@ -23,7 +23,7 @@ from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
 from sitl.autopilot.commander import Commander, FlightMode
 from sitl.autopilot.parameters import Parameters
-from sitl.geodesy import Origin
+from sitl.geodesy import Origin, standard_pressure_pa
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.truth import Truth
 
@@ -133,7 +133,6 @@ _UNIQUE_ID = 0x4D41564649  # "MAVFI"
 _ESTIMATOR_GOOD, _ESTIMATOR_NO_POSITION = 0x33F, 0x027
 _ZERO_MASKS = ((0, 0x007), (3, 0x038))
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
-_STANDARD_PRESSURE_HPA = 1013.25
 
 
 def _heartbeat(s: Snapshot) -> Any:
@@ -229,10 +228,9 @@ def _highres_imu(s: Snapshot) -> Any:
     """Specific force and rates in FRD, without a magnetometer."""
     force_ned = s.truth.acceleration_ned_mps2 - np.array([0.0, 0.0, GRAVITY_MPS2])
     height = s.amsl_m(float(s.truth.position_ned_m[2]))
-    ratio = max(1.0 - 2.25577e-5 * height, 0.0)  # ISA troposphere
     return dialect.MAVLink_highres_imu_message(
         s.stamp_us, *s.truth.in_body(force_ned).tolist(),
-        *s.truth.rates_frd_radps.tolist(), 0.0, 0.0, 0.0, _STANDARD_PRESSURE_HPA * ratio**5.25588,
+        *s.truth.rates_frd_radps.tolist(), 0.0, 0.0, 0.0, standard_pressure_pa(height) / 100.0,
         0.0, height, 25.0, 0x1A3F & ~0x1C0,
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mavfi_cli.core.frames import Vector
-from sitl.geodesy import Origin
+from sitl.geodesy import Origin, pressure_altitude_m, standard_pressure_pa
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.truth import Truth
 
@@ -28,11 +28,6 @@ _LEVEL_SHARE = math.cos(_INCLINATION_RAD)
 _NORTH, _EAST = _LEVEL_SHARE * math.cos(_DECLINATION_RAD), _LEVEL_SHARE * math.sin(_DECLINATION_RAD)
 FIELD_NED_GAUSS = _STRENGTH_GAUSS * np.array([_NORTH, _EAST, math.sin(_INCLINATION_RAD)])
 _GRAVITY_NED_MPS2 = np.array([0.0, 0.0, GRAVITY_MPS2])
-
-# International standard atmosphere up to 11 km
-_SEA_LEVEL_PA = 101_325.0
-_LAPSE_PER_M = 2.25577e-5
-_EXPONENT = 5.25588
 
 
 class Sensors:
@@ -60,10 +55,9 @@ class Sensors:
     def barometer(self, truth: Truth) -> tuple[float, float]:
         """Return the air pressure, Pa, and its altitude above sea level, m."""
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
-        pressure = float(_SEA_LEVEL_PA * (1.0 - _LAPSE_PER_M * altitude_m) ** _EXPONENT)
-        pressure += BAROMETER_PA * float(self._noise.standard_normal())
-        share = (pressure / _SEA_LEVEL_PA) ** (1.0 / _EXPONENT)
-        return pressure, float((1.0 - share) / _LAPSE_PER_M)
+        noise_pa = BAROMETER_PA * float(self._noise.standard_normal())
+        pressure_pa = standard_pressure_pa(altitude_m) + noise_pa
+        return pressure_pa, pressure_altitude_m(pressure_pa)
 
     def fix(self, truth: Truth) -> tuple[float, float, float, Vector]:
         """Return latitude, longitude (deg), altitude (m) and velocity (3,), NED, of a GPS."""
