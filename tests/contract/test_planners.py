@@ -85,7 +85,7 @@ def test_other_packages_plug_in_by_entry_point(plugged_in):
 
 
 def test_a_plug_in_that_does_not_load_is_an_error_of_one_line(plugged_in):
-    with pytest.raises(MavfiError, match=r"'gone' \(nowhere_at_all:Gone\) does not load: Mod"):
+    with pytest.raises(MavfiError, match=r"'gone' \(nowhere_at_all:Gone\) cannot be loaded: Mod"):
         planners.find("gone")
 
 
