@@ -31,7 +31,7 @@ from mavfi_cli.cli.parameters import (
     UPSETS,
 )
 from mavfi_cli.core.option_types import Number, OutFile
-from mavfi_cli.core.terminal import echo, note
+from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
 from mavfi_cli.report.table import FORMATS
 
@@ -254,7 +254,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         echo(json.dumps(plain(told), indent=2, default=str))
     else:
         absent = [f"not in the picture: {text}" for text in chosen.absent]
-        echo("\n".join([*flown.lines(), *absent, f"Picture  {output}"]))
+        echo_lines([*flown.lines(), *absent, f"Picture  {output}"])
 
 
 @campaign.command(cls=GroupedCommand)
@@ -316,7 +316,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
         lines += more
     if not told:
         raise click.UsageError("name a campaign, --margin or --difference")
-    echo(json.dumps(told, indent=2) if as_json else "\n".join(lines))
+    echo_lines(json.dumps(told, indent=2).split("\n") if as_json else lines)
 
 
 @campaign.command()
@@ -381,5 +381,5 @@ def _show(
         lines += CampaignReport.of(ledger, by, confidence, **parts).lines()
     else:
         table, _ = shown(ledger)
-        lines += ["", short(table).formatted("text").rstrip()]
-    echo("\n".join(lines))
+        lines += ["", *short(table).formatted("text").rstrip().split("\n")]
+    echo_lines(lines)

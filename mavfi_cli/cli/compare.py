@@ -24,7 +24,7 @@ from mavfi_cli.cli.parameters import (
     TARGETS,
     WORLD,
 )
-from mavfi_cli.core.terminal import echo
+from mavfi_cli.core.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
     from mavfi_cli.studies.compare import ComparePlan
@@ -93,7 +93,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
         echo(platform_csv(comparison), nl=False)
     else:
         files = "compare.json, compare.csv, compare.svg, timeline.svg, timeline/"
-        echo("\n".join([*platform_lines(comparison), "", f"Files  {out}: {files}"]))
+        echo_lines([*platform_lines(comparison), "", f"Files  {out}: {files}"])
 
 
 def _plan(options: dict[str, Any]) -> ComparePlan:

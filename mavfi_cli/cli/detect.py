@@ -24,7 +24,7 @@ from mavfi_cli.cli.parameters import (
     STAGES,
     WORLD,
 )
-from mavfi_cli.core.terminal import echo
+from mavfi_cli.core.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
     from mavfi_cli.studies.evaluate import EvaluationPlan
@@ -133,7 +133,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
         echo(detector_csv(*pairs), nl=False)
     else:
         files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
-        echo("\n".join([*detector_lines(evaluation), "", f"Files  {out}: {files}"]))
+        echo_lines([*detector_lines(evaluation), "", f"Files  {out}: {files}"])
 
 
 def _plan(options: dict[str, Any]) -> EvaluationPlan:

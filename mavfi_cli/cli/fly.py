@@ -42,7 +42,7 @@ from mavfi_cli.cli.parameters import (
     WORLD,
 )
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
-from mavfi_cli.core.terminal import echo, note_error
+from mavfi_cli.core.terminal import echo, echo_lines, note_error
 
 if TYPE_CHECKING:
     from mavfi_cli.mission.run_folder import Run
@@ -232,7 +232,7 @@ def fly(
         echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:
         drawn = folder_lines(run, folder.picture if picture else None)
-        echo("\n".join([*summary_lines(run.result), *drawn, *_hint(run)]))
+        echo_lines([*summary_lines(run.result), *drawn, *_hint(run)])
     if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
     if expect is not None and run.record.outcome != expect:

@@ -13,7 +13,7 @@ import click
 
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import PLATFORM, STACK
-from mavfi_cli.core.terminal import echo
+from mavfi_cli.core.terminal import echo, echo_lines
 from mavfi_cli.report.table import WIDTH, Table
 
 if TYPE_CHECKING:
@@ -176,10 +176,10 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         _print_json(found)
     elif not names:
-        echo("\n".join(f"{stack.name:<19}{stack.description}" for stack in found))
+        echo_lines(f"{stack.name:<19}{stack.description}" for stack in found)
         echo(_MORE_STACKS)
     else:
-        echo("\n".join(_explained(found[0]) if len(found) == 1 else _compared(found)))
+        echo_lines(_explained(found[0]) if len(found) == 1 else _compared(found))
 
 
 def _explained(stack: Stack) -> Iterator[str]:
@@ -248,4 +248,4 @@ def states(as_json: bool) -> None:
     if as_json:
         echo(json.dumps(rows, indent=2))
         return
-    echo("\n".join(Table.of_records(rows).lines()))
+    echo_lines(Table.of_records(rows).lines())

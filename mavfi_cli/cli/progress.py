@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
+from mavfi_cli.core.errors import printable
 from mavfi_cli.core.terminal import cleaned, note
 from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
 
@@ -97,7 +98,7 @@ class _FlightView(Watcher):
             self._screen.note((self._title, "bold"))
             self._title = ""
         if event.kind in _TOLD:
-            self._screen.note((f"{event.stamp_s:7.2f} s", "dim"), "  ", event.text)
+            self._screen.note((f"{event.stamp_s:7.2f} s", "dim"), "  ", printable(event.text))
 
 
 class _MissionsView(Spectator):

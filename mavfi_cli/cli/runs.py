@@ -12,7 +12,7 @@ import click
 from mavfi_cli.cli.grouped import GroupedCommand
 from mavfi_cli.cli.parameters import NUMBER, OUT, RunPath
 from mavfi_cli.core.option_types import OutFile
-from mavfi_cli.core.terminal import echo, note
+from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
 
 _TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
@@ -60,7 +60,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
             lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
         if events:
             lines += ["", "Events", *event_lines(recorded.result)]
-    echo("\n".join([*lines, *folder_lines(recorded, picture)]))
+    echo_lines([*lines, *folder_lines(recorded, picture)])
 
 
 @click.command(cls=GroupedCommand)
@@ -102,7 +102,7 @@ def replay(
         raise click.UsageError("--gdb needs a run folder, which --mission does not")
     else:
         comparison, lines = _repeat_mission(run, number, out, **options)
-    echo(json.dumps(comparison, indent=2) if as_json else "\n".join(lines))
+    echo_lines(json.dumps(comparison, indent=2).split("\n") if as_json else lines)
     if not comparison["identical"] and not how["without_fault"]:
         raise click.exceptions.Exit(1)
 

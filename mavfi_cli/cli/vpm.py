@@ -22,6 +22,7 @@ from mavfi_cli.cli.parameters import (
     STACK,
     WORLD,
 )
+from mavfi_cli.core.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
     from mavfi_cli.analysis.beside_model import FlightsReport
@@ -125,12 +126,12 @@ def vpm(
         model, flights = _flown(chosen, overheads, choices, out, options)
     files = [] if out is None else _save(model, flights, out)
     if as_json:
-        click.echo(json.dumps(model_json(model, flights), indent=2, sort_keys=True))
+        echo(json.dumps(model_json(model, flights), indent=2, sort_keys=True))
     elif as_csv:
-        click.echo(model_csv(flights or model), nl=False)
+        echo(model_csv(flights or model), nl=False)
     else:
         written = ["", f"Files  {out}: {', '.join(files)}"] if files else []
-        click.echo("\n".join([*model_lines(model, flights), *written]))
+        echo_lines([*model_lines(model, flights), *written])
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:

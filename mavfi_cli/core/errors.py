@@ -29,7 +29,15 @@ def printable(text: str) -> str:
 
 def lack_of(error: Exception) -> str:
     """Describe what is wrong with a file's contents, from the error that their use raised."""
-    return f"it has no {error}" if isinstance(error, KeyError) else described(error)
+    match error:
+        case KeyError():
+            return f"it has no {error}"
+        case TypeError() | AttributeError():
+            return "a value in it has the wrong type"
+        case RecursionError():
+            return "its values are nested too deeply"
+        case _:
+            return printable(str(error)) or type(error).__name__
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import click
 
@@ -19,6 +19,15 @@ def cleaned(text: str) -> str:
 def echo(text: str, *, nl: bool = True) -> None:
     """Print text to stdout. Raises OSError if stdout cannot be written."""
     click.echo(cleaned(text), nl=nl)
+
+
+def echo_lines(lines: Iterable[str]) -> None:
+    """Print lines to stdout. A newline within a line is replaced as other control characters are.
+
+    Raises:
+        OSError: Stdout cannot be written.
+    """
+    click.echo("\n".join(map(printable, lines)))
 
 
 def note(text: str) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
+from mavfi_cli.core.errors import printable
 from mavfi_cli.stats.shares import Interval, Share
 
 WIDTH = 100  # characters; default maximum width of a table
@@ -76,7 +77,7 @@ class Table:
     def text(self) -> str:
         """Return title, aligned columns and notes."""
         lines = [*([self.title] if self.title else []), *self.lines(WIDTH), *self.notes]
-        return "\n".join(lines) + "\n"
+        return "\n".join(map(printable, lines)) + "\n"
 
     def markdown(self) -> str:
         """Return a table with pipes, below the title in bold."""
@@ -87,7 +88,7 @@ class Table:
             for row in (head, rules, *rows)
         ]
         title = [f"**{self.title}**", ""] if self.title else []
-        return "\n".join([*title, *lines, "", *self.notes]).rstrip() + "\n"
+        return "\n".join(map(printable, [*title, *lines, "", *self.notes])).rstrip() + "\n"
 
     def latex(self) -> str:
         """Return a float with a plain tabular, which needs no package.

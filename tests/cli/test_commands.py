@@ -145,10 +145,10 @@ def _change(folder, section, value):
         (lambda f: (f / "result.json").write_text('{"schema": 1, '), "damaged"),
         (lambda f: (f / "result.json").write_bytes(b"\xff\xfe"), "damaged"),
         (lambda f: (f / "result.json").write_text("[]"), "not a JSON object"),
-        (lambda f: (f / "result.json").write_text("[" * 100_000), "damaged (RecursionError"),
-        (lambda f: _change(f, "config", 5), "damaged (TypeError"),
-        (lambda f: _change(f, "detection", 5), "damaged (TypeError"),
-        (lambda f: _change(f, "events", 5), "damaged (TypeError"),
+        (lambda f: (f / "result.json").write_text("[" * 100_000), "nested too deeply"),
+        (lambda f: _change(f, "config", 5), "damaged (a value in it has the wrong type)"),
+        (lambda f: _change(f, "detection", 5), "damaged (a value in it has the wrong type)"),
+        (lambda f: _change(f, "events", 5), "damaged (a value in it has the wrong type)"),
         (lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}), "damaged (it has no"),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
@@ -165,6 +165,16 @@ def test_show_says_in_one_line_what_is_wrong_with_a_run(command_line, copied, da
     (line,) = err.splitlines()
     assert line.startswith("error: ")
     assert said in line
+
+
+def test_a_newline_in_a_text_of_a_record_begins_no_line(command_line, copied):
+    events = json.loads((copied / "result.json").read_text())["events"]
+    lines = command_line("show", copied, "--events")[1].count("\n")
+    _change(copied, "events", [event | {"text": "a\nb"} for event in events])
+    code, out, _ = command_line("show", copied, "--events")
+    assert code == 0
+    assert out.count("a\ufffdb\n") == len(events)
+    assert out.count("\n") == lines
 
 
 def test_no_text_of_a_record_commands_the_terminal(command_line, copied):

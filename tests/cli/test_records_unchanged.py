@@ -102,7 +102,8 @@ COMMANDS = {
     # Renewed when operands became the bits that are read or written, and when the settings got the
     # memory of a run, and with the code of x86-64-v3.
     # Renewed when the summary got the null runs; all else is equal.
-    "kernels": ("7d1fc4ea7f2c0829", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    # Renewed when Wilson's intervals became SciPy's: the last digit of the bound of null runs.
+    "kernels": ("8f12c7a042eae4d3", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
         "eac34e35e3c1cd54",
         [
@@ -111,8 +112,9 @@ COMMANDS = {
             *("--missions", "1", "--quiet", "--json"),
         ],
     ),
+    # Renewed when Wilson's intervals became SciPy's: the last digits of bounds.
     "evaluate": (
-        "11f2481b14b57c40",
+        "aa9d00cc0f3b1cde",
         [
             *("detect", "evaluate", "--world", "farm", "--detector", "none,gad", "--flights", "1"),
             *("--golden-flights", "1", "--field", "exponent"),
@@ -120,9 +122,11 @@ COMMANDS = {
         ],
     ),
     # Renewed when its curve got its throughputs from libm: those of numpy depend on the processor.
-    "vpm": ("42b0c90aea6f35bb", ["vpm", "--vehicle", "spark", "--json"]),
+    # Renewed when the numbers of a scheme got the groups `performance` and `ratios`.
+    "vpm": ("227a90ffefcc10d1", ["vpm", "--vehicle", "spark", "--json"]),
+    # Renewed when the columns got the names of the groups in `vpm.json`; all numbers are equal.
     "vpm --fly": (
-        "347da80654dec6fe",
+        "528f649b2c2b22f5",
         [
             *("vpm", "--vehicle", "spark", "--fly", "--world", "farm", "--missions", "1"),
             *("--quiet", "--csv"),

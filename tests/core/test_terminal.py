@@ -4,7 +4,7 @@ import click
 import pytest
 
 from mavfi_cli.core.errors import Interrupted, RecordError
-from mavfi_cli.core.terminal import echo, exit_code, note, note_error
+from mavfi_cli.core.terminal import echo, echo_lines, exit_code, note, note_error
 
 
 @pytest.mark.parametrize(
@@ -19,6 +19,11 @@ def test_control_characters_are_replaced(capfd, given, printed):
     echo(given)
     note(given)
     assert capfd.readouterr() == (printed, printed)
+
+
+def test_a_newline_within_a_line_is_replaced(capfd):
+    echo_lines(["one", "two\nthree"])
+    assert capfd.readouterr().out == "one\ntwo\ufffdthree\n"
 
 
 def test_an_error_is_one_line(capfd):

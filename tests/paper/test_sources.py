@@ -154,6 +154,15 @@ def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
     assert "kernels.json: damaged (" in problem
 
 
+@pytest.mark.parametrize("value", [3, [1, 2], {"plan": 1}, None])
+def test_another_json_is_no_summary_of_kernels(tmp_path, value):
+    (tmp_path / "kernels.json").write_text(json.dumps(value))
+    with pytest.raises(
+        RecordError, match=r"`mavfi kernels` \(a value in it has the wrong type"
+    ):
+        Evidence.gather([tmp_path])
+
+
 def test_a_campaigns_own_folders_are_no_campaigns(tmp_path, campaign, export):
     campaign("whole", 1, 1)
     export("whole/runs/0-sparse-1/trace.parquet", row())

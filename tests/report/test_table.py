@@ -96,3 +96,9 @@ def test_one_formatter_serves_an_estimate_and_its_json():
     value = Interval(value=-0.001, low=-1.0, high=1.0, count=4)
     assert spread(value, 2, sign="+", chance=1e-4) == "-0.00 (-1.00 to +1.00, p<.001)"
     assert spread(asdict(value), 1) == "0.0 (-1.0 to 1.0)"
+
+
+def test_a_newline_in_a_cell_begins_no_row():
+    table = Table([["name"], ["a\nb"]], title="t\nu", notes=["n\no"])
+    assert table.text().splitlines() == ["t\ufffdu", "name", "a\ufffdb", "n\ufffdo"]
+    assert "| a\ufffdb |" in table.markdown().splitlines()
