@@ -76,6 +76,7 @@ class Options:
         kept: numbers of missions whose run folders are kept whatever `keep` says.
         profiles: folder of the profiles of instruction-level faults that several campaigns share;
             None for the campaign's own, from which profiles go after their last mission.
+        planned: numbers of the missions among which a mission is the last; None for all.
         firmware: programs that missions of the folder may name; see
             `MissionConfig.require_firmware`.
     """
@@ -90,6 +91,7 @@ class Options:
     only: frozenset[int] | None = None
     kept: frozenset[int] = frozenset()
     profiles: Path | None = None
+    planned: frozenset[int] | None = None
     firmware: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -328,7 +330,9 @@ class _Run:
         self._sharing = Counter(
             mission.config.golden
             for mission in ledger.missing(errors=options.errors)
-            if mission.config.instruction is not None and options.profiles is None
+            if mission.config.instruction is not None
+            and options.profiles is None
+            and (options.planned is None or mission.number in options.planned)
         )
         names = [str(labels.get("setting", "")) for labels in ledger.cells()]
         self._setting_of = [names[cell] for cell in ledger.cell_of_each()]

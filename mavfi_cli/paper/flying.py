@@ -95,7 +95,8 @@ def reproduce(
     if any(item.preset for item in plan.items):
         with _opened(plan) as ledger:
             wanted = frozenset(plan.numbers(ledger))
-            options = replace(options, only=wanted, kept=frozenset(plan.kept(ledger)))
+            kept = frozenset(plan.kept(ledger))
+            options = replace(options, only=wanted, planned=wanted, kept=kept)
             told = _measured(ledger, wanted, options, spectator)
             whole = _with_flights(left, ledger, wanted, options, told)
             on_forecast(whole)

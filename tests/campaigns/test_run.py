@@ -111,8 +111,18 @@ def test_profiles_go_after_the_last_mission_with_their_golden_run(campaign):
     campaign.run(missions, only=frozenset({0, 1, 3, 4, 5})).close()
     assert kept[1].is_dir()  # a mission with this golden run is still missing
     assert not kept[2].exists()
-    campaign.run(missions).close()
+    campaign.run(missions, only=frozenset({2})).close()
     assert not kept[1].exists()
+    assert not (campaign.folder / PROFILES).exists()
+
+
+def test_profiles_go_after_the_last_mission_that_is_planned(campaign):
+    """`mavfi reproduce table4` flies some of the missions of its folder, in several parts."""
+    attacks = [InstructionConfig(target="control", seed=seed) for seed in range(3)]
+    missions = [PlannedMission(config=MissionConfig(world="fly", instruction=a)) for a in attacks]
+    campaign.run(missions, only=frozenset({0}), planned=frozenset({0, 1})).close()
+    assert kept_in(campaign.folder / PROFILES, missions[0].config.golden).is_dir()
+    campaign.run(missions, only=frozenset({1}), planned=frozenset({0, 1})).close()
     assert not (campaign.folder / PROFILES).exists()
 
 

@@ -157,9 +157,7 @@ def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
 @pytest.mark.parametrize("value", [3, [1, 2], {"plan": 1}, None])
 def test_another_json_is_no_summary_of_kernels(tmp_path, value):
     (tmp_path / "kernels.json").write_text(json.dumps(value))
-    with pytest.raises(
-        RecordError, match=r"`mavfi kernels` \(a value in it has the wrong type"
-    ):
+    with pytest.raises(RecordError, match=r"`mavfi kernels` \(a value in it has the wrong type"):
         Evidence.gather([tmp_path])
 
 
