@@ -106,7 +106,7 @@ def main() -> None:
             plan = replace(Plan(runs=options.runs, seed=1), **changes)
             targets = kernel_targets([str(path)], flight, Path(scratch))
             (runs,) = run_campaign(plan, targets, jobs=options.jobs)
-            (told,) = summarise(plan, [runs])["kernels"]
+            (told,) = summarise(plan, [runs]).as_dict()["kernels"]
             print(f"| {name} | {' | '.join(cells(told, runs.records))} |", flush=True)
 
 

@@ -107,7 +107,7 @@ class ErrorFreeRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorstFlight:
+class _WorstFlight:
     """The worst successful flight time and its recovery, as in the paper's section VII-A.
 
     The paper flies one world with one seed. Here every mission has its own seed, so every flight is
@@ -184,11 +184,11 @@ class FaultRow:
     unprotected: Share
     protected: dict[str, float]
     success: McNemar
-    worst: WorstFlight
+    worst: _WorstFlight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CorrectedTest:
+class _CorrectedTest:
     """McNemar's test of two detectors, with its p-value corrected over all of them by Holm."""
 
     both: int
@@ -206,8 +206,8 @@ class DetectorComparison:
 
     first: str
     second: str
-    recovered: CorrectedTest
-    undone: CorrectedTest
+    recovered: _CorrectedTest
+    undone: _CorrectedTest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -455,7 +455,7 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorCom
     tests = [_recoveries(*(chosen(faults, detector=name) for name in two)) for two in names]
     recovered, undone = (
         [
-            CorrectedTest(**asdict(test), difference=test.difference, corrected_p=corrected)
+            _CorrectedTest(**asdict(test), difference=test.difference, corrected_p=corrected)
             for test, corrected in zip(kind, holm([test.p_value for test in kind]), strict=True)
         ]
         for kind in ([own[0] for own in tests], [own[1] for own in tests])
@@ -576,7 +576,7 @@ def _ends(pairs: pa.Table, first: str) -> McNemar:
     return McNemar.of(flags(pairs, first), flags(pairs, "won"))
 
 
-def _worst(pairs: pa.Table) -> WorstFlight:
+def _worst(pairs: pa.Table) -> _WorstFlight:
     # A failed flight has no flight time and is never the longest.
     faulty, protected = (
         np.nan_to_num(numbers(pairs, name), nan=-math.inf)
@@ -595,7 +595,7 @@ def _worst(pairs: pa.Table) -> WorstFlight:
 
     worst = worst_case(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
     longer = 1.0 + worst["increase"] > LONGER
-    return WorstFlight(
+    return _WorstFlight(
         faulty=worst["increase"],
         protected=worst["protected_worst"] - 1.0,
         recovered=interval_of_rows(len(faulty), recovered, resamples=RESAMPLES),

@@ -159,7 +159,7 @@ class RatioRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CostInSeconds:
+class _CostInSeconds:
     """Flight time beyond that of the golden flight; several faults of a mission count as one."""
 
     mean: Interval
@@ -167,7 +167,7 @@ class CostInSeconds:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CostRatio:
+class _CostRatio:
     """Flight time over that of the golden flight.
 
     Attributes:
@@ -203,8 +203,8 @@ class CostRow:
     setting: str
     pairs: int
     lost: int
-    cost_s: CostInSeconds
-    over_own: CostRatio
+    cost_s: _CostInSeconds
+    over_own: _CostRatio
     worst_flight: WorstFault | None
 
     @property
@@ -451,11 +451,11 @@ class FaultCosts:
             setting=setting,
             pairs=self.costs.num_rows,
             lost=self.lost,
-            cost_s=CostInSeconds(
+            cost_s=_CostInSeconds(
                 mean=_over(count, lambda drawn: _mean(cost_s[drawn])),
                 largest=self._largest("cost_s"),
             ),
-            over_own=CostRatio(
+            over_own=_CostRatio(
                 p95=_over(count, lambda drawn: _late(over_own[drawn])),
                 largest=worst,
                 recovered_share=math.nan if setting == NONE else recovered,

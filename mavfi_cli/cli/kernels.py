@@ -162,7 +162,7 @@ def _plan(options: dict[str, Any]) -> Plan:
 def _attack(options: dict[str, Any]) -> None:
     from mavfi_cli.attack.campaign import run_campaign
     from mavfi_cli.cli.progress import runs_view
-    from mavfi_cli.report.attacks import save_runs, summarise, table
+    from mavfi_cli.report.attacks import save_runs, summarise
 
     plan, out = _plan(options), options["out"]
     targets: Sequence[AttackTarget]
@@ -186,9 +186,9 @@ def _attack(options: dict[str, Any]) -> None:
         if out is not None:
             files = ", ".join((*save_runs(out, summary, campaign), "runs.jsonl"))
     if options["as_json"]:
-        echo(json.dumps(summary, indent=2))
+        echo(json.dumps(summary.as_dict(), indent=2))
         return
-    echo(f"{table(summary)}\n")
+    echo(f"{summary.text()}\n")
     if out is not None:
         echo(f"Files  {out}: {files}")
     else:

@@ -17,7 +17,7 @@ from mavfi_cli.attack.program import ProgramTarget
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.spawn import Program
-from mavfi_cli.report.attacks import summarise, table
+from mavfi_cli.report.attacks import summarise
 
 pytestmark = pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is missing")
 
@@ -85,9 +85,9 @@ def test_a_long_program_is_attacked_whole(native_program):
         entry["offset"] for entry in runs.records
     ]
     summary = summarise(plan, [runs])
-    assert summary["counted"]
-    assert summary["not_reached"] < 0.02
-    assert "counted by callgrind; 0 % of the executions are not reached" in table(summary)
+    assert summary.counted
+    assert summary.not_reached < 0.02
+    assert "counted by callgrind; 0 % of the executions are not reached" in summary.text()
 
 
 def test_it_tells_how_fast_callgrind_counts_and_when_it_ends(native_program, monkeypatch):

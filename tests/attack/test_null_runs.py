@@ -15,7 +15,7 @@ from mavfi_cli.attack.target import RunLimits, RunOutcome
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer.counted import Counting
 from mavfi_cli.fi.tracer.spawn import Program
-from mavfi_cli.report.attacks import summarise, table
+from mavfi_cli.report.attacks import summarise
 
 FAR, NEAR, BREAKPOINT = (method.value for method in Counting)
 
@@ -36,8 +36,8 @@ def test_every_counting_method_is_tried_and_the_bound_stands_beside_the_sdc(targ
     assert set(runs.null_runs.counting) == {NEAR, BREAKPOINT}
     assert min(runs.null_runs.counting.values()) >= 5
     summary = summarise(plan, [runs])
-    assert summary["null_runs"]["runs"] == NULL_RUNS == 20
-    lines = table(summary).splitlines()
+    assert summary.counts.null_runs.runs == NULL_RUNS == 20
+    lines = summary.text().splitlines()
     (sdc,) = (line for line in lines if line.startswith("SDC"))
     assert sdc.endswith("(without a flip: 0.0 to 13.9 %)")
     (null,) = (line for line in lines if line.startswith("null runs: 20 equal ("))
@@ -69,8 +69,8 @@ def test_a_detour_that_changes_the_output_is_not_used(target, monkeypatch, name,
     assert {entry["outcome"] for entry in runs.records} == {"benign"}
     stages = [stage for entry in runs.records for stage in entry["trigger"]]
     assert max(stage["count"] for stage in stages) > 100
-    assert f"not used, because it changes the output: {', '.join(unused)}" in table(
-        summarise(plan, [runs])
+    assert f"not used, because it changes the output: {', '.join(unused)}" in (
+        summarise(plan, [runs]).text()
     )
 
 

@@ -251,7 +251,7 @@ def test_debug_registers_give_the_same_faults_and_outcomes(target):
 @pytest.mark.parametrize("options", [{"rule": "cpu-time"}, {"compat": "rosfi-2021"}])
 def test_time_rules_name_themselves_and_count_what_they_miss(target, options):
     campaign = attacked(target("counting", "400000"), runs=8, seed=6, **options)
-    summary = summarise(Plan(runs=8, seed=6, **options), [campaign])
+    summary = summarise(Plan(runs=8, seed=6, **options), [campaign]).as_dict()
     assert summary["sampling"].startswith(next(iter(options.values())))
     assert sum(row["count"] for row in summary["outcomes"].values()) == 8
     for entry in campaign.records:

@@ -28,7 +28,7 @@ def outcomes(told, *, windows=None):
         profiles=[profile], input_of=lambda _run: 0,
         null_runs=NullRuns(tasks=(), counting={}, unused=()),
     )  # fmt: skip
-    return summarise(Plan(runs=len(told), seed=1), [runs])["outcomes"]
+    return summarise(Plan(runs=len(told), seed=1), [runs]).as_dict()["outcomes"]
 
 
 def test_not_injected_runs_are_no_part_of_the_other_shares():

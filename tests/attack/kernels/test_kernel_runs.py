@@ -15,7 +15,7 @@ from mavfi_cli.attack.place import digest
 from mavfi_cli.attack.profile import profile_run
 from mavfi_cli.core.errors import BuildMismatch, ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import write_json
-from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise, table
+from mavfi_cli.report.attacks import KERNEL_COLUMNS, save_runs, summarise
 
 OUTCOMES = {"benign", "crash", "hang", "sdc", "not_injected"}
 
@@ -51,7 +51,7 @@ def test_the_golden_run_is_the_kernel_itself(control_campaign, kernel_inputs):
 def test_every_input_is_struck_equally_often(control_campaign):
     plan, (runs,) = control_campaign
     assert [entry["input"] for entry in runs.records] == [0, 1, 2, 3, 4] * 6
-    (kernel,) = summarise(plan, [runs])["kernels"]
+    (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
     assert [sum(each["outcomes"].values()) for each in kernel["inputs"]] == [6] * 5
     golden = {each["golden"]["sha256"] for each in kernel["inputs"]}
     assert {e["output_sha256"] for e in runs.records if e["outcome"] == "benign"} <= golden
@@ -154,7 +154,7 @@ def test_time_rules_say_what_they_missed(attack):
     plan, (runs,) = attack("point_cloud", runs=6, rule="cpu-time")
     for entry in runs.records:
         assert (entry["outcome"] == "not_injected") == bool(entry["not_injected_reason"])
-    (kernel,) = summarise(plan, [runs])["kernels"]
+    (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
     assert {each["complete"] for each in kernel["inputs"]} == {None}
 
 
@@ -170,7 +170,7 @@ def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, mon
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
     (tmp_path / "inputs.npz").write_bytes(kernel_inputs.read_bytes())
     plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
-    (kernel,) = summarise(plan, [runs])["kernels"]
+    (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
     for number, profile in enumerate(runs.profiles):
         start, pilot, windows = profile.strata
         assert start.marker is None
@@ -204,7 +204,7 @@ def test_the_writing_of_the_tree_is_not_attacked_but_the_whole_tree_is_compared(
     corrupted = [e["magnitude"] for e in runs.records if e["outcome"] == "sdc"]
     assert corrupted
     assert all(size["parts"]["nodes"] > 0 or size["noticeable"] for size in corrupted)
-    (kernel,) = summarise(plan, [runs])["kernels"]
+    (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
     assert kernel["sdc_parts"]["nodes"]["runs"] <= len(corrupted)
     assert kernel["sdc_noticeable"]["count"] <= len(corrupted)
 
@@ -212,22 +212,23 @@ def test_the_writing_of_the_tree_is_not_attacked_but_the_whole_tree_is_compared(
 def test_the_summary_has_what_numbers_depend_on(control_campaign, tmp_path):
     plan, campaign = control_campaign
     summary = summarise(plan, campaign)
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-    (kernel,) = summary["kernels"]
+    plain = summary.as_dict()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    (kernel,) = plain["kernels"]
     assert set(kernel["outcomes"]) == OUTCOMES
     assert sum(row["count"] for row in kernel["outcomes"].values()) == kernel["runs"] == 30
     assert sum(kernel["crashes"].values()) == kernel["outcomes"]["crash"]["count"]
     for row in kernel["outcomes"].values():
         low, high = row["wilson95"]
         assert 0.0 <= low <= row["share"] <= high <= 1.0
-    text = table(summary)
+    text = summary.text()
     assert "sampling: instruction-uniform" in text
     assert "input 4: all" in text
     files = save_runs(tmp_path, summary, campaign)
     first = {name: (tmp_path / name).read_bytes() for name in files}
     save_runs(tmp_path, summary, campaign)
     assert {name: (tmp_path / name).read_bytes() for name in files} == first
-    assert json.loads((tmp_path / "kernels.json").read_text()) == summary
+    assert json.loads((tmp_path / "kernels.json").read_text()) == plain
     rows = list(csv.reader((tmp_path / "kernels.csv").read_text().splitlines()))
     assert rows[0] == KERNEL_COLUMNS
     assert len(rows) == 31
