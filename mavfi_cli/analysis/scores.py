@@ -56,10 +56,11 @@ def scored(
     with contextlib.suppress(OSError, ValueError):  # missing or damaged
         kept = json.loads(store.read_text(encoding="utf-8"))
     names = {
-        each.name: f"{each.name}/{'+'.join(sorted(each.protect))}/{_WAY}/{each.model_digest(stack)}"
-        for each in detectors
+        detector.name: f"{detector.name}/{'+'.join(sorted(detector.protect))}/{_WAY}/"
+        f"{detector.model_digest(stack)}"
+        for detector in detectors
     }
-    scores = {each.name: kept.setdefault(names[each.name], {}) for each in detectors}
+    scores = {detector.name: kept.setdefault(names[detector.name], {}) for detector in detectors}
     struck = harmful(pairs[1])
     paths = struck["faulty_path"].to_pylist()
     golden = chosen(pairs[0], detector=NONE)["golden_path"].to_pylist()
@@ -73,9 +74,9 @@ def scored(
         tell(f"replaying {len(missing)} flights through {len(names)} detectors")
         for path, struck_s in missing:
             seen = _seen_of(path)
-            for each in detectors:
-                if path.name not in scores[each.name]:
-                    scores[each.name][path.name] = _score(seen, struck_s, each, stack)
+            for detector in detectors:
+                if path.name not in scores[detector.name]:
+                    scores[detector.name][path.name] = _score(seen, struck_s, detector, stack)
         write_json(store, kept)
 
     def known(path: str | None, detector: str) -> float | None:
@@ -148,8 +149,8 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]
     if not usable:
-        told = f"no error-free flight of the stack {stack.name!r} among {len(runs)} runs"
-        raise ModelError(told, path=flown)
+        problem = f"no error-free flight of the stack {stack.name!r} among {len(runs)} runs"
+        raise ModelError(problem, path=flown)
     flights: dict[tuple[str, int], FlightSamples] = {}
     for run in usable:
         config = run.record.config
@@ -167,10 +168,10 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
 def _is_error_free(run: Run, stack: StackMark) -> bool:
     """Return True for a flight of the stack that reached the goal without fault and alarm."""
     record = run.record
-    asked = (record.config["fault"], record.config["instruction"])
+    faults = (record.config["fault"], record.config["instruction"])
     return (
         record.outcome == Outcome.SUCCESS.value
-        and asked == (None, None)
+        and faults == (None, None)
         and not (record.detection or {}).get("alarm_count")
         and load_stack(record.config["stack"]).mark.digest == stack.digest
     )

@@ -88,8 +88,8 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
         model, _ = models["aad"]
         write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")
     if as_json:
-        told = {kind: dict(model.provenance) for kind, (model, _) in models.items()}
-        echo(json.dumps(told, indent=2))
+        provenance = {kind: dict(model.provenance) for kind, (model, _) in models.items()}
+        echo(json.dumps(provenance, indent=2))
         return
     failed = f"{left} flights failed and are left out"
     left_out = failed if flown is None else f"left out: {left}"

@@ -176,9 +176,9 @@ def _response(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, 
     platforms = comparison.plan.platforms
     for place, platform in enumerate(platforms):
         name, left = platform.platform, 0.0
-        found = rows[name]
+        quantities = rows[name]
         middle_ms, late_ms = (
-            1e3 * found[key].median.value for key in ("response_median_s", "response_p95_s")
+            1e3 * quantities[key].median.value for key in ("response_median_s", "response_p95_s")
         )
         for kernel in _CHAIN:
             length = 1e3 * platform.kernel_latency_s[kernel]
@@ -216,18 +216,18 @@ def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, st
     step = 0.8 / max(1, len(drawn))
     for place, (quantity, _) in enumerate(_RATIOS):
         for number, row in enumerate(drawn):
-            each, y = row.quantities[quantity], place + step * (number - (len(drawn) - 1) / 2)
-            if math.isnan(each.value):
+            ratio, y = row.quantities[quantity], place + step * (number - (len(drawn) - 1) / 2)
+            if math.isnan(ratio.value):
                 continue
             colour = colours[row.platform]
-            if not math.isnan(each.low):
-                axes.hlines(y, each.low, each.high, color=colour, linewidth=1.6)
+            if not math.isnan(ratio.low):
+                axes.hlines(y, ratio.low, ratio.high, color=colour, linewidth=1.6)
             axes.plot(
-                each.value, y, "o", color=colour, markersize=6, markeredgewidth=1.4,
+                ratio.value, y, "o", color=colour, markersize=6, markeredgewidth=1.4,
                 markerfacecolor=colour if row.setting == _GOLDEN else "white",
             )  # fmt: skip
             axes.text(
-                1.01, y, f"{each.value:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
+                1.01, y, f"{ratio.value:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
                 va="center", color=colour,
             )  # fmt: skip
     axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))

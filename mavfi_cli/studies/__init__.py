@@ -30,7 +30,7 @@ def fly(
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
-    wanted = {each.stored for each in missions}
+    wanted = {mission.stored for mission in missions}
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=True)
         mine = [number for number, *stored in ledger.rows() if tuple(stored) in wanted]

@@ -101,8 +101,8 @@ def train(
         spectator.on_note(f"fitting {kind}")
         fitted[kind] = fit(kind, dataset, seed=plan.seed, n_sigma=plan.n_sigma)
         if autopilots != {OWN_AUTOPILOT}:
-            told = {"autopilot": ", ".join(sorted(autopilots))}
-            fitted[kind] = replace(fitted[kind], provenance={**fitted[kind].provenance, **told})
+            flown = {"autopilot": ", ".join(sorted(autopilots))}
+            fitted[kind] = replace(fitted[kind], provenance={**fitted[kind].provenance, **flown})
     models = {kind: (model, folder / f"{kind}.json") for kind, model in fitted.items()}
     for model, path in models.values():  # all of them, or none
         model.save(path)

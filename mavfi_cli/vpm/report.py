@@ -477,18 +477,18 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     board = board or Board.load(calibration.board)
     parameter, wanted = calibration.parameter, calibration.tmr_time_ratio
 
-    def ratio(value: float, scheme: str = "tmr") -> float:
+    def time_ratio(value: float, scheme: str = "tmr") -> float:
         """Flight time of a scheme over REFERENCE's; infinite if one of them cannot fly."""
         inputs = _with_board(_with_number(vehicle, parameter, value), board, 1.0)
-        found = _time_ratio(inputs, SCHEMES, scheme)
-        return math.inf if found is None else found
+        ratio = _time_ratio(inputs, SCHEMES, scheme)
+        return math.inf if ratio is None else ratio
 
     low = 1.0 / vehicle.sensor_hz
     if parameter == "rotor_pull_n":
         three_kg = vehicle.mass_kg + SCHEMES["tmr"].copies * board.total_kg
         low = three_kg * GRAVITY_MPS2 / math.cos(vehicle.tilt_rad)
     value = low * _SPAN
-    least, most = ratio(value), ratio(low)
+    least, most = time_ratio(value), time_ratio(low)
     if not least <= wanted <= most:
         raise ConfigError(
             f"no {parameter} gives {vehicle.name!r} a ratio of {wanted:g}; it can be {least:.3f} "
@@ -497,7 +497,7 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
         )
     for _ in range(_STEPS):
         middle = 0.5 * (low + value)
-        low, value = (middle, value) if ratio(middle) > wanted else (low, middle)
+        low, value = (middle, value) if time_ratio(middle) > wanted else (low, middle)
     return CalibratedNumber(
         board=board.name,
         board_kg=board.total_kg,
@@ -505,6 +505,6 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
         value=value,
         unit=_UNITS[parameter],
         published_tmr_ratio=wanted,
-        tmr_ratio=ratio(value),
-        predicted_dmr_ratio=ratio(value, "dmr"),
+        tmr_ratio=time_ratio(value),
+        predicted_dmr_ratio=time_ratio(value, "dmr"),
     )
