@@ -64,7 +64,7 @@ class Choices:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModelParameter:
+class _Parameter:
     """A number that enters the model."""
 
     parameter: str
@@ -144,7 +144,7 @@ class CalibratedNumber:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Curves:
+class _Curves:
     """Safe velocity against action throughput, (n,), by the numbers of boards that can fly."""
 
     throughput_hz: list[float]
@@ -159,11 +159,11 @@ class VehicleReport:
     description: str
     board: str
     notes: tuple[str, ...]
-    parameters: tuple[ModelParameter, ...]
+    parameters: tuple[_Parameter, ...]
     schemes: tuple[SchemeResult, ...]
     sensitivity: tuple[Sensitivity, ...]
     calibrations: tuple[CalibratedNumber, ...]
-    curves: Curves
+    curves: _Curves
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +230,7 @@ def _vehicle(
 
 def _inputs(
     vehicle: ModelVehicle, choices: Choices
-) -> tuple[ModelInputs, tuple[ModelParameter, ...], CalibratedNumber | None]:
+) -> tuple[ModelInputs, tuple[_Parameter, ...], CalibratedNumber | None]:
     """Return the model's inputs, the same with their sources, and the calibration if there is one.
 
     The response time is the first of: the command line's, the platform's, the vehicle's own.
@@ -338,17 +338,17 @@ def _board(vehicle: ModelVehicle, choices: Choices) -> Board:
 
 def _parameters(
     inputs: ModelInputs, sources: Mapping[str, str], calibrated: str
-) -> tuple[ModelParameter, ...]:
+) -> tuple[_Parameter, ...]:
     sources = {"tilt_deg": "CAL20: its Table 1 is reproduced with 0 degrees", **sources}
     own = (
-        ModelParameter(
+        _Parameter(
             parameter=key, value=getattr(inputs.vehicle, key), unit=unit,
             source=sources.get(key, "not given"), calibrated=key == calibrated,
         )
         for key, unit in _UNITS.items()
     )  # fmt: skip
     boards = (
-        ModelParameter(
+        _Parameter(
             parameter=f"board.{key}", value=getattr(inputs.board, key), unit=unit,
             source=inputs.board.sources.get(key, "not given"),
         )
@@ -376,10 +376,10 @@ def _scheme(inputs: ModelInputs, scheme: Scheme, reference: Performance) -> Sche
     return replace(result, performance=performance, ratios=ratios)
 
 
-def _curves(inputs: ModelInputs, schemes: Mapping[str, Scheme]) -> Curves:
+def _curves(inputs: ModelInputs, schemes: Mapping[str, Scheme]) -> _Curves:
     copies = sorted({scheme.copies for scheme in schemes.values()})
     flying = [(n, inputs.acceleration_mps2(n)) for n in copies]
-    return Curves(
+    return _Curves(
         throughput_hz=_CURVE_HZ.tolist(),
         velocity_mps={
             n: safe_velocity_mps(accel, 1.0 / _CURVE_HZ, inputs.range_m).tolist()
