@@ -292,7 +292,7 @@ def tracing_problem():
     from mavfi_cli.mission.machine import OK, check_tracing
 
     found = check_tracing()
-    return None if found.verdict == OK else found.found
+    return None if found.verdict == OK else found.finding
 
 
 @pytest.fixture

@@ -43,16 +43,16 @@ class RunResult:
     outcome: RunOutcome
     signal: int | None
     verdict: RunVerdict
-    fault: InstructionFault | None  # None if a time trigger found nothing to hit
+    fault: InstructionFault | None  # None if a time trigger hit no instruction in scope
     injection: Injection | None
     followed: Followed
     reason: str  # why the fault was not injected
     run_s: float  # wall time of the whole run
 
     def completed(self, planned: FaultRecord) -> FaultRecord:
-        """Make the record of the run that was planned so."""
+        """Return the completed record of a planned run."""
         fault = self.fault
-        if fault is not None and not planned["trigger"]:  # a time trigger: it cannot be repeated
+        if fault is not None and not planned["trigger"]:  # a time trigger, which is not repeatable
             planned = {
                 **planned,
                 "object": fault.target.object,
@@ -75,7 +75,7 @@ class RunResult:
 
 
 def golden_run(place: JudgedPlace) -> Golden:
-    """Run without a fault several times; the target must be repeatable.
+    """Run several times without a fault, and require equal results.
 
     Raises:
         TargetError: the target fails, or its outputs differ.
@@ -83,7 +83,7 @@ def golden_run(place: JudgedPlace) -> Golden:
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
     for again in runs[1:]:
         if unlike := place.unlike(runs[0], again):
-            problem = f"fault-free runs differ, so outcomes cannot be told: {unlike}"
+            problem = f"fault-free runs differ, so no outcome can be judged: {unlike}"
             raise TargetError(place.name, problem)
     slowest = max(run.cpu_s for run in runs), max(run.wall_s for run in runs)
     return replace(runs[0], cpu_s=slowest[0], wall_s=slowest[1])
@@ -97,10 +97,10 @@ class Attacker:
     golden: Golden
 
     def run(self, fault: InstructionFault) -> RunResult:
-        """One run with a fault at an exact execution of an instruction.
+        """Run once with a fault at an exact execution of an instruction.
 
         Raises:
-            FaultError: the instruction at the location is not the drawn one.
+            FaultError: the location holds another instruction than the drawn one.
         """
         start = time.perf_counter()
         tracee = self.place.start()
@@ -122,7 +122,7 @@ class Attacker:
     def run_timed(
         self, plan: Strategy, rng: np.random.Generator, *, null: bool = False
     ) -> RunResult:
-        """One run with a fault at a drawn moment of the CPU time or duration of the golden run.
+        """Run once with a fault at a random moment of the golden run's CPU time or duration.
 
         Args:
             null: leave out the flip.
@@ -173,7 +173,7 @@ class Attacker:
         return None, reason
 
     def _corrupt(self, start: float, tracee: Tracee, fault: InstructionFault) -> RunResult:
-        """Flip at the stop in front of the attacked instruction, follow, and run to the end."""
+        """Flip bits just before the attacked instruction, follow them, and run to the end."""
         injection, followed = None, NOTHING
         with self._deadline(tracee) as alarm:
             window = self.place.limits.follow_window
@@ -270,20 +270,21 @@ def attack_live(
 ) -> LiveAttack:
     """Apply one fault in a running process, such as a node of a mission, and let it continue.
 
-    The record is on the disk before the process runs to the trigger. The process must be a child of
-    the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached, the kernel
-    tells the tracer first: take its end from the result, not from `Popen.wait`.
+    The record is written to disk before the process runs to the trigger. The process must be a
+    child of the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached,
+    the kernel notifies the tracer first: read its exit status from the result, not from
+    `Popen.wait`.
 
     Args:
         window: number of instructions for which a destination fault is followed.
         armed: called once the process runs towards the trigger.
-        reached: called when it has stopped there.
+        reached: called when the process has stopped at the trigger.
         leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
         context: further entries of the record: kernel, stage, sampling rule, seed, scope.
 
     Raises:
         TracingForbidden: the operating system refuses.
-        FaultError: another instruction is at the location.
+        FaultError: the location holds another instruction.
     """
     tracee = Tracee.attach(pid)
     try:
@@ -313,7 +314,7 @@ class TracerThread(Generic[T]):
     """Runs work that traces a node in a thread of its own.
 
     Args:
-        work: gets a function to call once the node runs towards the awaited event.
+        work: receives a function that it calls once the node runs towards the awaited event.
     """
 
     def __init__(self, work: Callable[[Notice], T]) -> None:
@@ -336,15 +337,15 @@ class TracerThread(Generic[T]):
             self._done.result()
 
     def result(self) -> T:
-        """Wait for the end of the work; return its result or raise its error."""
+        """Wait until the work is done; return its result or raise its error."""
         return self._done.result()
 
 
 class EntryCounter:
     """Counts the executions of one instruction in a node that keeps running.
 
-    If the operating system cannot count, a tracer stops at each execution. The count is still right
-    whenever the node has answered, because it answers after its last stop.
+    If the operating system cannot count, a tracer stops the node at each execution. The count is
+    exact whenever the node has answered, because it answers after its last stop.
 
     Args:
         pid: the node; closing the counter may end it.
@@ -361,7 +362,7 @@ class EntryCounter:
             self._tracer.await_armed()
 
     def read(self) -> int:
-        """Executions since the counter was made."""
+        """Return the number of executions since the counter was created."""
         return self._stops if self._counter is None else self._counter.read()
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
 """Counts how often a program executes each instruction in one run, by valgrind's callgrind.
 
 Callgrind takes 10 to 60 times as long as the program. It writes a file of counts after every
-`_BLOCKS` basic blocks and one at the end, and their sum is the whole run. The files that are there
-say how fast it counts. The native CPU time that leads to the same counts says how much is left.
+`_BLOCKS` basic blocks and one at the end; their sum covers the whole run. The finished files give
+the counting rate. The native CPU time that leads to the same counts gives the remaining time.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from mavfi_cli.fi.tracer.spawn import Program
 
 # By the path of an object, or UNNAMED: the executions of each linked address.
 Executions = Mapping[str, Mapping[int, int]]
-UNNAMED = "???"  # objects that valgrind does not recognise; their addresses are those in memory
+UNNAMED = "???"  # objects that valgrind does not recognise; their addresses are addresses in memory
 
 _SLOWER = 200.0
 _START_S = 60.0
-_TOLD_EVERY_S = 1.0
-_LAST_BYTES = 64  # of a file, which hold its last line
+_REPORT_EVERY_S = 1.0
+_LAST_BYTES = 64  # at the end of a file, which include its last line
 _BLOCKS = 200_000_000  # basic blocks between two files: 10 to 20 s
 
 
 def find_valgrind() -> str | None:
-    """Path of valgrind; None if it is not installed."""
+    """Return the path of valgrind, or None if it is not installed."""
     return shutil.which("valgrind")
 
 
@@ -50,13 +50,13 @@ def count_executions(
     native_s: Callable[[Executions], float | None],
     report: Callable[[str], None] = lambda _: None,
 ) -> tuple[int, Executions]:
-    """Run a program under callgrind; its exit code and the executions of its run.
+    """Run a program under callgrind; return its exit code and its execution counts.
 
     Args:
-        counts: file to which callgrind writes, and to others of this name with a number.
-        native_s: function from the executions at one moment to the CPU time of a native run until
-            then, s; None if it is not known.
-        tell: called every second with how far it is, in words.
+        counts: path of callgrind's output; it also writes numbered files with this prefix.
+        native_s: maps the execution counts so far to the CPU time of a native run up to that
+            point, s; returns None if that is unknown.
+        report: called every second with a description of the progress.
 
     Raises:
         TargetError: it does not end in time, or a signal kills it.
@@ -88,7 +88,7 @@ def count_executions(
 
 @dataclass(slots=True)
 class _Count:
-    """What has been counted of a run so far, and when it will end."""
+    """The counts of a run so far, with a forecast of its end."""
 
     counts: Path
     golden: Golden
@@ -106,7 +106,7 @@ class _Count:
         return _SLOWER * self.golden.wall_s + _START_S
 
     def update(self) -> str:
-        """Read the new files; how far the count is, in words."""
+        """Read the new files; return a description of the progress."""
         elapsed_s = time.monotonic() - self.begun_s
         if self._read_files():
             counted = sum(sum(counts.values()) for counts in self.executions.values())
@@ -125,7 +125,7 @@ class _Count:
             yield f"about {max(0.0, self.forecast_s - elapsed_s):.0f} s left"
 
     def read_rest(self) -> None:
-        """Read what is left when callgrind has ended."""
+        """Read the remaining files after callgrind has ended."""
         self._read_files()
         self._add(self.counts)
 
@@ -146,10 +146,10 @@ class _Count:
 def _await_end(
     process: subprocess.Popen[bytes], name: str, count: _Count, report: Callable[[str], None]
 ) -> int:
-    """Wait for the exit code; tell how far it is."""
+    """Wait for the exit code, and report progress meanwhile."""
     while (left_s := count.begun_s + count.limit_s - time.monotonic()) > 0:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            return process.wait(min(_TOLD_EVERY_S, left_s))
+            return process.wait(min(_REPORT_EVERY_S, left_s))
         report(count.update())
     raise TargetError(name, f"has not ended under callgrind after {count.limit_s:.0f} s")
 
@@ -165,7 +165,7 @@ def _is_complete(path: Path) -> bool:
 
 
 def _read_counts(path: Path) -> dict[str, Counter[int]]:
-    """Executions of each instruction, by the path of its object and its linked address.
+    """Return execution counts by the path of the object and the linked address.
 
     Args:
         path: callgrind's file; addresses are those of the linker, and the line after `calls=` is

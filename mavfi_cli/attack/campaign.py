@@ -1,9 +1,9 @@
 """Runs many faults on each of several targets: golden run, profile, fault list, runs.
 
 Fault number i of a target depends on the seed, the target's own stream and i only. So the results
-depend neither on the number of workers nor on the other targets. A target with several inputs runs
-on each equally often: fault i strikes input i modulo their number. A worker process keeps a target
-open and runs its faults in order.
+depend neither on the number of workers nor on the other targets. A target with several inputs uses
+them in rotation: fault i strikes input i modulo their number. A worker process keeps a target open
+and runs its faults in order.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ class Plan:
     compat: str | None = None
     model: FaultModel | None = None
     windows: int = 16  # number of stepped windows, if not the whole run is stepped
-    null: bool = False  # everything but the flip
+    null: bool = False  # leave out the flip
 
     def strategy(self) -> Strategy:
         """The sampling strategy."""
         return Strategy.of(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> dict[str, Any]:
-        """The entries that results depend on, without number of runs and choice of targets."""
+        """Return the entries that determine a target's results, except the number of runs."""
         return {
             "seed": self.seed,
             "rule": self.rule,
@@ -86,7 +86,7 @@ Stage = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetRuns:
-    """All runs of one target, in order of their numbers, with the profiles they were drawn from."""
+    """All runs of one target in numerical order, with the profiles of their faults."""
 
     target: AttackTarget
     context: Mapping[str, Any]  # entries of every record about the target
@@ -129,16 +129,16 @@ def run_campaign(
     """Make golden run, profile, fault list and runs of every target.
 
     Args:
-        targets: one or more; if there are several, each has its own stream.
-        folder: the faults are flushed there before the first run, and each run when it is over.
-            Runs that are already there are not repeated.
-        progress: called with the target and the number of its completed runs; with 0 before its
-            golden run and profile.
-        notice: called with what the user should know about a golden run.
+        targets: one or more targets; several need distinct streams.
+        folder: receives the list of faults before the first run, and the record of each run
+            as it ends. Runs that it already holds are not repeated.
+        progress: called with the target's name and its number of completed runs, first with 0
+            before the golden run.
+        notice: called with each warning about a golden run.
 
     Raises:
-        TracingForbidden: the operating system refuses.
-        TargetError: a target cannot be attacked; says why.
+        TracingForbidden: the operating system does not allow tracing.
+        TargetError: a target cannot be attacked.
         ConfigError: the folder holds another campaign, or runs beyond this one.
     """
     journal = None
@@ -173,8 +173,8 @@ def _attack(
     profiles, null_runs = make_null_runs(target.name, profiles, bench.draw, workers.null(bench))
     for method in null_runs.unused:
         notice(
-            f"{target.name} reads its own code as data: its output changes without a flip if a "
-            f"{method} counts, so none is used"
+            f"{target.name} reads its own code as data: its output changes even without a flip "
+            f"when a {method} counts executions, so none is used"
         )
     prepared = TargetRuns(
         target=target,
@@ -223,15 +223,15 @@ def _prepare(
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
             profiles = tuple(
-                part.profile(rng, windows=plan.windows, watch=_steps_told(stage))
+                part.profile(rng, windows=plan.windows, watch=_report_steps(stage))
                 for part in places_of(place)
             )
         undo.pop_all()
     return place, golden, profiles
 
 
-def _steps_told(stage: Callable[[str], None]) -> Watch:
-    """Make a watch that tells `stage` how many instructions were stepped so far, or other news."""
+def _report_steps(stage: Callable[[str], None]) -> Watch:
+    """Return a watch that reports stepped instructions, or other news, to `stage`."""
     total = 0
 
     def watch(news: int | str) -> None:
@@ -245,7 +245,7 @@ def _steps_told(stage: Callable[[str], None]) -> Watch:
 
 
 def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[FaultRecord]:
-    """Make the records of all faults before they run; time rules draw at the stop."""
+    """Make the records of all faults before they run; a time rule draws its fault at the stop."""
     chosen, records = plan.strategy(), list[FaultRecord]()
     for index in range(plan.runs):
         number = prepared.input_of(index)
@@ -275,7 +275,7 @@ _claims: list[socket.socket] = []  # of this process
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """Stay on one processor: tracer and target switch all the time, which is fastest there."""
+    """Stay on one processor, where the constant switches between tracer and target are fastest."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, [_claimed_processor()])
     try:
@@ -286,10 +286,10 @@ def one_processor() -> Iterator[None]:
 
 @functools.lru_cache(maxsize=1)
 def _claimed_processor() -> int:
-    """A processor that no other campaign has claimed; it stays the same, as what is started there.
+    """Claim a processor that no other campaign uses, for this process and its children.
 
-    The claim is a name that one socket on the machine can have, so it ends with its process. If
-    all are claimed, one is shared.
+    The claim is an abstract socket name, so it ends with the process. If all processors are
+    claimed, one is shared.
     """
     claim, processors = socket.socket(socket.AF_UNIX), sorted(os.sched_getaffinity(0), reverse=True)
     _claims.append(claim)
@@ -301,7 +301,7 @@ def _claimed_processor() -> int:
 
 
 def _give_up_processor() -> None:
-    """Leave the claimed processor to others."""
+    """Release the claimed processor."""
     while _claims:
         _claims.pop().close()
     _claimed_processor.cache_clear()
@@ -309,7 +309,7 @@ def _give_up_processor() -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bench:
-    """A target with its golden run, as plain values for a worker process."""
+    """A target and its golden runs, as plain values that a worker process can receive."""
 
     plan: Plan
     target: AttackTarget
@@ -321,7 +321,7 @@ class _Bench:
         return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
-        """The target's own random numbers; those of fault number i depend on i only."""
+        """Return a generator of the target's stream, for one use such as a fault's number."""
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
     def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
@@ -349,7 +349,7 @@ def _close() -> None:
 def _work_in_pool(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     try:
         return _work(job)
-    except SystemExit:  # the pool would send it to the client, and begin the next chunk
+    except SystemExit:  # the pool would pass it to the client and start the next chunk
         _close()
         os._exit(_TERMINATED)
 
@@ -382,7 +382,7 @@ def _leave(*_: object) -> NoReturn:
 
 
 class _AttackWorkers:
-    """The workers of one campaign, or this process if one is enough; a context manager."""
+    """The worker processes of one campaign, or this process for one job; a context manager."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
@@ -406,7 +406,7 @@ class _AttackWorkers:
         _give_up_processor()
 
     def take(self, bench: _Bench, place: JudgedPlace) -> None:
-        """Keep a place that was opened in this process, or close it if no worker here needs it."""
+        """Keep a place for runs in this process, or close it if worker processes do the runs."""
         if self._pool is None:
             _keep_open(bench, place)
         else:
@@ -414,7 +414,7 @@ class _AttackWorkers:
             _give_up_processor()
 
     def null(self, bench: _Bench) -> Run:
-        """A function that runs tasks without their flips."""
+        """Return a function that runs tasks without their flips."""
         without = replace(bench, plan=replace(bench.plan, null=True))
 
         def run(tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
@@ -424,10 +424,10 @@ class _AttackWorkers:
         return run
 
     def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
-        """The results in the order of the tasks.
+        """Run the tasks; yield their results in order.
 
         Raises:
-            FaultError: something killed a worker.
+            FaultError: a worker process was killed.
             TargetError: the target cannot be sent to a worker.
         """
         if self._pool is None:
@@ -439,7 +439,7 @@ class _AttackWorkers:
         try:
             pickle.dumps(bench)
         except Exception as error:  # the target may raise anything
-            problem = f"cannot be handed to a worker process: {error}"
+            problem = f"cannot be sent to a worker process: {error}"
             raise TargetError(bench.target.name, problem) from None
         size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
         jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
@@ -477,15 +477,15 @@ def replay_runs(
     """Repeat the runs of a campaign's folder.
 
     Args:
-        kernels: names of the kernels; all of ours if none is named.
-        runs: number of runs of each kernel, or of the program, from the first; 0 for all.
-        program: the program of the folder, which may be somebody else's: it is not executed unless
-            it is this one.
+        kernels: names of the kernels; empty for all built-in ones.
+        runs: number of runs to repeat of each kernel or of the program; 0 for all.
+        program: the program that the user named. The folder may come from somebody else, so its
+            program is executed only if it is this one.
 
     Raises:
-        RecordError: the folder has no runs that can be repeated.
-        ConfigError: the folder has the runs of another program.
-        BuildMismatch: a record is of another build; says what differs.
+        RecordError: the folder holds no repeatable runs.
+        ConfigError: the folder holds runs of another program.
+        BuildMismatch: a record comes from another build.
     """
     plan, repeated = read_plan(folder), False
     for target in _targets(plan, folder, kernels, program):
@@ -503,7 +503,7 @@ def replay_runs(
                 record.require_same_build(entry, image)
                 yield _replay(attackers[entry.get("input", 0)], entry)
     if not repeated:
-        raise RecordError(f"{folder}: no runs that can be repeated")
+        raise RecordError(f"{folder}: holds no repeatable runs")
 
 
 def _targets(
@@ -521,8 +521,8 @@ def _targets(
             raise RecordError(f"{folder}: holds runs of a program, not of {' and '.join(kernels)}")
         if program is None:
             raise ConfigError(
-                f"holds runs of a program, {plan['program']!r}, which would be executed: if it is "
-                "yours, give --program and the other options of the program again",
+                f"holds runs of a program, {plan['program']!r}, which would be executed: if you "
+                "trust it, repeat --program and its other options",
                 path=folder,
             )
         known = {"stdin": None, "files": None, **program.known()}

@@ -1,6 +1,7 @@
-"""Differences from the golden run: their size, and which outputs of a program are compared.
+"""Compares outputs with those of the golden run.
 
-The templates of kernels import this and no tracer: what they load is copied for every run.
+Kernel templates import this module, so it must not load the tracer: every run copies what they
+load.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Difference:
         absolute: the same in `unit`, or inf.
         unit: unit of `absolute`.
         text: the difference in words.
-        noticeable: whether it is beyond what the taker of the output tolerates.
-        parts: what the difference consists of, by name.
+        noticeable: whether it exceeds what the consumer of the output tolerates.
+        parts: named components of the difference.
     """
 
     relative: float
@@ -41,7 +42,7 @@ class Difference:
     parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Entries of a record; a size that is not a number is null."""
+        """Entries of a record; a size that is not finite is null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,
@@ -55,13 +56,13 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputComparison:
-    """The compared outputs, and how they are compared.
+    """Which outputs are compared, and how.
 
     Attributes:
         files: compared files, relative to the folder in which the program runs.
         stdout: whether standard output is compared too.
         tolerance: largest relative difference of a number that still counts as equal.
-        ignored: patterns (bytes); a line that contains one is left out.
+        ignored: patterns (bytes); lines that match one are ignored.
     """
 
     files: tuple[str, ...] = ()
@@ -76,8 +77,8 @@ class OutputComparison:
         """Make a comparison from options of the command line.
 
         Args:
-            outputs: each `stdout`, or `file:PATH` relative to the program's folder; an empty list
-                means standard output.
+            outputs: `stdout`, or `file:PATH` relative to the program's folder; empty for standard
+                output.
 
         Raises:
             ConfigError: an output is neither of the two, a path leads out of the program's
@@ -92,7 +93,7 @@ class OutputComparison:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The entries that results depend on."""
+        """Return the entries that determine results."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
         entries: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
@@ -134,7 +135,7 @@ class OutputComparison:
 def _inside(text: str) -> str:
     kind, _, name = text.partition(":")
     if kind != "file" or not name:
-        raise ConfigError(f"cannot compare {text!r}; known: stdout, file:PATH", key="compare")
+        raise ConfigError(f"must be stdout or file:PATH, got {text!r}", key="compare")
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or not path.parts:
         raise ConfigError(
@@ -164,7 +165,7 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
 
 
 def _beginning(path: Path) -> bytes:
-    """The contents of a file, cut behind what is compared."""
+    """The contents of a file, truncated to just beyond the compared size."""
     with path.open("rb") as file:
         return file.read(LARGEST_BYTES + 1)
 
@@ -172,8 +173,8 @@ def _beginning(path: Path) -> bytes:
 def _magnitude(golden: bytes, output: bytes) -> float | None:
     """Largest relative difference between the numbers of two texts.
 
-    It is relative to the golden number's size, absolute if that is 0, and infinite if one of the
-    two is not finite and they differ. None if the texts differ in more than their numbers.
+    The difference is absolute where the golden number is 0, and infinite where one of two differing
+    numbers is not finite. Returns None if the texts differ in more than their numbers.
     """
     ours, theirs = _SEPARATORS.split(golden), _SEPARATORS.split(output)
     if len(ours) != len(theirs):

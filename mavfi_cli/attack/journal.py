@@ -1,8 +1,8 @@
-"""The folder of a campaign: its plan, the drawn faults, and every run as soon as it is over.
+"""The folder of a campaign: its plan, its drawn faults, and its completed runs.
 
-`plan.json` says what the folder holds. `faults.jsonl` (`faults-KERNEL.jsonl`) is on the disk before
-the first fault runs. `runs.jsonl` grows by one line a run, so an interrupted campaign continues
-where it stopped.
+`plan.json` describes the campaign. `faults.jsonl` (`faults-KERNEL.jsonl`) is written before the
+first fault runs. `runs.jsonl` gains one line per run, so an interrupted campaign continues where it
+stopped.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class Journal:
         """Open the folder, or create it.
 
         Args:
-            known: everything that its results depend on, as plain values.
+            known: everything that determines its results, as plain values.
             runs: number of runs of each kernel when the campaign is complete.
 
         Raises:
-            ConfigError: it holds another campaign, or runs beyond this one.
+            ConfigError: it holds another campaign, or more runs than `runs`.
             RecordError: it cannot be written.
         """
         self._folder = folder
@@ -58,13 +58,13 @@ class Journal:
         self._end_last_line()
 
     def _end_last_line(self) -> None:
-        """Keep the next run off a line that an interruption has cut."""
+        """End a line that an interruption has cut, so that the next run starts a new one."""
         path = self._folder / RUNS
         if path.is_file() and not path.read_bytes().endswith(b"\n"):
             self._write(b"\n")
 
     def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
-        """Refuse to leave out existing runs, because the summary covers the whole folder."""
+        """Refuse to omit existing runs, because the summary covers the whole folder."""
         counts: dict[str, int] = {}
         for entry in read_runs(self._folder):
             kernel = entry.get("kernel", "")
@@ -72,20 +72,20 @@ class Journal:
         others = sorted(counts.keys() - set(kernels)) if kernels is not None else []
         if others:
             raise ConfigError(
-                f"holds runs of {' and '.join(others)} as well: name every kernel that it has, "
-                "or another folder",
+                f"holds runs of {' and '.join(others)} as well: name all of its kernels, or "
+                "choose another folder",
                 path=self._folder,
             )
         most = max(counts.values(), default=0)
         if most > runs:
             raise ConfigError(
-                f"holds {most} runs already, {runs} are asked for: ask for at least as many, or "
-                "name another folder",
+                f"holds {most} runs already: the number of runs must be at least {most}, "
+                f"got {runs}; or choose another folder",
                 path=self._folder,
             )
 
     def runs_of(self, planned: Sequence[FaultRecord]) -> dict[int, FaultRecord]:
-        """Existing runs of the planned faults, by number."""
+        """Return the existing runs of the planned faults, by number."""
         runs = {}
         for entry in read_runs(self._folder):
             index = entry["run"]
@@ -94,12 +94,12 @@ class Journal:
         return runs
 
     def flush_plan(self, name: str, planned: Iterable[FaultRecord]) -> None:
-        """Flush the faults to a file of that name before the first one runs."""
+        """Write the planned faults to the named file."""
         text = "".join(json.dumps(entry) + "\n" for entry in planned).encode()
         write_atomically(self._folder / name, lambda file: file.write(text))
 
     def append(self, entry: FaultRecord) -> None:
-        """Append a run that is over."""
+        """Append a completed run."""
         self._write((json.dumps(entry) + "\n").encode())
 
     def _write(self, data: bytes) -> None:
@@ -109,7 +109,7 @@ class Journal:
 
 
 def read_plan(folder: Path) -> dict[str, Any]:
-    """Read everything that the runs of a folder depend on.
+    """Read the plan of a folder.
 
     Raises:
         RecordError: the folder holds no campaign.
@@ -118,9 +118,9 @@ def read_plan(folder: Path) -> dict[str, Any]:
 
 
 def read_runs(folder: Path) -> list[FaultRecord]:
-    """Read the completed records of a folder; incomplete lines are left out.
+    """Read the completed records of a folder; incomplete lines are skipped.
 
-    A run that was repeated, because the program was built anew, replaces the earlier one.
+    If a run was repeated after the program was rebuilt, the later record counts.
 
     Raises:
         RecordError: the file cannot be read.

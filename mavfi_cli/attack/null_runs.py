@@ -1,9 +1,9 @@
-"""Null runs: everything but the flip. They show whether the runs of a target repeat.
+"""Null runs, which leave out the flip, show whether a target's runs are repeatable.
 
-An outcome means something only if a run without a flip ends as the golden run did. A target may
-depend on time or on chance. It may also read its own code as data. Then a detour, which counts
-executions by changing code, changes its output. So a campaign begins with null runs of its first
-faults, by turns from every counting method, and goes on without detours that change the output.
+An outcome is meaningful only if a run without a flip ends as the golden run did. A target may
+depend on time or on chance. It may also read its own code as data; then a detour, which counts
+executions by patching code, changes its output. So a campaign begins with null runs of some of its
+first faults, covers every counting method, and then avoids detours that change the output.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from mavfi_cli.fi.tracer.image import Location
 from mavfi_cli.fi.tracer.tracee import DETOUR_COST
 
 NULL_RUNS = 20
-_FAULTS = 64  # of the campaign, from which null runs are chosen
-_REPEATED = 3  # runs of a null fault that differed, to tell a detour from chance
-_APART_S = 1.0  # golden runs and the last null run
+_FAULTS = 64  # first faults of the campaign, from which null runs are chosen
+_REPEATED = 3  # repetitions of a differing null run, to separate detours from chance
+_APART_S = 1.0  # least time between the golden runs and the last null run
 _TIMER = "timer"
 _DETOURS = (Counting.FAR_DETOUR, Counting.DETOUR)
 Profiles = tuple[TargetProfile | None, ...]  # of each input; None for time rules
@@ -39,8 +39,8 @@ class NullRuns:
 
     Attributes:
         tasks: the faults whose flips were left out.
-        counting: null runs that reached their fault, by the name of the counting method.
-        unused: names of the counting methods that change the output and so are not used.
+        counting: number of null runs that reached their fault, by name of the counting method.
+        unused: names of the counting methods that are avoided because they change the output.
     """
 
     tasks: tuple[Task, ...]
@@ -59,18 +59,18 @@ def make_null_runs(
     draw: Callable[[Profiles, int], InstructionFault | None],
     run: Run,
 ) -> tuple[Profiles, NullRuns]:
-    """Make null runs of a target, and leave out detours that change its output.
+    """Make null runs of a target, and drop detours that change its output.
 
     Args:
         name: the target's name for errors.
-        draw: function from profiles and a number to the fault of this number; None for time rules.
+        draw: returns the fault of a number, given the profiles; None for time rules.
         run: runs tasks without their flips.
 
     Returns:
-        The profiles without the counting methods that are not used, and the null runs.
+        The profiles without the dropped counting methods, and the null runs.
 
     Raises:
-        TargetError: null runs end differently from the golden run; names the counting methods.
+        TargetError: null runs end differently from the golden run.
     """
     unused: tuple[Counting, ...] = ()
     while True:
@@ -93,21 +93,21 @@ def make_null_runs(
 
 
 def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
-    """Repeat a null run later, because a difference may come late, such as that of a date.
+    """Repeat a null run later to detect a slow change, such as that of a date.
 
     Args:
-        golden_s: end of the golden runs on `time.monotonic`. The null run begins a second later at
-            the earliest, so that a program that prints the time in seconds ends differently.
+        golden_s: end of the golden runs on `time.monotonic`. The null run begins at least a
+            second later, which exposes a program that prints the time in seconds.
 
     Raises:
-        TargetError: it ends differently from the golden run now.
+        TargetError: the null run no longer ends as the golden run did.
     """
     time.sleep(max(0.0, golden_s + _APART_S - time.monotonic()))
     if any(null_run.differs for null_run in _make(null_runs.tasks[:1], run)):
         raise TargetError(
             name,
-            "a run without a flip ends differently from the golden run now, which it did not at "
-            "first: it depends on time or on what runs leave behind, so outcomes cannot be told",
+            "a run without a flip no longer ends as the golden run did: it depends on time or on "
+            "what earlier runs left behind, so no outcome can be judged",
         )
 
 
@@ -124,7 +124,7 @@ class _NullRun:
 
     @property
     def method(self) -> str:
-        """The name of the counting method: of several that which changes the most code."""
+        """Name of the counting method; of several, the one that changes the most code."""
         if self.task[1] is None:
             return _TIMER
         return _counting(self.task[1]).value
@@ -138,7 +138,7 @@ def _make(tasks: Sequence[Task], run: Run) -> list[_NullRun]:
 
 
 def _problem(made: Iterable[_NullRun]) -> str:
-    """Why the outcomes of a target cannot be told."""
+    """Explain why no outcome of a target can be judged."""
     methods: dict[str, list[_NullRun]] = defaultdict(list)
     for null_run in made:
         methods[null_run.method].append(null_run)
@@ -148,14 +148,14 @@ def _problem(made: Iterable[_NullRun]) -> str:
         text = ", ".join(f"{title} {count}" for title, count in ends.items())
         parts.append(f"{method}: {ends.total()} of {len(runs)}{text and f' ({text})'}")
     return (
-        "runs without a flip end differently from the golden run, so outcomes cannot be told; by "
-        f"counting method: {'; '.join(parts)}; --ignore-lines leaves out lines of a program that "
-        "change"
+        "runs without a flip end differently from the golden run, so no outcome can be judged; by "
+        f"counting method: {'; '.join(parts)}; --ignore-lines skips lines of a "
+        "program that vary"
     )
 
 
 def _by_turns(faults: Sequence[Task]) -> tuple[Task, ...]:
-    """Choose null runs by turns from all counting methods, and from all places of each."""
+    """Choose null runs in rotation from all counting methods, and from all places of each."""
     methods: dict[Counting, dict[Location | None, list[Task]]] = {}
     for task in faults:
         stops = _detours(task[1])
@@ -175,6 +175,6 @@ def _detours(fault: InstructionFault | None) -> list[CountedStop]:
 
 
 def _counting(fault: InstructionFault | None) -> Counting:
-    """The counting method of a fault, of several that which changes the most code."""
+    """Counting method of a fault; of several, the one that changes the most code."""
     used = {stage.detour.counting for stage in _detours(fault) if stage.detour is not None}
     return next((method for method in Counting if method in used), Counting.BREAKPOINT)

@@ -1,4 +1,4 @@
-"""The place where a target runs repeatedly from the same memory, and its golden run there."""
+"""The interface of a place where a target runs repeatedly, and its golden run there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Tracee
 
-# Called with the instructions stepped since the last call, or with what goes on, in words.
+# Called with the number of instructions stepped since the last call, or with a status text.
 Watch = Callable[[int | str], None]
 
 
@@ -26,7 +26,7 @@ class AttackPlace(Protocol):
         """Kind of the target for messages: kernel, node or program."""
 
     def start(self) -> Tracee:
-        """Start a run, stopped before anything that can be hit."""
+        """Start a run, stopped before any code in scope."""
 
     def image(self, tracee: Tracee) -> Image:
         """The memory image of a run."""
@@ -46,7 +46,7 @@ class Golden:
     cpu_s: float
     wall_s: float
     exit_code: int = 0
-    notices: tuple[str, ...] = ()  # what the user should know about it
+    notices: tuple[str, ...] = ()  # warnings for the user
 
     @property
     def sha256(self) -> str:

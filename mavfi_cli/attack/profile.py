@@ -1,16 +1,16 @@
 """Profiles the instructions that a target executes in one run: all of them, or a stated sample.
 
-A run that is not too long is stepped completely. A longer one is cut into windows that together are
-the whole run. Each execution of a *marker*, such as a function's entry, begins a window.
-It ends in front of the next execution of any marker, or with the run. The code before the first
-marker is a window too. The windows of one marker are a stratum. Some windows of each stratum, each
-with the same chance, are drawn and stepped, so every executed instruction in scope is as likely to
-be in the sample as all others of its stratum.
+A run that is not too long is stepped completely. A longer one is cut into windows that together
+make up the whole run. Each execution of a *marker*, such as a function's entry, begins a window.
+The window ends before the next execution of any marker, or with the run. The code before the first
+marker is a window too. The windows of one marker are a stratum. Windows of each stratum are drawn
+with equal probability and stepped, so all executed instructions of a stratum are equally likely to
+be in the sample.
 
-A few windows are stepped first: the *pilot*. Its lengths decide how many of the other windows are
-stepped, as many as fit into `ENOUGH` instructions. A sample whose size depends on its own lengths
-would be biased, so the pilot is a stratum of its own, which is complete, and only the other windows
-estimate the rest. They are drawn at equal distances from a random start. A stratum is drawn in
+A few windows are stepped first: the *pilot*. Its lengths determine how many of the other windows
+are stepped: as many as fit into `ENOUGH` instructions. A sample whose size depends on its own
+lengths would be biased, so the pilot is a complete stratum of its own, and only the other windows
+estimate the rest. They are drawn at equal spacing from a random start. A stratum is drawn in
 proportion to its windows times their mean length, and an instruction uniformly from its stepped
 windows.
 """
@@ -40,12 +40,12 @@ from mavfi_cli.stats.shares import Interval, estimated_total
 
 STEPS = 2_000_000  # of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
-_NOTHING = "executes nothing that may be hit"
+_NOTHING = "executes no code in scope"
 _UNNAMED = (
-    "executes code that callgrind cannot name: its object has no writable data in its file, and is "
-    "loaded anywhere; link it at a fixed address (-no-pie), or name a function"
+    "executes code that callgrind cannot name: its file has no writable data, and its address is "
+    "not fixed; link it at a fixed address (-no-pie), or name a function"
 )
-_COOL = 64  # an instruction that is executed at most this many times less often than the hottest
+_COOL = 64  # ratio of the hottest instruction's executions to those of a checked one, at most
 _CHECKED = 4  # instructions whose counts are checked, besides the most executed
 _TAIL = 16  # bytes behind the code, for the decoder
 _DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
@@ -56,7 +56,7 @@ Window = tuple[int, int]  # stratum and number of the sampled window that a run 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScopeCode:
-    """Code in scope that lies in one piece."""
+    """One contiguous piece of code in scope."""
 
     start: int  # address
     data: bytes  # the code, and _TAIL bytes behind it
@@ -66,7 +66,7 @@ class ScopeCode:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetProfile:
-    """The instructions that can be hit in one run, with what is needed to draw from them."""
+    """The instructions in scope that one run executes, from which faults are drawn."""
 
     strata: tuple[Stratum, ...] = ()
     counted: CountedRun | None = None  # a whole run that was counted instead of stepped
@@ -81,13 +81,13 @@ class TargetProfile:
 
     @property
     def windows(self) -> str:
-        """Stepped windows and all windows, in words."""
+        """Stepped windows of all windows, as text."""
         stepped = sum(len(stratum.segments) for stratum in self.strata)
         return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
 
     @property
     def executed(self) -> int:
-        """Number of executed instructions in scope, over the stepped windows."""
+        """Number of executed instructions in scope in the stepped windows."""
         stepped = sum(stratum.executed for stratum in self.strata)
         return stepped if self.counted is None else self.counted.executed
 
@@ -105,7 +105,7 @@ class TargetProfile:
 
     @property
     def not_reached(self) -> float:
-        """Share of the executed instructions that is not drawn, because no stop reaches it."""
+        """Share of the executed instructions that no stop can reach, and that are never drawn."""
         return 0.0 if self.counted is None else self.counted.not_reached
 
     def code_at(self, address: int) -> bytes:
@@ -128,7 +128,7 @@ class TargetProfile:
         raise ValueError(f"{address:#x} is not in scope")
 
     def window_of(self, record: FaultRecord) -> Window | None:
-        """The sampled window of a fault; None if no sample of windows was taken."""
+        """Return the sampled window of a fault; None if windows were not sampled."""
         first = record["trigger"][0]
         return self._sampled_windows.get((first["object"], first["offset"], first["count"]))
 
@@ -143,7 +143,7 @@ class TargetProfile:
 
     @property
     def sampled(self) -> dict[int, int]:
-        """Stepped windows of each stratum of which not all were stepped, by its number."""
+        """Number of stepped windows of each incomplete stratum, by the stratum's number."""
         return {
             number: len(stratum.segments)
             for number, stratum in enumerate(self.strata)
@@ -151,7 +151,7 @@ class TargetProfile:
         }
 
     def draw(self, plan: Strategy, rng: np.random.Generator) -> InstructionFault:
-        """Draw one fault, uniformly over the executed instructions."""
+        """Draw one fault uniformly from the executed instructions."""
         drawn = self.counted or self._drawn_stratum(rng)
         return draw_fault(drawn, plan, rng, code_at=self.code_at, locate=self.locate)
 
@@ -161,7 +161,7 @@ class TargetProfile:
         return self.strata[which]
 
     def after(self, begin: CountedStop) -> TargetProfile:
-        """Make the same profile for a run that has to reach `begin` first."""
+        """Return the same profile for a run that must reach `begin` first."""
 
         def later(stratum: Stratum) -> Stratum:
             segments = (
@@ -172,14 +172,14 @@ class TargetProfile:
         return replace(self, strata=tuple(map(later, self.strata)))
 
     def without(self, methods: Container[Counting]) -> TargetProfile:
-        """Make the same profile without some counting methods on the way to a fault."""
+        """Return the same profile without these counting methods on the way to a fault."""
         strata = self.strata
         if Counting.DETOUR in methods:
             strata = tuple(stratum.without_detours() for stratum in strata)
         return replace(self, strata=strata, counted=self.counted and self.counted.without(methods))
 
-    def in_words(self) -> str:
-        """How the population of faults was found, in words."""
+    def describe(self) -> str:
+        """Describe the population of faults and how it was sampled."""
         if self.complete:
             return f"all {self.executed} executed instructions in scope"
         windows: dict[str, list[int]] = {}
@@ -202,7 +202,7 @@ class TargetProfile:
 
 
 def _code_of(code: Iterable[ScopeCode], address: int) -> bytes:
-    """16 bytes at an address, from pieces of code."""
+    """Return 16 bytes at an address from pieces of code."""
     for piece in code:
         if 0 <= (at := address - piece.start) < len(piece.data):
             return piece.data[at : at + 16]
@@ -221,18 +221,18 @@ def profile_run(
     watch: Watch | None = None,
     guard: Guard = nullcontext,
 ) -> TargetProfile:
-    """Step a golden run, or a sample of the windows that markers cut it into.
+    """Step a golden run, or a sample of its windows.
 
     Args:
-        markers: instructions in scope; none for the whole run.
-        end: nothing is profiled from the first execution of this instruction in scope on.
-        windows: the least number of windows of each marker to step, after half as many as a pilot.
-        enough: more windows are stepped while they have at most this many instructions together,
-            by the length of the pilot's.
+        markers: instructions in scope that begin windows; none for the whole run.
+        end: an instruction in scope; its first execution ends the profile.
+        windows: least number of windows of each marker to step, after a pilot of half as many.
+        enough: number of instructions up to which more windows are stepped, estimated from the
+            pilot.
         guard: makes the context in which a run is stepped.
 
     Raises:
-        TargetError: no instruction in scope executes, or the run does not repeat itself.
+        TargetError: no instruction in scope executes, or the run is not repeatable.
         WindowTooLong: too many instructions.
     """
     begun = time.perf_counter()
@@ -258,7 +258,7 @@ def profile_run(
 
 
 def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
-    """Step one call of a function, at whose entry the runs of the place start.
+    """Step one call of the function at whose entry the place's runs start.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -277,10 +277,10 @@ def profile_calls(
     watch: Watch | None = None,
     guard: Guard = nullcontext,
 ) -> TargetProfile:
-    """Step calls of one function, which is drawn in proportion to its calls.
+    """Step calls of one function, drawn in proportion to its number of calls.
 
     Args:
-        windows: the most calls to step.
+        windows: largest number of calls to step.
         guard: makes the context in which a run is stepped.
 
     Raises:
@@ -310,16 +310,17 @@ def profile_counted(
     counts: Executions,
     begun: float,
 ) -> TargetProfile:
-    """The profile of a whole run whose executions have been counted.
+    """Return the profile of a whole run from its execution counts.
 
-    Some counts are checked in runs of the place: the largest, and others in proportion to them.
+    The largest count and a sample of others, drawn in proportion to their size, are checked in
+    further runs.
 
     Args:
-        counts: the executions of the run.
-        begun: when the counting began, `time.perf_counter`.
+        counts: execution counts of the run.
+        begun: start of the counting on `time.perf_counter`.
 
     Raises:
-        TargetError: no instruction in scope executes, or one more or less often than counted.
+        TargetError: no instruction in scope executes, or a checked count is wrong.
     """
     run, image, code = _counted(place, counts)
     if not run.executed:
@@ -333,10 +334,10 @@ def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
     """CPU time of a native run until it has executed as much as has been counted, s.
 
     Args:
-        counts: the executions in a part of the run, from its beginning.
+        counts: execution counts of the first part of the run.
 
     Returns:
-        None if nothing in scope has been counted yet, or the run does not execute as much.
+        None if nothing in scope has been counted yet, or the native run ends before that.
     """
     run, image, _ = _counted(place, counts)
     if not run.executed:
@@ -355,11 +356,11 @@ def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
 def _counted(
     place: AttackPlace, counts: Executions
 ) -> tuple[CountedRun, Image, tuple[ScopeCode, ...]]:
-    """The executions in scope, in a native run."""
+    """Map the counts in scope to the addresses of a native run."""
     image, code, scope = _code(place)
     objects = {entry.path: entry.bias for entry in map(image.named, scope.objects) if entry.path}
-    # Valgrind names the code of an object only if a file is mapped to its writable data. The code
-    # of another one lies where it was linked, or else nobody knows where.
+    # Valgrind names the code of an object only if a file is mapped to its writable data. Other
+    # code is at its linked address, or its address is unknown.
     biases = objects | {UNNAMED: 0}
     executions = {
         biases[path] + offset: count
@@ -406,7 +407,7 @@ def function_of(place: AttackPlace, name: str) -> Location:
 
 
 def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
-    """The detour that counts an instruction of a run; None if none fits there."""
+    """Return a detour that counts executions of the marker; None if none fits there."""
     with started(place) as tracee:
         address = place.image(tracee).address(marker)
         code = tracee.memory.read(address, _DETOUR_CODE)
@@ -420,7 +421,7 @@ def detour_of(place: AttackPlace, marker: Location) -> Detour | None:
 
 @contextmanager
 def started(place: AttackPlace) -> Iterator[Tracee]:
-    """A run of a place, which is killed afterwards."""
+    """Start a run of a place, and kill it afterwards."""
     tracee = place.start()
     try:
         yield tracee
@@ -470,7 +471,7 @@ class _Stepper:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
-        """Step the windows of these numbers, from 1, out of `count`."""
+        """Step the windows of these numbers, from 1 to `count`."""
         left = sorted(numbers.tolist())
         segments: list[Segment] = []
         while left:  # one pass, unless a function calls itself
@@ -480,7 +481,7 @@ class _Stepper:
         return Stratum(marker=self.marker, segments=tuple(segments), windows_in_run=count)
 
     def _pass(self, numbers: Sequence[int]) -> Iterator[Segment]:
-        """Step windows of one run, until one lies inside the window before it."""
+        """Step windows of one run, up to one that begins inside an earlier window."""
         with started(self.place) as tracee, self.guard(tracee):
             image = self.place.image(tracee)
             address = -1 if self.marker is None else image.address(self.marker)

@@ -1,4 +1,4 @@
-"""A user's program as a target: its start, golden run and profile, and the judgement of its runs.
+"""A user's program as a target: starts, profiles and judges its runs.
 
 A program that is not short is profiled by exact execution counts.
 """
@@ -63,14 +63,14 @@ def _require_attackable(path: Path) -> None:
     if path.stat().st_mode & (stat.S_ISUID | stat.S_ISGID):
         raise TargetError(
             path.name,
-            "is set-uid or set-gid: it would lose these rights under the tracer, and must not have "
-            "them with a corrupted register; attack a copy",
+            "is set-uid or set-gid: it would lose these rights under the tracer, and must not "
+            "hold them while its state is corrupted; attack a copy",
         )
 
 
 _SHORT = 100_000  # instructions that are stepped rather than counted
 _STEP_LIMIT_S = 1e-3  # for one stepped instruction, about forty times what it takes
-_WATCHING = 20.0  # watching the system calls makes a run at most so much slower
+_WATCHING = 20.0  # largest slowdown of a run whose system calls are watched
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ class ProgramTarget:
     objects: tuple[str, ...] = ()  # file names in scope; by default the program itself
     function: str | None = None  # hit only calls of this function
     folder: Path | None = None  # each run works in a copy of it; None: in an empty folder
-    # Copied too: files and folders of the user, by their place relative to the program's folder.
+    # Further files and folders to copy, by their path relative to the program's folder.
     files: Mapping[str, Path] = field(default_factory=dict)
     limits: RunLimits = field(default_factory=RunLimits)
     mechanism: Mechanism | None = None
@@ -94,7 +94,7 @@ class ProgramTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """No stream, because a campaign has one program."""
+        """Empty, because a campaign has only one program."""
         return ()
 
     @property
@@ -114,7 +114,7 @@ class ProgramTarget:
         return entries
 
     def known(self) -> dict[str, Any]:
-        """Everything that its results depend on."""
+        """Return everything that determines the results."""
         entries = self.context() | {
             "comparison": self.comparison.to_json(),
             "environment": dict(self.command.environment),
@@ -126,19 +126,18 @@ class ProgramTarget:
         return entries
 
     def open(self) -> _Workplace:
-        """Make a scratch folder for its runs."""
+        """Create a scratch folder for the program's runs."""
         return _Workplace(self)
 
 
 class _Workplace:
-    """A scratch folder of one worker, with a folder in which the program runs, new for every run.
+    """The scratch folder of one worker, with a fresh folder for every run of the program.
 
-    Nothing outside it is ever removed.
+    Nothing outside the scratch folder is ever removed.
 
     Raises:
-        TargetError: the program is of a kind that cannot be attacked, or its files cannot be
-            copied.
-        RecordError: the scratch folder cannot be made.
+        TargetError: this kind of program cannot be attacked, or its files cannot be copied.
+        RecordError: the scratch folder cannot be created.
     """
 
     kind = "program"
@@ -184,7 +183,7 @@ class _Workplace:
         return image.scope(self.target.scope_objects)
 
     def _parts(self) -> dict[str, bytes | None]:
-        """The compared outputs of the last run, by name; None for a file that it did not write."""
+        """Return the compared outputs of the last run by name; None for an unwritten file."""
         parts = self.target.comparison.parts(self._folder.path, self._stdout)
         for name in self.target.comparison.files:
             if parts[name] is not None and not self._folder.wrote(name):
@@ -197,16 +196,16 @@ class _Workplace:
         """Step or count the golden run, or step sampled calls of the target's function.
 
         Raises:
-            WindowTooLong: too many instructions to step, and nothing that counts them.
+            WindowTooLong: the run is too long to be stepped, and valgrind is not installed.
             UnknownName: no such object or function.
-            TargetError: the function is never called, or the counts are not those of a run.
+            TargetError: the function is never called, or the counts do not match a native run.
         """
         if (watched := self._watch()).company:
             raise TargetError(
                 self.name,
-                f"{watched.company}, which is not followed: nothing there could be counted or hit; "
-                "attack a program with one thread (--env OMP_NUM_THREADS=1 makes one of "
-                "some)",
+                f"{watched.company}, which the tracer does not follow: nothing there can be "
+                "counted or hit; attack a program with one thread (--env OMP_NUM_THREADS=1 may "
+                "limit it to one)",
             )
         function, limit = self.target.function, self.limits.profile_steps
         if function is not None:
@@ -224,17 +223,17 @@ class _Workplace:
 
     @contextlib.contextmanager
     def _guard(self, tracee: Tracee) -> Iterator[None]:
-        """Give a stepped run a deadline, and compare it with the golden run if it ends."""
+        """Give a stepped run a deadline; if it ends, compare it with the golden run."""
         wall_s = self._watching_s + self.limits.profile_steps * _STEP_LIMIT_S
         with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
             yield
         if alarm.fired:
-            raise TargetError(self.name, f"does not end within {wall_s:.0f} s when it is stepped")
+            raise TargetError(self.name, f"does not end within {wall_s:.0f} s when stepped")
         if tracee.ended is not None:
             self._require_golden("stepped", tracee.ended)
 
     def _counted(self, rng: np.random.Generator, watch: Watch | None) -> TargetProfile:
-        """Count the executions of a whole run by callgrind, and check some of them."""
+        """Count the executions of a whole run with callgrind, and check some of the counts."""
         begun = time.perf_counter()
         self._folder.renew()
         code, executions = count_executions(
@@ -245,12 +244,12 @@ class _Workplace:
         return profile_counted(self, rng, executions, begun)
 
     def _native_s(self, executions: Executions) -> float | None:
-        """CPU time of a native run up to these executions, beside the run under callgrind."""
+        """Return the CPU time of a native run up to these counts; callgrind runs meanwhile."""
         with contextlib.closing(self.target.open()) as other:
             return native_time_s(other, executions)
 
     def _require_golden(self, how: str, ended: Ended) -> None:
-        """Refuse a profile if the profiled run has not ended and printed as the golden run."""
+        """Refuse a profile if the profiled run ended or printed differently from the golden run."""
         golden = self._known_golden()
         if ended.signal is not None:
             unlike = f"it is killed by {signal_name(ended.signal)}"
@@ -258,7 +257,7 @@ class _Workplace:
             again = replace(golden, output=_joined(self._parts()), exit_code=ended.exit_code or 0)
             unlike = self.unlike(golden, again)
         if unlike:
-            problem = f"does not do the same when it is {how}, so it has no profile: {unlike}"
+            problem = f"behaves differently when {how}, so it cannot be profiled: {unlike}"
             raise TargetError(self.name, problem)
 
     def _known_golden(self) -> Golden:
@@ -270,7 +269,7 @@ class _Workplace:
         return _WATCHING * golden_s + self.limits.wall_grace_s
 
     def _watch(self) -> Watched:
-        """What the program does in a fault-free run, found out once."""
+        """Watch the program's system calls in one fault-free run."""
         if self._watched is None:
             tracee = self.start()
             try:
@@ -283,8 +282,8 @@ class _Workplace:
         """Run once without a fault, timed from the entry point.
 
         Raises:
-            TargetError: it does not end in time or by itself, lacks memory or a terminal, prints
-                too much, or does not write a compared file.
+            TargetError: it times out, is killed, lacks memory or a terminal, prints too much, or
+                does not write a compared file.
         """
         before_s = _children_cpu_s()
         tracee = self.start()
@@ -292,7 +291,7 @@ class _Workplace:
         start, limit_s = time.perf_counter(), self.limits.golden_s
         with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=limit_s) as alarm:
             ended = run_out(tracee)
-        tracee.kill()  # with what it has started
+        tracee.kill()  # and its children
         if alarm.fired:
             raise TargetError(self.name, f"does not end within {limit_s:g} s without a fault")
         wall_s, cpu_s = time.perf_counter() - start, _children_cpu_s() - before_s
@@ -305,7 +304,7 @@ class _Workplace:
         return replace(golden, notices=tuple(self._notices(golden.exit_code)))
 
     def _require_sound(self, ended: Ended, parts: Mapping[str, bytes | None]) -> None:
-        """Refuse a golden run with which no other can be compared."""
+        """Refuse a golden run that cannot serve as a reference."""
         problem = self._failure(ended)
         for name, data in parts.items():
             if data is None:
@@ -317,16 +316,16 @@ class _Workplace:
             elif len(data) > LARGEST_BYTES:
                 what = "prints" if name == STDOUT else f"writes to {name}"
                 problem = problem or (
-                    f"{what} more than {LARGEST_BYTES >> 20} MB, the most that is compared: let it "
-                    "print less, or compare another output"
+                    f"{what} more than {LARGEST_BYTES >> 20} MB, the limit of a comparison: reduce "
+                    "its output, or compare another one"
                 )
         if problem:
             raise TargetError(self.name, problem)
 
     def _failure(self, ended: Ended) -> str:
-        """Why a fault-free run has failed; empty if it has not."""
+        """Explain why a fault-free run failed; empty if it did not."""
         if ended.signal == signal.SIGXFSZ:
-            return "writes more than 1 GB, and is stopped there"
+            return "was stopped after it had written 1 GB"
         if ended.exit_code == 0:
             return ""
         how = f"ends with exit code {ended.exit_code} without a fault"
@@ -337,7 +336,7 @@ class _Workplace:
         if watched.lacked_memory and limit_bytes is not None:
             return f"{how}: it needs more than {limit_bytes / (1 << 30):g} GB; --memory allows more"
         if watched.terminal and silent:
-            return f"{how}: it may want a terminal, and a campaign gives none, or input (--stdin)"
+            return f"{how}: it may need input (--stdin), or a terminal, which campaigns lack"
         return how if ended.signal is not None else ""
 
     def _last_words(self) -> str:
@@ -354,8 +353,8 @@ class _Workplace:
         outside = [path for path in written if not path.is_relative_to(self._folder.tree)]
         if outside:
             yield (
-                f"{self.name} writes outside its folder: {_first_of(outside)}; runs share that, "
-                "and faults may damage it"
+                f"{self.name} writes outside its folder: {_first_of(outside)}; all runs "
+                "share these files, and faults may damage them"
             )
         compared = [self._folder.path / name for name in self.target.comparison.files]
         ignored = [
@@ -370,7 +369,7 @@ class _Workplace:
             )
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ; empty if they are equal."""
+        """Describe how two fault-free runs differ; empty if they are equal."""
         if again.exit_code != golden.exit_code:
             return f"their exit codes are {golden.exit_code} and {again.exit_code}"
         if self.target.comparison.same(golden.output, again.output):
@@ -379,7 +378,7 @@ class _Workplace:
         first = next((a for a, b in lines if a != b), b"")
         text = first[:60].decode(errors="replace").strip()
         where = f"at the line {text!r}" if text else "in length"
-        return f"their outputs differ {where}; --ignore-lines leaves out lines that change"
+        return f"their outputs differ {where}; --ignore-lines skips lines that vary"
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         parts, comparison = self._parts(), self.target.comparison
@@ -398,7 +397,7 @@ class _Workplace:
 
 
 def _joined(parts: dict[str, bytes | None]) -> bytes:
-    """Join all outputs: a single one as it is, several each after its name."""
+    """Join all outputs; with several, each follows its name."""
     pieces = [b"\0missing" if data is None else data for data in parts.values()]
     if len(pieces) == 1:
         return pieces[0]

@@ -1,8 +1,8 @@
-"""Starts a Python program that is attacked, or whose forks are, always in the same state.
+"""Starts a Python program, whose forks may be attacked, always in the same state.
 
 Its memory depends only on its messages, so a corrupted pointer meets the same data in every
-repetition. It has no address randomisation, a fixed environment, and all bytecode cached. A fork of
-the attacking process would carry traces of everything that ran there before.
+repetition. It runs without address randomisation, in a fixed environment, and with all bytecode
+cached. A fork of the attacking process would inherit traces of everything that ran there before.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from mavfi_cli.fi.tracer import linux
 
 CHANNEL = 3  # file descriptor of the program's end of the socket
 _FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
-# It gets no other environment variables, so that its memory does not depend on the shell: not on
-# its language, its search path or an activated virtual environment.
+# It gets no other environment variables, so that its memory does not depend on the shell's
+# language, search path or virtual environment.
 _KEPT = ("HOME", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PYTHONPATH")
 _FIXED = {
     "LANG": "C.UTF-8",
@@ -37,18 +37,19 @@ _early: dict[str, ServedProcess] = {}
 
 
 class ServedProcess:
-    """A started program; it may load much before its first message, so start it early.
+    """A started program. Loading it may take long, so start it early.
 
-    A program that compiles its modules has another memory than one that finds their bytecode. So a
-    program that wrote to a cache is ended, and another is started, which finds its entry there.
+    A program that compiles its modules has a different memory layout from one that loads their
+    bytecode. So a program that wrote to a cache is replaced by another, which loads from it.
 
     Attributes:
         pid: its process id.
         connection: our end of the socket to it.
 
     Args:
-        module: the program. It takes one message and answers with a value and `newest_cache_ns`.
-        output: file descriptor of its standard output; None: nowhere.
+        module: the program. It receives one message and replies with a value and
+            `newest_cache_ns`.
+        output: file descriptor of its standard output; None discards it.
     """
 
     def __init__(self, module: str, *, output: int | None = None) -> None:
@@ -58,18 +59,18 @@ class ServedProcess:
 
     @classmethod
     def start_early(cls, module: str) -> None:
-        """Start a program that the next `of` gets, because it loads long."""
+        """Start a slow program now; the next call of `of` returns it."""
         if module not in _early:
             _early[module] = cls(module)
 
     @classmethod
     def of(cls, module: str) -> ServedProcess:
-        """The program that was started early, or a new one."""
+        """Return the program that was started early, or start a new one."""
         return _early.pop(module, None) or cls(module)
 
     def _start(self) -> None:
         self.connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        choose_caches()  # or the first program alone would have to
+        choose_caches()  # before the first program, which would do so alone otherwise
         environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
         output = (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)
         actions = [
@@ -78,7 +79,7 @@ class ServedProcess:
             (os.POSIX_SPAWN_DUP2, self._errors, 2),
             (os.POSIX_SPAWN_DUP2, theirs.fileno(), CHANNEL),
         ]
-        line = [*PYTHON, "-m", self._module]  # what is imported decides the memory layout
+        line = [*PYTHON, "-m", self._module]  # the imports determine the memory layout
         self._started_ns = time.clock_gettime_ns(_FILE_CLOCK)
         with theirs, linux.fixed_addresses():
             self.pid = os.posix_spawn(
@@ -90,7 +91,7 @@ class ServedProcess:
         """Send the first message, wait until the program is ready, and return its answer.
 
         Raises:
-            TargetError: the program could not start; says why.
+            TargetError: the program did not start.
         """
         answer, cached_ns = self._ask(message, name)
         if cached_ns >= self._started_ns:
@@ -128,9 +129,9 @@ class ServedProcess:
 
 
 def newest_cache_ns() -> int:
-    """Time of the newest file in the caches of the code that this process has loaded.
+    """Return the time of the newest change in the caches of the loaded modules.
 
-    It counts bytecode and compiled kernels beside it, in ns since the epoch.
+    The caches hold bytecode and compiled kernels. The time is in ns since the epoch.
     """
     specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
     files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]

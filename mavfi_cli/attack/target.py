@@ -1,7 +1,7 @@
 """The interface of targets, and the judgement of a run.
 
-An `AttackTarget` is plain values that can be sent to a worker process. `open` returns the place
-where it runs repeatedly from the same memory. Any class with these methods can be a target.
+An `AttackTarget` consists of plain values that can be sent to a worker process. `open` returns the
+place where it runs repeatedly from the same memory. Any class with these methods can be a target.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class RunOutcome(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunLimits:
-    """The limits beyond which a run counts as hung, and how far to step."""
+    """The limits beyond which a run counts as hung, and the limits of stepping."""
 
     factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0
-    golden_s: float = 120.0  # of a run without a fault
+    golden_s: float = 120.0  # wall time of a fault-free run
     wall_grace_s: float = 5.0  # for delays on a loaded machine; only a blocked target waits as long
     follow_window: int = 64  # instructions after a destination fault
     profile_steps: int = 2_000_000  # of one window
@@ -52,7 +52,7 @@ class RunVerdict:
     """The judgement of a run from its end and its output.
 
     Attributes:
-        outcome: the outcome, on the assumption that every flip was applied.
+        outcome: the outcome, if the flip was applied.
         output_sha256: hash of the output; empty if there is none.
         details: further entries of the record, such as `magnitude`.
     """
@@ -83,14 +83,14 @@ class JudgedPlace(AttackPlace, Protocol):
         """
 
     def unlike(self, golden: Golden, again: Golden) -> str:
-        """How two fault-free runs differ, in words; empty if they are equal."""
+        """Describe how two fault-free runs differ; empty if they are equal."""
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
         """Judge the last run; `ended` is None if it exceeded its limit."""
 
 
 def places_of(place: JudgedPlace) -> Sequence[JudgedPlace]:
-    """The places of a target's inputs, if it names them in `inputs`; most have one, their own."""
+    """Return one place per input of a target: its attribute `inputs`, or the place itself."""
     inputs: Sequence[JudgedPlace] = getattr(place, "inputs", (place,))
     return inputs
 
@@ -104,13 +104,13 @@ class AttackTarget(Protocol):
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """Stream of its random numbers; empty if a campaign has no other target."""
+        """Name of its random stream; empty if it is the only target of a campaign."""
 
     def known(self) -> dict[str, Any]:
-        """Everything that its results depend on; the same for all targets of a campaign."""
+        """Return what determines its results; the same for all targets of a campaign."""
 
     def open(self) -> JudgedPlace:
-        """Make a place for runs in this process."""
+        """Open a place for runs in this process."""
 
 
 def judged(
@@ -121,12 +121,12 @@ def judged(
     *,
     tolerance: float | None,
 ) -> tuple[RunOutcome, Difference | None]:
-    """Judge a run: its outcome, and the size of its difference if it is known.
+    """Return the outcome of a run, and its difference if that is known.
 
     Args:
         ended: how the run ended; None if it exceeded its limit.
-        output: its output; None if that is not complete.
-        compare: function from golden and other output to their difference, or to None.
+        output: its output; None if incomplete.
+        compare: returns the difference of the golden and another output, or None.
         tolerance: largest relative difference that is benign; None if every byte counts.
     """
     if ended is None:

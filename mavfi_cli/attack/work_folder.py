@@ -1,7 +1,7 @@
 """The folder in which a program runs: every run gets a fresh copy of the user's files.
 
-A program may overwrite or delete the files that it is given, and a corrupted one may do so by
-accident. So no relative argument and no link leads from its folder to a file of the user.
+A program may overwrite or delete its input files, and a corrupted one may do so by accident. So no
+relative argument or link leads from its folder to a user's file.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _DEEPEST = 100  # folders within folders
 def copied_arguments(
     argv: Iterable[str], directory: Path, folder: Path | None
 ) -> tuple[list[str], dict[str, Path]]:
-    """Make arguments that name the user's files name copies of them.
+    """Rewrite arguments that name the user's files so that they name copies.
 
-    What follows the first `=` of an argument, as in `of=out.txt`, counts as an argument too. An
-    argument that names something below `folder` names its copy. Any other relative argument that
-    names a file, or that names a folder and contains a slash, names a copy at the same place
-    relative to the program's folder. An absolute argument outside `folder` stays.
+    The text after the first `=` of an argument, as in `of=out.txt`, is treated as an argument. An
+    argument that names a path below `folder` is made to name its copy. Any other relative argument
+    that names a file, or contains a slash and names a folder, is made to name a copy at the same
+    path relative to the program's folder. An absolute argument outside `folder` stays.
 
     Args:
         directory: The folder that relative arguments are relative to.
-        folder: The folder of which every run gets a copy; None if there is none.
+        folder: The folder that is copied for every run; None if there is none.
 
     Returns:
-        The arguments, and the files and folders to copy, by their place relative to the program's
-        folder. A place may begin with `..`.
+        The arguments, and the files and folders to copy by their path relative to the program's
+        folder. A path may begin with `..`.
     """
     arguments, sources = [], {}
     places = [directory] if folder is None else [directory, folder]
@@ -52,8 +52,8 @@ def copied_arguments(
 
 
 def _copied(argument: str, directory: Path, folder: Path | None) -> tuple[str, Path | None]:
-    """The name of an argument's copy, and its source if that lies outside of `folder`."""
-    # Unlike Path's, the functions of os.path take any text, however long.
+    """Return the name of an argument's copy, and its source if that is outside `folder`."""
+    # Unlike Path, the functions of os.path accept text of any length.
     path, absolute = os.path.join(directory, argument), os.path.isabs(argument)
     named = os.path.isfile(path) or ("/" in argument and os.path.isdir(path))
     if folder is not None:
@@ -70,26 +70,26 @@ def _copied(argument: str, directory: Path, folder: Path | None) -> tuple[str, P
 
 
 def _unlinked(path: str) -> str:
-    """The path without links, but for its last part."""
+    """Resolve the links in all but the last part of a path."""
     return os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
 
 
 def _place(path: str, folder: Path) -> str:
-    """The path relative to a folder that contains it; empty if the folder does not."""
+    """Return the path relative to a folder, or an empty text if it is outside."""
     place = os.path.relpath(_unlinked(path), os.path.realpath(folder))
     return "" if PurePosixPath(place).parts[:1] == ("..",) else place
 
 
 class WorkFolder:
-    """The folder in which a program runs, made anew for every run.
+    """The folder in which a program runs, recreated for every run.
 
-    The user's files are copied once, with what their links point to. A link to another file of the
+    The user's files are copied once, including the targets of links. A link to another file of the
     same folder stays a link.
 
     Args:
-        scratch: A folder of ours.
+        scratch: A scratch folder, in which the copies are made.
         folder: The folder whose contents are copied; None for an empty folder.
-        sources: More files and folders, by their place relative to the program's folder.
+        sources: Further files and folders, by their path relative to the program's folder.
         name: The program's name for errors.
 
     Attributes:
@@ -97,7 +97,7 @@ class WorkFolder:
         tree: The folder that contains it and all copies.
 
     Raises:
-        TargetError: The files are too large, cannot be read, or are no regular files.
+        TargetError: The files are too large, unreadable, or not regular files.
     """
 
     def __init__(
@@ -120,17 +120,17 @@ class WorkFolder:
             raise TargetError(name, f"its files cannot be copied: {error}") from None
 
     def renew(self) -> None:
-        """Make the folder as it was before the first run.
+        """Restore the folder to its state before the first run.
 
         Raises:
-            TargetError: It cannot be made.
+            TargetError: It cannot be restored.
         """
         try:
             if self.tree.exists():
                 shutil.rmtree(self.tree)  # follows no link
             shutil.copytree(self._original, self.tree, symlinks=True)
         except OSError as error:
-            problem = f"its folder cannot be made anew for the next run: {error}"
+            problem = f"its folder cannot be restored for the next run: {error}"
             raise TargetError(self._name, problem) from None
 
     def had(self, name: str) -> bool:
@@ -138,7 +138,7 @@ class WorkFolder:
         return (self._copy / name).is_file()
 
     def wrote(self, name: str) -> bool:
-        """Whether the last run wrote a file that is in the folder now."""
+        """Whether the last run wrote an existing file of the folder."""
         before, after = self._copy / name, self.path / name
         if not before.is_file():
             return True
@@ -149,7 +149,7 @@ class WorkFolder:
 
 
 class _Copier:
-    """Copies files and folders of the user, with what their links point to, up to a size."""
+    """Copies a user's files and folders, including the targets of links, up to a limit."""
 
     def __init__(self, name: str) -> None:
         self._name, self._bytes, self._files = name, LARGEST_BYTES, MOST_FILES
@@ -159,7 +159,7 @@ class _Copier:
 
         Args:
             source: A path without links.
-            target: Where the copy lies; its folder exists.
+            target: Path of the copy, in an existing folder.
         """
         self._root, self._copy = source, target
         self._copy_one(source, target, ())
@@ -177,9 +177,9 @@ class _Copier:
             self._require_room()
             shutil.copy2(source, target)
         elif not stat.S_ISDIR(about.st_mode):
-            raise TargetError(self._name, f"gets no copy of {source}: it is no file and no folder")
+            raise TargetError(self._name, f"gets no copy of {source}: it is not a file or folder")
         elif real in above or len(above) > _DEEPEST:
-            raise TargetError(self._name, f"gets no copy of {source}: it leads back or too deep")
+            raise TargetError(self._name, f"gets no copy of {source}: it is a cycle or too deep")
         else:
             self._require_room()
             target.mkdir(exist_ok=True)
@@ -191,7 +191,7 @@ class _Copier:
         if self._bytes < 0 or self._files < 0:
             raise TargetError(
                 self._name,
-                f"every run gets a copy of its files, at most {LARGEST_BYTES >> 30} GB and "
-                f"{MOST_FILES} of them, and they are more: name large inputs by absolute paths "
-                "outside of --folder, which are not copied",
+                f"the files to copy for every run must be at most {LARGEST_BYTES >> 30} GB and "
+                f"{MOST_FILES} in number: name large inputs by absolute paths "
+                "outside --folder, which are not copied",
             )

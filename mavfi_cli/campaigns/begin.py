@@ -1,4 +1,4 @@
-"""Prepares a campaign's folder and list from the preset, file or folder that a user names."""
+"""Prepares a campaign's folder and missions from a preset, file or folder."""
 
 from __future__ import annotations
 
@@ -61,14 +61,15 @@ def chosen(
     Args:
         what: a preset, a TOML file, or the folder of an existing campaign.
         out: the folder; None means campaigns/NAME, or the named folder.
-        scale: fraction of the repetitions; for a folder, only the one it was begun with.
-        changes: factors to replace, as `replaced` takes them; the default folder's name has them.
+        scale: fraction of the repetitions; an existing folder accepts only its own.
+        changes: factors to replace, as in `replaced`; they become part of the default folder's
+            name.
         firmware: the program that a folder's missions may name; see
             `MissionConfig.require_firmware`.
 
     Raises:
-        ConfigError: the specification or the scale cannot be used; or a preset without `out`
-            has the name of a campaign here.
+        ConfigError: the specification or the scale is invalid, or a preset without `out` has the
+            same name as a campaign here.
         UnknownName: no preset, file or folder has this name.
     """
     spec = chosen_spec(what, scale, changes, out, firmware)
@@ -86,7 +87,7 @@ def chosen_spec(
     out: Path | None = None,
     firmware: str | None = None,
 ) -> Spec:
-    """Find the named specification, as `chosen` does, without its folder."""
+    """Find the named specification as `chosen` does, but without its folder."""
     folder = _folder(what)
     if folder is None:
         spec = replaced(load_spec(what), changes)
@@ -105,7 +106,7 @@ def chosen_spec(
 
 
 def _folder_of(what: str) -> Path:
-    """The named folder, or the folder into which the named campaign is flown.
+    """Return the named folder, or the folder of the named campaign.
 
     Args:
         what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset;
@@ -127,7 +128,7 @@ def opened(what: str | Path) -> Iterator[Ledger]:
 
     Raises:
         MavfiError: as `_folder_of`, `Ledger` and `ExportedLedger`.
-        RecordError: an error of the block shows that what was read is damaged.
+        RecordError: an error in the block reveals damaged data.
     """
     path = Path(what)
     ledger = ExportedLedger(path) if is_export(path) else Ledger(_folder_of(str(what)))
@@ -136,7 +137,7 @@ def opened(what: str | Path) -> Iterator[Ledger]:
 
 
 def _folder(what: str) -> Path | None:
-    """The named campaign's folder; None for a preset or a file."""
+    """Return the named campaign's folder; None for a preset or a file."""
     folder = Path(what)
     if what in PRESETS.names:
         return None
@@ -151,7 +152,7 @@ def _folder(what: str) -> Path | None:
 
 
 def begun() -> list[str]:
-    """The folders of all campaigns in the default place."""
+    """List the folders of all campaigns in the default location."""
     return sorted(str(path.parent) for path in DEFAULT.glob(f"*/{LEDGER}"))
 
 
@@ -160,21 +161,21 @@ def _require_one_meaning(what: str) -> None:
     if what in PRESETS.names and (Path(what) / LEDGER).is_file():
         own = DEFAULT / what
         raise ConfigError(
-            f"{what} is a preset, and .{os.sep}{what} holds a campaign: say .{os.sep}{what} for "
-            f"that one; the preset's own folder is {own}, or run with --out {own} to begin it"
+            f"{what} is a preset, and .{os.sep}{what} holds a campaign: use .{os.sep}{what} for "
+            f"the folder; the preset's own folder is {own}, which --out {own} creates"
         )
 
 
 def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
-    """Return the campaign of a study to fly in a folder, and whether its list grows.
+    """Return a study's campaign for a folder, and whether its list grows.
 
-    More repetitions of the same study continue fewer, because lists grow by repetition.
+    A study with more repetitions continues one with fewer, because lists grow by repetition.
 
     Args:
-        what, repetitions: names of the study and of its repetitions, for errors.
+        what, repetitions: words for the study and its repetitions in errors.
 
     Raises:
-        ConfigError: the folder holds another campaign; says how it differs.
+        ConfigError: the folder holds another campaign.
     """
     if not (folder / LEDGER).is_file():
         return spec, False
@@ -193,13 +194,13 @@ def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[S
 
 
 def stored_spec(ledger: Ledger) -> Spec | None:
-    """The specification with which a campaign was begun; None if a program made its list."""
+    """Return the stored specification of a campaign; None if a program made its list."""
     text = ledger.meta("spec")
     return None if text is None else parse_spec(text, ledger.folder / SPEC)
 
 
 def stopped(ledger: Ledger) -> list[str]:
-    """The settings that the campaign's stopping rule has ended early."""
+    """Return the settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
     if spec is None or spec.stop is None:
         return []
@@ -220,12 +221,12 @@ def begin(
     """Open the folder of a campaign for flying, and store its list.
 
     Args:
-        options, spectator: for the flights that find fixed worlds, if there are any.
+        options, spectator: for the flights that search for fixed worlds, if any.
 
     Raises:
-        ConfigError: the folder holds another campaign, or none although `missing_only` is set.
-        MavfiError: no mission can be flown with a world, vehicle, planner or other choice; or
-            no world fits the rule of fixed worlds.
+        ConfigError: the folder holds another campaign, or `missing_only` is set and it holds none.
+        MavfiError: a world, vehicle, planner or other choice makes missions impossible; or no
+            world fits the rule of fixed worlds.
     """
     begun = (folder / LEDGER).is_file()
     if missing_only and not begun:
@@ -259,10 +260,10 @@ def begin(
 
 
 def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
-    """Return the specification with the world seeds that its campaign was begun with.
+    """Return the specification with the stored world seeds of its campaign.
 
     Raises:
-        ConfigError: the worlds of missions to append follow another rule.
+        ConfigError: missions to append have another rule of fixed worlds.
     """
     with Ledger(folder) as ledger:
         stored = stored_spec(ledger)
@@ -282,7 +283,7 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
 
 
 def flyable(spec: Spec) -> list[PlannedMission]:
-    """List the missions of a campaign; a MavfiError says which kind of them cannot be flown."""
+    """List the missions of a campaign. Raises MavfiError if a kind of mission cannot be flown."""
     check_kinds(spec.kinds())
     return spec.missions()
 
@@ -291,7 +292,7 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
     """Check each kind of mission once, and each kind of vehicle process once.
 
     Raises:
-        MavfiError: as `check_names`; names the setting.
+        MavfiError: as `check_names`, with the name of the setting.
     """
     seen: set[str] = set()
     for mission in missions:
@@ -307,15 +308,15 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
 
 
 def check_names(config: MissionConfig, *, start: bool = True) -> None:
-    """Raise now what would keep every mission like this one from being flown.
+    """Raise any error that would prevent every mission of this kind.
 
     Args:
-        start: start the simulated vehicle, too, and end it at once.
+        start: also start the simulated vehicle, and end it at once.
 
     Raises:
-        VehicleProcessError: the vehicle refuses the world, the vehicle, the start or the goal.
+        VehicleProcessError: the simulation rejects the world, the vehicle, the start or the goal.
         MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
-            for another stack; values make no fault; or the start is blocked.
+            for another stack; a fault is invalid; or the start is blocked.
     """
     CompanionParts.of(config)
     if config.fault is not None:
@@ -328,7 +329,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     if config.detector is not None:
         config.detector.built(config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
-        raise FaultSpecError("a fault in the detector needs a detector")
+        raise FaultSpecError("a fault in the detector requires a detector")
     if start:
         try:
             VehicleInProcess(config).end()
@@ -347,13 +348,13 @@ def _with_worlds(
     options: Options,
     spectator: Spectator,
 ) -> Spec:
-    """Return the specification with a seed for every world that the rule is for.
+    """Return the specification with a seed for every world that the rule covers.
 
-    A world is judged by the first mission in it, flown without fault and protection. The first
-    mission has the first of all values, so all stacks and platforms share one world.
+    A candidate is judged by golden flights of the first mission in that world. That mission has the
+    first value of every factor, so all stacks and platforms share one world.
 
     Args:
-        missions: missions of the specification.
+        missions: the specification's missions.
         folder: folder of the campaign.
 
     Raises:

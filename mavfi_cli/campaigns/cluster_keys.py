@@ -1,7 +1,7 @@
 """The keys of a cluster: one certificate that scheduler, workers and runner share over TLS.
 
-The certificate signs itself and is the only authority, so whoever has the key belongs to the
-cluster, and nobody else connects.
+The certificate is self-signed and the only authority, so exactly the holders of the key can
+connect.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _SKEW = timedelta(days=1)  # clocks of hosts differ
 
 
 def make_keys(folder: Path) -> None:
-    """Write a new certificate and its key into a folder, which is made if it is missing.
+    """Write a new certificate and its key into a folder, which is created if necessary.
 
     Only the user can read the files. Existing files are never replaced.
 
     Raises:
-        ConfigError: the folder already has one of the files.
+        ConfigError: one of the files already exists.
         MavfiError: cryptography is not installed.
         RecordError: the files cannot be written.
     """
@@ -75,10 +75,10 @@ def _write_new(path: Path, content: bytes) -> None:
 
 
 def security(folder: Path) -> Security:
-    """Return dask's settings of TLS with the keys in a folder, for each role in a cluster.
+    """Return dask's TLS settings for every role in a cluster, with the keys in a folder.
 
     Raises:
-        ConfigError: a file is missing, of another user, or open to other users.
+        ConfigError: a file is missing, belongs to another user, or is accessible to other users.
     """
     from distributed.security import Security
 

@@ -1,13 +1,13 @@
-"""The ledger of a campaign: SQLite in WAL mode, one writer, one transaction a mission.
+"""The ledger of a campaign: SQLite in WAL mode, one writer, one transaction per mission.
 
     meta      schema, versions, name and specification of the campaign
     cells     the settings, by their labels
     missions  the numbered list, written before the first mission flies
-    results   one short row a mission that is over
-    records   its whole result.json, compressed
+    results   one short row per finished mission
+    records   its complete result.json, compressed
 
-A mission is missing as long as it has no row in `results`; a kill at any moment leaves a mission
-with its whole row or with none.
+A mission is missing until it has a row in `results`. A kill at any moment leaves it with a complete
+row or with none.
 """
 
 from __future__ import annotations
@@ -90,11 +90,11 @@ def _object(text: str | bytes) -> dict[str, Any]:
 class Ledger:
     """One campaign's missions and results.
 
-    A context manager that closes it. Any number may read while one writes.
+    Use it as a context manager. Any number of readers may run beside one writer.
 
     Attributes:
-        export: the table of flights if it was opened from an export, which has no records; else
-            None.
+        export: the table of flights if the ledger was opened from an export, which has no records;
+            else None.
     """
 
     export: pa.Table | None = None
@@ -102,11 +102,11 @@ class Ledger:
     def __init__(self, folder: Path, *, writing: bool = False, memory: bool = False) -> None:
         """Open the ledger of a folder; a writer creates it if there is none.
 
-        `memory` makes an empty one in memory; `folder` is then only for messages.
+        With `memory` the ledger is empty and in memory, and `folder` only appears in messages.
 
         Raises:
-            RecordError: there is none, it is damaged, or it cannot be opened.
-            ConfigError: another version of mavfi wrote it, or another process is its writer.
+            RecordError: the ledger is missing, damaged, or cannot be opened.
+            ConfigError: another version of mavfi wrote it, or another process is writing to it.
         """
         self.folder = folder
         self._path = folder if memory else folder / LEDGER
@@ -197,7 +197,7 @@ class Ledger:
                     self._db.execute("ROLLBACK")
 
     def _rows(self, query: str, *values: object) -> Generator[Any]:
-        """The rows of a query, one after the other.
+        """Yield the rows of a query.
 
         Raises:
             RecordError: the ledger is damaged.
@@ -211,19 +211,19 @@ class Ledger:
     # The campaign ---------------------------------------------------------------------------------
 
     def meta(self, key: str) -> str | None:
-        """An entry about the campaign; None if it was never stored."""
+        """Return an entry about the campaign; None if it was never stored."""
         values = [
             str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)
         ]
         return values[0] if values else None
 
     def set_meta(self, values: Mapping[str, str]) -> None:
-        """Store entries about the campaign, all or none."""
+        """Store entries about the campaign atomically."""
         with self._transaction():
             self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def plan(self, missions: Iterable[PlannedMission]) -> int:
-        """Add missions at the end of the list; return their number.
+        """Append missions to the list; return their number.
 
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
@@ -248,15 +248,15 @@ class Ledger:
         missions: Iterable[tuple[int, int, str, str]],
         results: Iterable[Record],
     ) -> None:
-        """Store the rows of a whole campaign without its records.
+        """Store all rows of a campaign, but no records.
 
         Args:
-            cells: the settings' labels with their numbers.
-            missions: number, cell, pair and changes of each.
-            results: the columns of the table `results` by name; a missing one is empty.
+            cells: labels of the settings with their numbers.
+            missions: number, cell, pair and changes of every mission.
+            results: columns of the table `results` by name; a missing column is empty.
 
         Raises:
-            RecordError: the rows are of other types, or a number is there twice.
+            RecordError: a row has the wrong types, or a number occurs twice.
         """
         own = [column[1] for column in self._rows("PRAGMA table_info(results)")]
         marks = ", ".join("?" * len(own))
@@ -289,7 +289,7 @@ class Ledger:
         return cells
 
     def rows(self) -> Iterator[tuple[int, str, str, str]]:
-        """Number, labels, pair and changes of every mission, as they are stored."""
+        """Yield number, labels, pair and changes of every mission as stored."""
         yield from self._rows(
             "SELECT number, labels, pair, changes FROM missions JOIN cells USING (cell) "
             "ORDER BY number"
@@ -300,10 +300,10 @@ class Ledger:
     def missing(self, *, errors: bool = False) -> Iterator[MissingMission]:
         """Missions without a result, in the order of the list.
 
-        Read in portions, so that results may be added meanwhile.
+        They are read in portions, so results may be added meanwhile.
 
         Args:
-            errors: missions that could not begin count as missing too.
+            errors: include missions that could not begin.
         """
         over = "SELECT 1 FROM results WHERE results.number = missions.number"
         over += " AND state <> 'error'" if errors else ""
@@ -329,17 +329,17 @@ class Ledger:
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
     def fates(self, *, errors: bool = True) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
-        """Number, outcome and fate of the fault of every mission that is over.
+        """Yield number, outcome and fault's fate of every finished mission.
 
         Args:
-            errors: missions that could not begin count as over.
+            errors: include missions that could not begin.
         """
         over = "" if errors else " WHERE state <> 'error'"
         for number, *fate in self._rows(f"SELECT number, outcome, injected FROM results{over}"):
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:
-        """Number of missions with a row."""
+        """Number of finished missions."""
         ((count,),) = self._rows("SELECT count(*) FROM results")
         return int(count)
 
@@ -381,7 +381,7 @@ class Ledger:
     # Results --------------------------------------------------------------------------------------
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
-        """Results of the missions that are over, in the order of the list.
+        """Yield the results of finished missions in the order of the list.
 
         Args:
             numbers: only these missions.
@@ -416,10 +416,10 @@ class Ledger:
                 yield over
 
     def configs(self, numbers: Sequence[int]) -> Iterator[MissionConfig]:
-        """Configurations of these missions, in the order of the list.
+        """Yield the configurations of these missions in the order of the list.
 
         Raises:
-            RecordError: an export has changes that make no mission.
+            RecordError: an export holds changes that give no valid mission.
         """
         rows = self._rows(
             "SELECT number, changes FROM missions "
@@ -435,10 +435,10 @@ class Ledger:
             yield config
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
-        """Columns of every flown mission, in the order of the list and in portions.
+        """Yield portions of columns of the flown missions, in the order of the list.
 
         Args:
-            names: of the tables `missions` and `results`.
+            names: columns of the tables `missions` and `results`.
         """
         rows = self._rows(
             f"SELECT {', '.join(names)} FROM results JOIN missions USING (number) "
@@ -448,7 +448,7 @@ class Ledger:
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
-        """Number of missions that could not begin, by cell that has any."""
+        """Number of missions that could not begin, for every cell with such missions."""
         return dict(
             self._rows(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
@@ -457,7 +457,7 @@ class Ledger:
         )
 
     def planned_by_cell(self) -> list[int]:
-        """Number of missions of each cell."""
+        """Number of missions per cell."""
         rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]
 
@@ -480,7 +480,7 @@ def stored_export(path: Path) -> pa.Table:
     """Read an export.
 
     Raises:
-        RecordError: the file is missing or damaged, has other columns, or has a mission twice.
+        RecordError: the file is missing or damaged, lacks a column, or lists a mission twice.
     """
     import pyarrow.compute as pc
 
@@ -507,15 +507,15 @@ def _no_export(path: Path, why: object) -> RecordError:
 
 
 def stored_provenance(table: pa.Table) -> dict[str, Any]:
-    """Return the provenance in the metadata of an export; {} if it has none."""
+    """Return the provenance in the metadata of an export; empty if there is none."""
     return dict(json.loads((table.schema.metadata or {}).get(METADATA, b"{}")))
 
 
 class ExportedLedger(Ledger):
-    """A ledger in memory with the missions of an export. It has no records of flights.
+    """A ledger in memory with the missions of an export, but without records of flights.
 
     Raises:
-        RecordError: the file is no export.
+        RecordError: the file is not an export.
     """
 
     def __init__(self, path: Path) -> None:

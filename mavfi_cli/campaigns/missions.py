@@ -1,4 +1,4 @@
-"""The missions of a campaign, each complete by itself, and their results."""
+"""Self-contained missions of a campaign, and their results."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ class PlannedMission:
     """One mission of a campaign; its number is its place in the list, from 0.
 
     Attributes:
-        labels: the setting that the mission belongs to; missions of equal labels are counted
-            together.
-        pair: missions of equal pairs share world, start and noise; empty: a hash of everything
-            that golden, faulty and protected flights of a pair share.
+        labels: the mission's setting; missions with equal labels are counted together.
+        pair: missions with equal pairs share world, start and noise. Empty selects a hash of
+            everything that golden, faulty and protected flights of a pair share.
     """
 
     config: MissionConfig
@@ -51,7 +50,7 @@ class PlannedMission:
 _DEFAULT = MissionConfig()
 # Faults and protection, which a golden run does not have.
 _TREATMENT = ("fault", "instruction", "detector", "isolate")
-_NAMES = tuple(each.name for each in fields(MissionConfig))
+_NAMES = tuple(field.name for field in fields(MissionConfig))
 _SHARED = tuple(name for name in _NAMES if name not in _TREATMENT)
 _shared = attrgetter(*_SHARED)
 
@@ -64,12 +63,12 @@ def _pair_of(shared: tuple[Any, ...]) -> str:
 
 
 def canonical(value: Any) -> str:
-    """Canonical JSON of a value: equal values give equal text."""
+    """Return canonical JSON: equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
 def changes_of(config: MissionConfig) -> Changes:
-    """The values of a mission that differ from the defaults."""
+    """Return the values of a mission that differ from the defaults."""
     return {
         name: plain
         for name in _NAMES
@@ -79,7 +78,7 @@ def changes_of(config: MissionConfig) -> Changes:
 
 
 def _plain(value: Any) -> Any:
-    """The value as JSON gives it back; `asdict` copies, which is slow for long lists."""
+    """Convert a value as a JSON round trip would, without the slow copies of `asdict`."""
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
     names = getattr(value, "__dataclass_fields__", None)
@@ -87,10 +86,10 @@ def _plain(value: Any) -> Any:
 
 
 def kind_of(changes: Changes, apart: Collection[str]) -> str:
-    """A mission as text without some of its values, and without the seeds of its faults.
+    """Return a mission as text, without some values and without the seeds of its faults.
 
     Args:
-        changes: of `changes_of`.
+        changes: the mission's values from `changes_of`.
     """
     kind = {name: value for name, value in changes.items() if name not in apart}
     for name in ("fault", "instruction"):
@@ -100,28 +99,28 @@ def kind_of(changes: Changes, apart: Collection[str]) -> str:
 
 
 def label_text(labels: Labels) -> str:
-    """A setting in one phrase; the same whatever the order of its labels."""
+    """Describe a setting in one phrase, whatever the order of its labels."""
     phrases = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
     return " ".join(phrases) or "all missions"
 
 
 def label_value(value: Label) -> str:
-    """The value of a label as a specification has it."""
+    """Format the value of a label as in a specification."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Names of labels in the order in which they are shown."""
+    """Return names of labels in display order."""
     unordered = set(names)
     return [name for name in _FIRST if name in unordered] + sorted(unordered - set(_FIRST))
 
 
 @contextlib.contextmanager
 def naming(labels: Labels) -> Iterator[None]:
-    """Make a known error inside name the setting that it concerns.
+    """Add the name of the setting to errors raised in the block.
 
     Raises:
-        ConfigError: instead of any MavfiError, with its exit code.
+        ConfigError: replaces any MavfiError and keeps its exit code.
     """
     try:
         yield
@@ -143,8 +142,8 @@ class MissingMission(NamedTuple):
 class ResultState(Enum):
     """Whether a mission has a result."""
 
-    FLOWN = "flown"  # it ended, well or badly: `outcome` says how
-    ERROR = "error"  # it could not begin: no result, and counted nowhere
+    FLOWN = "flown"  # it ended with the given `outcome`
+    ERROR = "error"  # it could not begin, so it has no result and is not counted
 
 
 # By the activation in a record; any other is active.
@@ -163,17 +162,17 @@ _BY_ACTIVATION = {
 class Injected(Enum):
     """What happened to the fault of a flown mission."""
 
-    GOLDEN = "golden"  # none was asked for
+    GOLDEN = "golden"  # the mission has no fault
     ACTIVE = "active"  # it struck, and what it struck was read afterwards
-    UNREAD = "unread"  # it struck, and nothing read it as long as it was followed
+    UNREAD = "unread"  # it struck, and nothing read the value while it was followed
     CAUGHT = "caught"  # it struck, and a detector withheld it before anything read it
-    NOT_ACTIVATED = "not_activated"  # it struck what nothing read before it was over
-    NOT_INJECTED = "not_injected"  # the mission ended, or the run parted, before the trigger
-    NULL = "null"  # everything but the flip, as was asked for
+    NOT_ACTIVATED = "not_activated"  # it struck a value that nothing read before it expired
+    NOT_INJECTED = "not_injected"  # the mission ended, or the run diverged, before the trigger
+    NULL = "null"  # a null injection, which leaves out the flip
 
     @classmethod
     def of(cls, result: Record, *, faulty: bool) -> Injected:
-        """What happened to the fault of a mission, by its record; `asked`: it was to have one."""
+        """Return what happened to the fault of a mission, by its record."""
         flight = record_of(result)
         fault = flight.fault
         if not faulty:
@@ -188,7 +187,7 @@ class Injected(Enum):
 
 
 def _caught(flight: FlightRecord) -> bool:
-    """True if an alarm withheld the struck value: at its stamp, or by the name of its state."""
+    """Return True if an alarm withheld the struck value, matched by stamp or by state."""
     strikes = flight.fault.get("strikes") or []
     stamps = {strike["stamp_s"] for strike in strikes}
     states = {change["state"] for strike in strikes for change in strike["changes"]}
@@ -205,7 +204,7 @@ def _caught(flight: FlightRecord) -> bool:
 
 # Missions whose success the fault, if there was one, could affect.
 COUNTED = frozenset(
-    each.value for each in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
+    fate.value for fate in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
 )
 
 
@@ -214,12 +213,12 @@ class MissionResult:
     """One row of the ledger.
 
     Attributes:
-        result: its result.json, the same as of `mavfi fly`; of a mission that crashed or hung
-            before it could write one, what is known of it. Empty for an error.
+        result: its result.json, as `mavfi fly` writes it. A mission that crashed or hung before it
+            could write one has the known fields only. Empty for an error.
         injected: what happened to its fault; None for an error.
         reason: the record's reason for the outcome, or why the mission could not begin.
-        wall_s: wall time of the attempt that counts, s.
-        attempts: number of attempts; more than one if something outside killed it.
+        wall_s: wall time of the final attempt, s.
+        attempts: number of attempts; above 1 after kills from outside the mission.
         path: absolute path of the kept run folder; None if it was not kept.
     """
 

@@ -1,4 +1,4 @@
-"""Progress of a campaign, for its spectators."""
+"""Progress of a campaign, and the interface of its observers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ class Progress:
 
     Attributes:
         total: missions of the list.
-        before: missions that were over before this run began.
-        over: missions that are over now, including `before`.
+        before: missions that were finished before this run began.
+        over: missions that are finished now, including `before`.
         running: missions in flight.
-        again: attempts that something outside ended and that were repeated.
+        again: attempts that were repeated because something outside the mission ended them.
         elapsed_s: wall time of this run, s.
-        inside_s: wall time within missions, summed over the workers, s.
-        workers: missions that can fly at the same time; None where that changes, as on a cluster.
-        outcomes: of the missions that this run flew, by setting, in the order of the list.
-        beyond_s: wall time of what follows the missions, s.
+        inside_s: wall time spent in missions, summed over the workers, s.
+        workers: missions that can fly at the same time; None if that varies, as on a cluster.
+        outcomes: outcomes of this run's missions by setting, in the order of the list.
+        beyond_s: wall time of the work that follows the missions, s.
     """
 
     total: int
@@ -37,25 +37,25 @@ class Progress:
 
     @property
     def rate_per_h(self) -> float:
-        """Missions an hour of this run so far; 0 before the first is over."""
+        """Missions per hour of this run so far; 0 before the first has ended."""
         return 3600.0 * (self.over - self.before) / self.elapsed_s if self.elapsed_s > 0.0 else 0.0
 
     @property
     def eta_s(self) -> float | None:
-        """Time until all is over at this rate; None before the first mission is."""
+        """Time to the end at this rate, s; None before the first mission has ended."""
         rate = self.rate_per_h
         return 3600.0 * (self.total - self.over) / rate + self.beyond_s if rate > 0.0 else None
 
     @property
     def outside(self) -> float | None:
-        """Fraction of the workers' time outside missions; None if their number is not known."""
+        """Fraction of the workers' time outside missions; None if their number varies."""
         if self.workers is None or self.elapsed_s <= 0.0:
             return None
         return max(0.0, 1.0 - self.inside_s / (self.workers * self.elapsed_s))
 
     @property
     def success_rate(self) -> float | None:
-        """Share of successes among the missions that this run flew; None before the first."""
+        """Success rate of this run's missions; None before the first has ended."""
         whole = sum(self.outcomes.values(), Counter())
         return whole["success"] / whole.total() if whole else None
 
@@ -70,7 +70,7 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """A time as minutes or hours."""
+    """Format a time as minutes or hours."""
     minutes, left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"
@@ -80,13 +80,13 @@ class Spectator:
     """Watches a campaign. This base class ignores all events."""
 
     def on_progress(self, progress: Progress) -> None:
-        """Handle progress: a mission is over, or a second has passed."""
+        """Handle progress, after every mission and at least every second."""
 
     def on_end(self, progress: Progress) -> None:
-        """Handle the end: all missions are over, or the user asked to stop."""
+        """Handle the end, after all missions or an interruption."""
 
     def on_note(self, text: str) -> None:
         """Handle a note for the user."""
 
     def on_step(self, text: str, elapsed_s: float) -> None:
-        """Handle progress of what is not missions, as one line; wall time since its begin, s."""
+        """Handle progress outside missions: a line of text, and wall time since its start, s."""

@@ -1,9 +1,9 @@
-"""Runs a campaign: every mission of the list that has no result yet, until a setting is known well.
+"""Runs the missing missions of a campaign, up to the stopping rule of each setting.
 
-With a stopping rule, the interval of a setting's success rate is checked after every batch of the
-setting, over exactly the first missions of the list up to there, in whatever order they ended. So
-the number of workers does not change when a setting stops. Frequent checks make the true confidence
-a little lower than the nominal one.
+With a stopping rule, the interval of a setting's success rate is checked after every batch, over
+exactly the setting's missions up to that point of the list, in whatever order they ended. So the
+number of workers does not affect when a setting stops. Repeated checks make the true confidence
+slightly lower than the nominal one.
 """
 
 from __future__ import annotations
@@ -63,25 +63,25 @@ _LOOK_S = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How missions are run; the options change no result.
+    """Options of execution, which do not affect results.
 
     Attributes:
         jobs: missions at the same time.
-        limit_s: wall time of one mission, s; missions that exceed it are recorded as `hang`.
-        task: module that does the work.
-        errors: fly missions again that could not begin.
-        cluster: address of a scheduler of dask.distributed, instead of workers on this machine.
-        cluster_key: folder of its keys (`cluster_keys.make_keys`), for an address with tls://.
+        limit_s: limit of a mission's wall time, s; longer missions are recorded as `hang`.
+        task: module that flies a mission.
+        errors: retry missions that could not begin.
+        cluster: address of a dask.distributed scheduler; None for workers on this machine.
+        cluster_key: folder of its keys (`cluster_keys.make_keys`) for a tls:// address.
         only: numbers of the missions to fly; None flies all.
-        kept: numbers of missions whose run folders are kept whatever `keep` says.
-        profiles: folder of the profiles of instruction-level faults that several campaigns share;
-            None for the campaign's own, from which profiles go after their last mission.
-        planned: numbers of the missions among which a mission is the last; None for all.
+        kept: numbers of missions whose run folders are kept regardless of `keep`.
+        profiles: folder of instruction-level profiles that several campaigns share. None selects
+            the campaign's own, where profiles are removed after their last mission.
+        planned: numbers of the missions among which the last one is determined; None for all.
         firmware: programs that missions of the folder may name; see
             `MissionConfig.require_firmware`.
     """
 
-    jobs: int = 0  # as many as there are cores
+    jobs: int = 0  # 0 selects the number of cores
     keep: Keep = Keep.FAILURES
     limit_s: float = LIMIT_S
     task: str = TASK
@@ -103,7 +103,7 @@ class Options:
             raise ConfigError(problem, key="cluster")
         if (self.cluster or "").startswith("tls://") != (self.cluster_key is not None):
             problem = (
-                "an address with tls:// needs --cluster-key, and only such an address takes it"
+                "a tls:// address requires --cluster-key, and other addresses do not accept it"
             )
             raise ConfigError(problem, key="cluster")
 
@@ -125,24 +125,24 @@ def run_campaign(
     append: bool = False,
     stop: Stop | None = None,
 ) -> Ledger:
-    """Fly a list of missions into a folder; missions with a result are not flown again.
+    """Fly a list of missions into a folder, except those that have a result.
 
     Args:
         missions: the list.
         folder: the campaign's folder, with ledger.sqlite and the kept run folders in runs/.
         options: how to run them.
-        spectator: hears of progress.
-        append: add missions that the folder does not have to its list.
+        spectator: observes the progress.
+        append: add new missions to the folder's list.
         stop: rule that ends settings early.
 
     Returns:
         The ledger, open for reading; `results()` come in the order of the list.
 
     Raises:
-        ConfigError: the folder holds another list, or another process works on it.
-        CampaignStopped: the machine keeps missions from being flown.
+        ConfigError: the folder holds another list, or another process is writing to it.
+        CampaignStopped: a problem of the machine prevents flights.
         RecordError: the ledger cannot be written.
-        Interrupted: Ctrl-C; a second one kills the missions that are flying.
+        Interrupted: the user pressed Ctrl-C; a second one kills the missions in flight.
     """
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=append)
@@ -161,16 +161,16 @@ def store_plan(
     differing: Sequence[str] = (),
     can_append: str = "",
 ) -> None:
-    """Store the list before anything flies, or compare it with the stored one.
+    """Store the list, or compare it with the stored one.
 
     Args:
-        append: missions that are not among the stored ones are added; those that are only there
-            stay.
-        differing: phrases that say in what another list differs; without, its first missions do.
-        can_append: how to have new missions added, told where no stored one is gone.
+        append: add missions that are not stored; stored ones stay in any case.
+        differing: descriptions of the differences for the error; empty for the first differing
+            missions.
+        can_append: how to append new missions, for the error if no stored mission is missing.
 
     Raises:
-        ConfigError: it is another list; says in what it differs. Or as `require_unchanged`.
+        ConfigError: the stored list differs, or as `require_unchanged`.
     """
     require_unchanged(ledger)
     left = Counter(row[1:] for row in ledger.rows())
@@ -204,7 +204,7 @@ def store_plan(
 def fly_missing(
     ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None = None
 ) -> None:
-    """Fly every mission without a result, or as many as the stopping rule takes.
+    """Fly every mission without a result, up to the stopping rule.
 
     Raises:
         MavfiError: as `run_campaign`.
@@ -216,7 +216,7 @@ def fly_missing(
 
 @contextlib.contextmanager
 def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
-    """Make a clean folder for the attempts; remnants of a killed run are removed."""
+    """Create an empty folder for attempts; remove remnants of a killed run."""
     work = own_folder(folder / WORK)
     shutil.rmtree(work, ignore_errors=True)
     for path in (work, profiles):
@@ -228,16 +228,16 @@ def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
 
 
 class MissionQueue:
-    """The missing missions in the order of the list; with a stopping rule, each in its batch.
+    """The missing missions in the order of the list, in batches if there is a stopping rule.
 
     Args:
         missing: missions without a result.
-        stop: the rule; None lets all missions through.
-        cells: the setting of each mission, in the order of the list.
-        over: number, outcome and fate of the fault of every mission that is over.
+        stop: the stopping rule; None admits all missions.
+        cells: setting of every mission, in the order of the list.
+        over: number, outcome and fault's fate of every finished mission.
 
     Attributes:
-        stopped: the settings that are known well enough.
+        stopped: settings that the rule has ended.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class MissionQueue:
             self.record(number, row)
 
     def next(self) -> MissingMission | None:
-        """The next mission that may begin; None where there is none now."""
+        """Return the next mission that may begin; None if there is none now."""
         if self._stop is None:
             return next(self._missing, None)
         self._held = {
@@ -284,7 +284,7 @@ class MissionQueue:
         return cell not in self.stopped and self._place[number] < self._open[cell]
 
     def record(self, number: int, row: Row) -> None:
-        """Note that a mission is over."""
+        """Record the end of a mission."""
         if self._stop is None:
             return
         cell = self._cells[number]
@@ -345,7 +345,7 @@ class _Run:
         self._begun = time.monotonic()
 
     def fly(self, interrupts: Sequence[int]) -> None:
-        """Fly until nothing is missing, or the user asks to stop."""
+        """Fly until nothing is missing or the user interrupts."""
         announced, options = False, self._options
         fleet: LocalWorkers | Cluster
         if options.cluster is None:
@@ -369,12 +369,12 @@ class _Run:
             shutil.rmtree(self.profiles, ignore_errors=True)  # an interruption may have left some
         self._spectator.on_end(self._progress())
         if interrupts:
-            raise Interrupted("interrupted; run again to go on")
+            raise Interrupted("interrupted; run again to continue")
         if self._given_up:
             number, reason = next(iter(sorted(self._given_up.items())))
             raise CampaignStopped(
-                f"{len(self._given_up)} missions were ended from outside {ATTEMPTS} times, the "
-                f"first is {number} ({reason}): too little memory? Fewer --jobs may help"
+                f"{len(self._given_up)} missions were killed from outside {ATTEMPTS} times, the "
+                f"first is {number} ({reason}): if memory is short, use fewer --jobs"
             )
 
     def _fill(self, workers: LocalWorkers | Cluster, interrupts: Sequence[int]) -> None:
@@ -417,7 +417,7 @@ class _Run:
         shutil.rmtree(out, ignore_errors=True)
 
     def _forget_profiles(self, config: MissionConfig) -> None:
-        """Remove what missions with the same golden run share after the last of them."""
+        """Remove the shared profiles of a golden run after its last mission."""
         if (golden := config.golden) not in self._sharing:
             return
         if config.instruction is not None:
@@ -428,7 +428,7 @@ class _Run:
             shutil.rmtree(kept, ignore_errors=True)
 
     def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: MissionConfig) -> None:
-        """Store a mission that is over: first its run folder, then its row."""
+        """Store a finished mission: first its run folder, then its row."""
         assert verdict.state is not None
         number, result = ended.number, verdict.result
         path, outcome = None, record_of(result).outcome or None
@@ -457,7 +457,7 @@ class _Run:
         self._errors += 1
         self._spectator.on_note(f"mission {number} could not be flown: {verdict.reason}")
         if self._errors >= _GIVE_UP and not any(self._outcomes.values()):
-            raise CampaignStopped(f"no mission can be flown; the last: {verdict.reason}")
+            raise CampaignStopped(f"no mission could begin; the last failed with: {verdict.reason}")
 
     def _progress(self) -> Progress:
         return Progress(
@@ -474,7 +474,7 @@ class _Run:
 
 
 def _put_away(run: Path, runs: Path, number: int) -> Path:
-    """Move a run folder to the kept ones; return its new path."""
+    """Move a run folder to the kept runs; return its new path."""
     stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
     place = own_folder(runs) / f"{number:06d}-{stem}"
     with writing(place):
@@ -485,10 +485,10 @@ def _put_away(run: Path, runs: Path, number: int) -> Path:
 
 
 def require_unchanged(ledger: Ledger) -> None:
-    """Require that versions and files are those with which the campaign was begun.
+    """Require that versions and files have not changed since the campaign began.
 
     Raises:
-        ConfigError: the campaign was begun with others; names them.
+        ConfigError: a version or a file has changed.
     """
     versions = installed_versions()
     stored = ledger.meta("versions")

@@ -33,12 +33,14 @@ _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
 # Factors that may differ without any fault.
-MISSION = tuple(each.name for each in fields(MissionConfig) if each.name not in _NESTED | _NEVER)
+MISSION = tuple(
+    member.name for member in fields(MissionConfig) if member.name not in _NESTED | _NEVER
+)
 _DETECTOR = {"detector": "name"} | {
-    each.name: each.name for each in fields(DetectorConfig) if each.name != "name"
+    member.name: member.name for member in fields(DetectorConfig) if member.name != "name"
 }
 _FAULT = {
-    level: tuple(each.name for each in fields(record) if each.name != "seed")
+    level: tuple(member.name for member in fields(record) if member.name != "seed")
     for level, (_, record) in _LEVELS.items()
 }
 _OF_FAULTS = dict.fromkeys((*_ALIASES, "level", *_FAULT["source"], *_FAULT["instruction"]))
@@ -51,21 +53,21 @@ def _mission_of(values: Factors, seed: int, fault_seed: int) -> MissionConfig:
     mission |= _fault(values, fault_seed)
     detector = {_DETECTOR[name]: value for name, value in values.items() if name in _DETECTOR}
     if detector and "name" not in detector:
-        raise ConfigError(f"{', '.join(sorted(detector))}: needs a detector")
+        raise ConfigError(f"{', '.join(sorted(detector))}: requires a detector")
     if detector and detector["name"] != "none":
         mission["detector"] = detector
     return structure(mission, MissionConfig)
 
 
 def _fault(values: Factors, seed: int) -> Factors:
-    """The field `fault` or `instruction` of the mission; empty without a fault."""
+    """Return the field `fault` or `instruction` of a mission; empty without a fault."""
     given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
     level = given.pop("level", "source")
     if level not in [*_LEVELS]:
         raise ConfigError(f"expected {' or '.join(_LEVELS)}, got {level!r}", key="level")
     targets = [name for name in _ALIASES if name in given]
     if len(targets) > 1:
-        raise ConfigError("a fault strikes a stage or a site, not both")
+        raise ConfigError("name a stage or a site for the fault, not both")
     fault = {_ALIASES[name] if name in targets else name: value for name, value in given.items()}
     for name in fault:
         if name not in _FAULT[level]:
@@ -76,7 +78,7 @@ def _fault(values: Factors, seed: int) -> Factors:
         return {_LEVELS[level][0]: {**fault, "seed": seed}}
     if given or "level" in values:
         named = sorted({*given, *({"level"} & set(values))})
-        raise ConfigError(f"{', '.join(named)}: a fault needs a stage or a site")
+        raise ConfigError(f"{', '.join(named)}: requires a stage or a site")
     return {}
 
 
@@ -84,7 +86,7 @@ def _fault(values: Factors, seed: int) -> Factors:
 
 
 class Keep(Enum):
-    """Which run folders are kept. Every outcome but success is a failure."""
+    """Policy that selects the run folders to keep. Every outcome except success is a failure."""
 
     NONE = "none"
     FAILURES = "failures"
@@ -92,7 +94,7 @@ class Keep(Enum):
     ALL = "all"
 
     def wants(self, number: int, outcome: str | None) -> bool:
-        """True if the run folder of this mission is kept."""
+        """Return True if the run folder of this mission is kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
         mixed = number  # a sample of the successes covers all settings however they alternate
@@ -111,13 +113,13 @@ class FixedWorld:
     """The table `[fixed_world]` of a specification.
 
     Attributes:
-        replans: least and most replans, for the median over golden runs.
-        flights: golden runs of each candidate, with seeds from the campaign's first on.
-        candidates: world seeds 1 to this number are tried, and the first that fits is taken.
-        worlds: the worlds that the rule is for; empty: all worlds of the campaign.
-        world_seed: seed of each world, named by the user or found by the rule.
-        flown: replans of the golden runs of candidates 1, 2, 3, ...; fewer than `flights` values
-            for a candidate whose flights could not begin.
+        replans: least and largest median of replans over the golden runs.
+        flights: number of golden runs per candidate; seeds start at the campaign's first.
+        candidates: largest world seed to try; the first from 1 that fits is chosen.
+        worlds: the worlds that the rule covers; empty for all worlds of the campaign.
+        world_seed: seed of every world, given by the user or chosen by the rule.
+        flown: replans of the golden runs of candidates 1, 2, 3, ...; a candidate whose flights
+            could not begin has fewer than `flights` values.
     """
 
     replans: tuple[int, int]
@@ -132,23 +134,26 @@ class FixedWorld:
         if not 0 <= least <= most:
             raise ValueError(f"replans: expected [LEAST, MOST], got [{least}, {most}]")
         if self.flights < 1 or self.candidates < 1:
-            raise ValueError("flights and candidates: must be at least 1")
+            raise ValueError(
+                "flights and candidates: must be at least 1, "
+                f"got {self.flights} and {self.candidates}"
+            )
         for world, seed in self.world_seed.items():
             if seed < 0:
-                raise ValueError(f"world_seed.{world}: must not be negative, is {seed}")
+                raise ValueError(f"world_seed.{world}: must be at least 0, got {seed}")
 
     def rules(self, world: str) -> bool:
-        """True if missions in this world share one; a user's own boxes already are one world."""
+        """Return True if the rule covers this world; a user's own boxes are fixed already."""
         named = world in self.worlds or world in self.world_seed
         return named or (not self.worlds and not world.endswith(".toml"))
 
     def fits(self, replans: Sequence[int]) -> bool:
-        """True if a candidate fits the rule by the replans of its golden runs."""
+        """Return True if a candidate fits the rule, given the replans of its golden runs."""
         least, most = self.replans
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
     def describe(self) -> str:
-        """The rule and the worlds that it has found, in one line."""
+        """Describe the rule and the chosen worlds in one line."""
         phrases = []
         for world, seed in self.world_seed.items():
             flown = self.flown.get(world)
@@ -172,7 +177,7 @@ LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """Missions that are listed together: their own factors, crossed with the common ones."""
+    """A group of missions: its own factors, crossed with the common ones."""
 
     name: str = ""
     axes: Axes = field(default_factory=dict)
@@ -180,17 +185,17 @@ class Setting:
 
     def __post_init__(self) -> None:
         if self.repetitions is not None and self.repetitions < 1:
-            raise ValueError(f"repetitions: must be at least 1, is {self.repetitions}")
+            raise ValueError(f"repetitions: must be at least 1, got {self.repetitions}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop:
-    """The rule that ends a setting which has been flown often enough.
+    """The rule that ends a setting once its success rate is precise enough.
 
     Attributes:
         margin: largest half-width of the Wilson interval of the success rate.
         confidence: confidence of that interval.
-        batch: the interval is checked after every batch of this many missions of a setting.
+        batch: number of missions of a setting between checks of the interval.
     """
 
     margin: float
@@ -200,7 +205,8 @@ class Stop:
     def __post_init__(self) -> None:
         if not (0.0 < self.margin < 0.5 and 0.0 < self.confidence < 1.0 and self.batch >= 1):
             raise ValueError(
-                "needs a margin between 0 and 0.5, a confidence between 0 and 1, a batch from 1"
+                "margin must be between 0 and 0.5, confidence between 0 and 1, batch at least 1; "
+                f"got {self.margin:g}, {self.confidence:g} and {self.batch}"
             )
 
 
@@ -213,10 +219,10 @@ class Spec:
         first_seed: first seed of the missions; repetition r flies with first_seed + r.
         repetitions: missions for each combination of factors.
         fixed: factors that all missions share.
-        axes: factors that are crossed, each with its values.
-        settings: lists of missions, each crossed with `axes`.
+        axes: crossed factors with their values.
+        settings: groups of missions, crossed with `axes`.
         stop: ends settings early; None flies everything.
-        fixed_world: has missions in a world share one; None: the world changes with the seed.
+        fixed_world: one fixed world seed for all missions; None: the world changes with the seed.
     """
 
     name: str  # name of the folder below campaigns/
@@ -234,13 +240,13 @@ class Spec:
     def __post_init__(self) -> None:
         for name, least in (("seed", 0), ("first_seed", 0), ("repetitions", 1)):
             if (value := getattr(self, name)) < least:
-                raise ValueError(f"{name}: must be at least {least}, is {value}")
+                raise ValueError(f"{name}: must be at least {least}, got {value}")
 
     def scaled(self, scale: float) -> Spec:
-        """Return the same campaign with a fraction of its repetitions, at least one each.
+        """Return the same campaign with a fraction of its repetitions, but at least one.
 
         Raises:
-            ConfigError: the scale leaves nothing.
+            ConfigError: the scale is not above 0.
         """
         if not (math.isfinite(scale) and scale > 0.0):
             raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
@@ -259,7 +265,7 @@ class Spec:
         """List the missions repetition by repetition, so that pairs and settings grow together.
 
         Raises:
-            ConfigError: there is nothing to fly, more than MOST, or a combination makes no mission.
+            ConfigError: there are no missions or more than MOST, or a combination is invalid.
         """
         points = self._points()
         return [
@@ -270,7 +276,7 @@ class Spec:
         ]
 
     def kinds(self) -> list[PlannedMission]:
-        """The first missions of the list, one for each combination; the others differ in seeds.
+        """Return the first mission of every combination; the others differ only in seeds.
 
         Raises:
             ConfigError: as `missions`.
@@ -289,7 +295,9 @@ class Spec:
         ]
         planned = sum(count * math.prod(map(len, axes.values())) for axes, _, count in crossed)
         if planned > MOST:
-            raise ConfigError(f"campaign {self.name!r} has {planned} missions; at most {MOST}")
+            raise ConfigError(
+                f"campaign {self.name!r} must have at most {MOST} missions, got {planned}"
+            )
         points: list[tuple[Factors, Labels, int]] = []
         for axes, name, count in crossed:
             for values in itertools.product(*axes.values()):
@@ -301,7 +309,9 @@ class Spec:
                         labels[key] = "+".join(map(str, value)) if several else value
                 points.append(({**self.fixed, **chosen}, labels, count))
         if not points:
-            raise ConfigError(f"campaign {self.name!r} has no mission: an empty list of values")
+            raise ConfigError(
+                f"campaign {self.name!r} has no missions, because a list of values is empty"
+            )
         return points
 
     def _mission(self, values: Factors, labels: Labels, repetition: int) -> PlannedMission:
@@ -317,7 +327,7 @@ class Spec:
             return PlannedMission(config=config, labels=labels)
 
     def differences(self, other: Spec, repetitions: str = "repetitions") -> list[str]:
-        """A phrase for each factor or number that differs; names and stops do not count.
+        """Describe every differing factor or number, except names and stopping rules.
 
         Args:
             repetitions: the word for repetitions.
@@ -333,7 +343,7 @@ class Spec:
         ]
 
     def _choices(self, repetitions: str) -> dict[str, list[Any]]:
-        """Factors with all their values, and the numbers."""
+        """Return the factors with all their values, and the numbers."""
         choices: dict[str, list[Any]] = {}
         for axes in (self.axes, *(setting.axes for setting in self.settings)):
             for name, values in axes.items():
@@ -363,7 +373,7 @@ class Spec:
         return choices
 
     def to_toml(self) -> str:
-        """TOML from which `parse_spec` makes an equal specification."""
+        """Return TOML that `parse_spec` reads as an equal specification."""
         names = ("name", "about", "seed", "first_seed", "repetitions")
         settings = []
         for setting in self.settings:
@@ -388,11 +398,11 @@ def _listed(values: Sequence[Any] | None) -> str:
 def require_named(
     key: str, names: Sequence[str], known: Sequence[str] | None = None, least: int = 1
 ) -> None:
-    """Require some names, each once and each known.
+    """Require at least one name, without repetition, all of them known.
 
     Raises:
-        ConfigError: too few, or one twice.
-        UnknownName: a name is not among the known ones, if they are given.
+        ConfigError: there is no name, or one occurs twice.
+        UnknownName: a name is not among `known`, if that is given.
     """
     if len(names) < least:
         raise ConfigError("name at least one", key=key)

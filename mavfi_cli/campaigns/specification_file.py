@@ -1,4 +1,4 @@
-"""Specifications as TOML: campaign.toml, the presets, and changes by `--set`."""
+"""Reads specifications from TOML (campaign.toml, the presets) and applies changes of `--set`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mavfi_cli.core.errors import ConfigError, UnknownName, named_member
 
 PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
-_TOP = (*(each.name for each in fields(Spec) if each.name not in ("fixed", "axes", "settings")),
+_TOP = (*(key.name for key in fields(Spec) if key.name not in ("fixed", "axes", "settings")),
         *_FACTORS)  # fmt: skip
 _SETTING = ("name", "repetitions")
 
@@ -32,9 +32,9 @@ def load_spec(name: str) -> Spec:
     """Load a preset, or the specification in a TOML file.
 
     Raises:
-        UnknownName: neither a preset nor a file, or no mission flies in a world of
-            `[fixed_world]`.
-        ConfigError: the file cannot be used; says where and why.
+        UnknownName: the name is neither a preset nor a file, or `[fixed_world]` names a world
+            without missions.
+        ConfigError: the file is invalid.
     """
     path = PRESETS.path(name)
     spec = parse_spec(read_text(path), path if path == Path(name) else Path(path.name))
@@ -52,12 +52,12 @@ def parse_spec(text: str, path: Path) -> Spec:
 
 
 def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
-    """Read a specification from TOML's tables; `path` as for `parse_spec`, `text` for lines."""
+    """Read a specification from TOML tables; `path` and `text` locate errors."""
     _require_table(data, "", _TOP, path)
     mission, factors = data.get("mission", {}), data.get("factors", {})
     settings = data.get("setting", [{}])
     if not isinstance(settings, list):
-        raise ConfigError("expected tables [[setting]]", path=path, key="setting")
+        raise ConfigError("must consist of tables [[setting]]", path=path, key="setting")
     _require_table(mission, "mission", NAMES, path)
     for name, value in mission.items():
         _require_usable(name, value, f"mission.{name}", path)
@@ -91,15 +91,15 @@ def _require_table(table: Any, key: str, known: Sequence[str], path: Path) -> No
 
 
 def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
-    """Refuse a value that no mission can have, whatever the factor's type."""
+    """Refuse a value that no factor can have."""
     if name in LISTS and not isinstance(value, list):
-        raise ConfigError(f"expected a list, got {value!r}", path=path, key=key)
+        raise ConfigError(f"must be a list, got {value!r}", path=path, key=key)
     if isinstance(value, datetime.date | datetime.time):
-        raise ConfigError(f"no factor is a date or a time, got {value}", path=path, key=key)
+        raise ConfigError(f"must not be a date or a time, got {value}", path=path, key=key)
 
 
 def _axes(table: Factors, place: str, path: Path) -> Axes:
-    """Read factors, each with its value or values."""
+    """Read factors with one or more values."""
     axes: dict[str, tuple[Any, ...]] = {}
     for name, value in table.items():
         key, several = f"{place}.{name}", isinstance(value, list)
@@ -126,17 +126,17 @@ _LONGEST = 100  # characters of a folder's name; a longer one ends with a digest
 def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     """Return the specification with factors replaced, under a name that includes the changes.
 
-    A factor is replaced in all settings that have it. A factor of the mission that is
-    missing from the specification is added to all missions.
+    A factor is replaced in all settings that have it. A mission factor that the specification
+    lacks is added to all missions.
 
     Args:
-        changes: KEY=VALUE[,VALUE], each with a different key. A value with a comma is quoted
-            as in TOML, and all values may be written as one TOML list.
+        changes: KEY=VALUE[,VALUE] with distinct keys. A value with a comma is quoted as in TOML,
+            and all values may be written as one TOML list.
 
     Raises:
-        ConfigError: no such factor; names the nearest.
-        ConfigError: a change is not KEY=VALUE, the specification lacks this factor of faults, or it
-            cannot have these values.
+        ConfigError: there is no such factor.
+        ConfigError: a change is not KEY=VALUE, the specification lacks this factor of faults, or
+            the values are invalid.
     """
     if not changes:
         return spec
@@ -145,7 +145,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     for change in changes:
         key, equals, text = change.partition("=")
         if not equals or not text:
-            raise ConfigError(f"expected KEY=VALUE[,VALUE], got {change!r}", key="set")
+            raise ConfigError(f"must be KEY=VALUE[,VALUE], got {change!r}", key="set")
         if key in seen:
             raise ConfigError(f"{key} is set twice", key="set")
         seen.add(key)
@@ -161,7 +161,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
 
 
 def folder_name(text: str) -> str:
-    """The text without the characters that do not belong into a folder's name."""
+    """Return the text without characters that are unsuitable for a folder's name."""
     return _ODD.sub("-", text).strip("-")
 
 

@@ -8,7 +8,7 @@ from mavfi_cli.campaigns.missions import Changes
 
 
 def prepare() -> None:
-    """Import and load everything that a mission needs; every worker is a fork of this state."""
+    """Import and load everything that a mission needs, before workers are forked."""
     import pyarrow.parquet  # noqa: F401  # only imported: its threads start at the first use
 
     import mavfi_cli.mission.run
@@ -21,7 +21,7 @@ def prepare() -> None:
 
 
 def perform(changes: Changes, out: Path) -> Path:
-    """Fly the mission of `missions.changes_of`; return its run folder, which is in `out`.
+    """Fly a mission, given its `missions.changes_of`; return its run folder in `out`.
 
     Raises:
         MavfiError: the mission could not begin, or its record could not be written.
@@ -32,5 +32,5 @@ def perform(changes: Changes, out: Path) -> Path:
     from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.spec.mission import MissionConfig
 
-    profiles = (out / CACHE).resolve()  # the runner has made a link to those of the campaign
+    profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
     return fly_mission(structure(changes, MissionConfig), out, Watcher(), profiles=profiles).path

@@ -1,6 +1,6 @@
-"""The workers that fly missions, on this machine or on dask.distributed, and what their ends mean.
+"""Workers that fly missions on this machine or on dask.distributed, and judge their ends.
 
-Dask's workers import this module. Each thread of a dask worker keeps a worker of ours, so a dask
+Dask workers import this module. Every thread of a dask worker keeps one local worker, so a dask
 worker with n threads flies n missions at a time.
 """
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class CampaignStopped(MavfiError):
-    """The machine has a problem that does not concern one mission only."""
+    """The machine has a problem that affects more than one mission."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ class AttemptResult:
     Attributes:
         state: state of the mission; None if something outside ended the attempt.
         result: the mission's record; empty if there is none.
-        doubtful: true if there is a record, but something outside may have affected it.
+        doubtful: true if something outside the mission may have affected the record.
     """
 
     state: ResultState | None
@@ -67,10 +67,10 @@ class AttemptEnd:
 
     Attributes:
         exit: exit code of the mission's process; None if it was killed.
-        signal: signal that killed it; None if its guard was killed too, or the time ran out.
-        timeout: true if the limit of wall time passed.
+        signal: signal that killed it; None after a time-out or if its guard was killed too.
+        timeout: true if the mission exceeded its wall time.
         report: the mission's last message: folder, or error and text, or traceback.
-        lost: why its end is unknown.
+        lost: reason why its end is unknown.
         wall_s: wall time of the whole attempt, the guard's work included, s.
     """
 
@@ -131,7 +131,7 @@ class LocalWorkers:
 
     @property
     def free(self) -> int:
-        """Number of missions that may be started now."""
+        """Number of missions that can start now."""
         return self._jobs - len(self._number)
 
     def start(self, number: int, changes: Changes, out: Path, limit_s: float) -> None:
@@ -145,12 +145,12 @@ class LocalWorkers:
         self._number[channel] = number
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for a guard's message or the time-out; return the missions that ended."""
+        """Wait for a guard's message or the time-out; return the ended missions."""
         ended = []
         for key, _ in self._selector.select(timeout_s):
             channel = key.fileobj
             assert isinstance(channel, socket.socket)
-            message = _heard(channel) or {}
+            message = _next_message(channel) or {}
             if "pid" not in message:  # not the begin of the worker
                 ended.append(AttemptEnd(number=self._number[channel], **message))
                 self._release(channel)
@@ -167,15 +167,15 @@ class LocalWorkers:
             channel.shutdown(socket.SHUT_WR)  # the guard ends its worker, and then itself
         for channel in list(self._number):
             channel.settimeout(_STOP_S)
-            while _heard(channel) is not None:
+            while _next_message(channel) is not None:
                 pass
             self._release(channel)
         self._server.close()
         self._selector.close()
 
 
-def _heard(channel: socket.socket) -> Mapping[str, Any] | None:
-    """Read a guard's next message; None if it is gone or sends nothing in time."""
+def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
+    """Receive a guard's next message; None if it has died or does not send one in time."""
     with contextlib.suppress(OSError):
         if packet := channel.recv(PACKET):
             message: dict[str, Any] = json.loads(packet)
@@ -230,7 +230,7 @@ def _refused(kind: str, text: str) -> AttemptResult:
 
 
 def _cut_off(outcome: Outcome, reason: str, out: Path, config: MissionConfig) -> AttemptResult:
-    """Judge a mission whose process ended before it wrote its record, by what is known of it."""
+    """Judge a mission whose process ended before it wrote its record."""
     runs = [path for path in out.glob("[!.]*/") if path.name != SCRATCH]
     run = runs[0] if len(runs) == 1 else None
     fault = None
@@ -264,13 +264,13 @@ class Cluster:
 
     Args:
         address: address of the scheduler, such as tls://host:8786.
-        keep: the campaign's policy; other run folders are sent without their traces.
-        keys: folder with the keys of the cluster; needed for tls://.
+        keep: the campaign's policy; run folders that it drops are sent without their traces.
+        keys: folder with the keys of the cluster; required for tls://.
 
     Raises:
         CampaignStopped: dask is not installed, the scheduler does not answer, no worker connects,
-            or a worker has another version of something that results depend on.
-        ConfigError: the keys cannot be used.
+            or the version of a component that affects results differs on a worker.
+        ConfigError: the keys are invalid.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class Cluster:
     ) -> None:
         self._keep, self._task = keep, task
         self._versions = installed_versions()
-        self._token = uuid.uuid4().hex[:8]  # tells this run's results from others
+        self._token = uuid.uuid4().hex[:8]  # distinguishes this run's results from others
         self._submitted = 0
         self._futures: dict[int, tuple[Future, Path]] = {}
         self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -291,7 +291,7 @@ class Cluster:
 
     @property
     def free(self) -> int:
-        """Number of missions that may be sent now."""
+        """Number of missions that can be sent now."""
         if time.monotonic() - self._looked_s > _LOOK_S:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
@@ -308,7 +308,7 @@ class Cluster:
         future.add_done_callback(lambda _future: self._done.put(number))
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for news or the time-out; return the missions that ended."""
+        """Wait for a result or the time-out; return the ended missions."""
         numbers = []
         with contextlib.suppress(queue.Empty):
             numbers.append(self._done.get(timeout=timeout_s))
@@ -395,11 +395,11 @@ def _fly(
     """Fly a mission; run folders that the campaign does not keep are sent without their traces.
 
     Args:
-        versions: those of the runner.
+        versions: the runner's versions.
 
     Returns:
-        Its end, and its files, compressed, by path in its folder. Or how this
-        worker's versions differ from the runner's; it then does not fly.
+        Its end, and its compressed files by path in its folder; or, without flying, the differences
+        of this worker's versions from the runner's.
     """
     differing = version_differences(versions, _worker_versions())
     if differing:
@@ -428,7 +428,7 @@ def _workers(task: str) -> LocalWorkers:
 
 @cache
 def _scratch() -> ScratchFolder:
-    """A folder of this worker, until it ends; profiles of instruction-level faults stay in it."""
+    """Return this worker's scratch folder, which also keeps instruction-level profiles."""
     folder = ScratchFolder("worker")
     (folder.path / "profiles").mkdir()
     return folder

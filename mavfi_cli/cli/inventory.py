@@ -49,7 +49,7 @@ def doctor(as_json: bool) -> None:
         checks.append(check)
         if not as_json:
             colour, mark = _MARKS[check.verdict]
-            first, *rest = textwrap.wrap(check.found, WIDTH - _FOUND) or [""]
+            first, *rest = textwrap.wrap(check.finding, WIDTH - _FOUND) or [""]
             click.secho(f"{mark:<8}", fg=colour, nl=False)
             echo(f"{check.name:<20} {first}")
             for line in [*rest, *([f"-> {check.remedy}"] if check.remedy else [])]:

@@ -1,8 +1,8 @@
 """The loop of one mission: receives messages, runs a control tick per state, sends setpoints.
 
-The clock is the vehicle's: a LOCAL_POSITION_NED is the tick of its stamp. In lockstep the
-vehicle waits for the setpoint of that stamp; the answer goes out first, so that a vehicle in a
-process of its own simulates the next tick while the heavy kernels run.
+The vehicle provides the clock: every LOCAL_POSITION_NED starts the control tick of its stamp. In
+lockstep the vehicle waits for the setpoint of that stamp. The setpoint is sent first, so that a
+vehicle in its own process simulates the next tick while the heavy kernels run.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERR
 
 
 class ForeignClock:
-    """Time of a foreign vehicle, heard only in the stamps of its states, and of the wall.
+    """Estimates a foreign vehicle's time from the stamps of its states and the wall clock.
 
-    Between two states the vehicle's clock is estimated. It runs at the pace that the flight has had
-    so far, but no faster than the wall's clock: a simulator may be slower than real time.
+    Between two states the vehicle's clock is estimated. It runs at the flight's pace so far, but no
+    faster than the wall clock, because a simulator may be slower than real time.
 
     Args:
-        wall: Clock of the wall, s.
+        wall: Returns wall-clock time, s.
 
     Attributes:
         stamp_s: Stamp of the newest state; 0 before the first.
@@ -74,9 +74,9 @@ class ForeignClock:
         self.heard = False
 
     def believes(self, stamp_s: float, limit_s: float) -> bool:
-        """Return False for the stamp of a state that is not newer, or that leaps beyond a limit.
+        """Return False for a state's stamp that is not newer or that jumps beyond a limit.
 
-        A clock has leapt if a second state follows the first within the limit.
+        A jump is accepted as a new clock if a second state follows the first within the limit.
         """
         leaps = stamp_s > self.stamp_s + limit_s
         follows = self._doubted_s < stamp_s <= self._doubted_s + limit_s
@@ -94,12 +94,12 @@ class ForeignClock:
             self._pace = min(1.0, flown_s / passed_s)
 
     def wait(self, waited_s: float) -> None:
-        """Note a time on the wall's clock without a new state."""
+        """Note the wall-clock time without a new state."""
         self._waited_s += waited_s
 
     @property
     def silence_s(self) -> float:
-        """Time without a new state that has passed on the vehicle's clock and on the wall's."""
+        """Time since the newest state, on both the vehicle's and the wall clock, s."""
         return self._waited_s * self._pace
 
     @property
@@ -162,7 +162,7 @@ class Flight:
 
     @property
     def place_enu_m(self) -> FloatArray:
-        """The place of the vehicle (3,), known after `connect`."""
+        """Position of the vehicle (3,), available after `connect`."""
         assert self._session.state is not None
         return self._session.state.position_enu_m
 
@@ -174,7 +174,7 @@ class Flight:
         Raises:
             NoAutopilot: No heartbeat arrived.
             LinkLost: The other end closed the connection.
-            Interrupted: The user pressed Ctrl-C before there was anything to record.
+            Interrupted: The user pressed Ctrl-C before the flight.
         """
         while self._session.phase is Phase.CONNECTING:
             if self._interrupts:
@@ -204,7 +204,7 @@ class Flight:
         return self.companion
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return a time that no flight from the take-over to the goal undercuts, s."""
+        """Return a lower bound of the flight time from the take-over to the goal, s."""
         takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
         way_m = norm(briefing.goal_enu_m - takeoff) - self.stack.goal_tolerance_m
         turn_s = TURN_S if self.stack.turns_before_departure else 0.0
@@ -245,9 +245,10 @@ class Flight:
                 self.end_s = self.stamp_s if self.outcome is None else self.end_s
 
     def _finished(self) -> bool:
-        """Return True once there is an outcome, and the vehicle has landed if it is to land.
+        """Return True once there is an outcome and any required landing is complete.
 
-        A refusal in the air ends the mission and lands. Any other failure of the session is raised.
+        A command refused in the air ends the mission with a landing. Other failures of the session
+        are raised.
         """
         failure = self._session.failure
         if failure is not None and self.outcome is None:
@@ -269,7 +270,7 @@ class Flight:
         """Set the outcome of the mission. Later calls have no effect.
 
         Args:
-            lands: The vehicle still follows, also if the outcome is none after which it lands.
+            lands: Land although the outcome does not require it; the vehicle still responds.
         """
         if self.outcome is not None:
             return
@@ -279,7 +280,7 @@ class Flight:
         self.logger.note(self.stamp_s, "outcome", text, self._session.state)
 
     def explain(self, why: str) -> None:
-        """Add the failure of the vehicle's process to the reason of a lost link."""
+        """Add the failure of the vehicle's process to the reason for a lost link."""
         if self.outcome is Outcome.LINK_LOST:
             self.reason = f"{self.reason}: {why}"
 
@@ -295,7 +296,7 @@ class Flight:
             raise LinkLost(f"the simulated vehicle said nothing for {self._patience_s:g} s")
 
     def _turn_by_wall(self, clock: ForeignClock) -> None:
-        """Run a tick for a foreign autopilot, also without a new state, until it counts as lost."""
+        """Run a tick for a foreign autopilot, even without a new state, until it counts as lost."""
         begun_s = time.monotonic()
         data = self._receive(IDLE_S)
         waited_s = time.monotonic() - begun_s
@@ -335,7 +336,7 @@ class Flight:
         return newest_s
 
     def _believes(self, stamp_s: float) -> bool:
-        """Return False for a stamp that a foreign vehicle's clock cannot have in flight."""
+        """Return False for a stamp that is impossible for a foreign vehicle in flight."""
         if self._clock is None or not self._airborne():
             return True
         return self._clock.believes(stamp_s, self._config.loss_limit_s)
@@ -356,7 +357,7 @@ class Flight:
     def _tick(self, stamp_s: float | None) -> bool:
         """Run one control tick: publish due outputs, decide, send the setpoint, then compute.
 
-        Returns False without any effect if there is no new stamp.
+        Returns False and does nothing if there is no new stamp.
         """
         if stamp_s is None or (stamp_s <= self.stamp_s and len(self.trace)):
             return False
@@ -407,7 +408,7 @@ class Flight:
         )
 
     def _offer_frames(self, companion: Companion) -> None:
-        """Pass the newest depth frames to perception, each with its camera pose."""
+        """Pass the newest depth frames and their camera poses to perception."""
         assert self._briefing is not None
         for image in self._frames:
             pose = self._session.state_at(image.stamp_s)
@@ -448,7 +449,7 @@ class Flight:
 
     @property
     def _blind_s(self) -> float:
-        """Time by which the next frame of a foreign autopilot's camera is overdue, s."""
+        """Return how long the next frame of a foreign autopilot's camera is overdue, s."""
         if not self._camera_asked or self._config.link is None:
             return 0.0
         return self.stamp_s - self._seen_s - 1.0 / self._config.camera_rate_hz

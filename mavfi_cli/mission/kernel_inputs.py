@@ -28,17 +28,19 @@ from mavfi_cli.spec.mission import MissionConfig
 
 _Any = TypeVar("_Any")
 INPUTS_A_KERNEL = 5
-_FORESEEN = 2  # of the five checked trajectories, if the flight has so many with a collision
-_FLIGHTS = 20  # the most flights from which planning problems are taken
+_FORESEEN = (
+    2  # least number of the five checked trajectories with a collision, if the flight has as many
+)
+_FLIGHTS = 20  # largest number of flights to search for planning problems
 
 
 def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
     """Fly the mission without a fault and return inputs of all kernels, spread over the flight.
 
-    If it does not have enough planning problems, missions with the next seeds supply the rest.
+    If one flight has too few planning problems, flights with the next seeds supply the rest.
 
     Raises:
-        TargetError: A flight did not reach its goal, or there are too few inputs of a kernel.
+        TargetError: A flight did not reach its goal, or a kernel has too few inputs.
         MavfiError: The mission could not begin.
     """
     name, recorder = _flight_name(config), _flown(config)
@@ -85,12 +87,12 @@ def _flown(config: MissionConfig) -> Recorder:
 
 
 def _spread(of: Sequence[_Any], number: int = INPUTS_A_KERNEL) -> list[_Any]:
-    """Members at equal distances; the middle one is among them if the number is odd."""
+    """Return equally spaced members, including the middle one if the number is odd."""
     return [of[(2 * k + 1) * len(of) // (2 * number)] for k in range(number)]
 
 
 def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
-    """Return checked trajectories, some of them with a collision if there are any."""
+    """Return checked trajectories, including some with a collision if there are any."""
     free: list[CollisionInputs] = []
     foreseen: list[CollisionInputs] = []
     for check, stamp_s in recorder.orders.get("collision_check", []):
@@ -113,12 +115,13 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
         another = replace(config, seed=seed)
         tasks += _hard_tasks(another, _flown(another))
     raise TargetError(
-        _flight_name(config), "has too few plans around an obstacle, and so have the next seeds"
+        _flight_name(config),
+        "has too few plans around obstacles, even with the flights of the next seeds",
     )
 
 
 def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
-    """Return the requests that a straight line does not answer."""
+    """Return the planning requests that a straight line does not solve."""
     assert recorder.briefing is not None
     hard = []
     for (request, snapshot), _ in recorder.orders["planner"]:
@@ -158,12 +161,12 @@ def _tracked(
 def kernel_targets(
     kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
 ) -> list[KernelTarget]:
-    """Return the kernels of these names, with the inputs of a golden run.
+    """Return targets for the named kernels, with inputs of a golden run.
 
-    The inputs are those in the folder, or else of a flight, which are then stored there.
+    The inputs come from the folder, or from a flight whose inputs are then stored there.
 
     Raises:
-        ConfigError: The folder contains the inputs of another flight.
+        ConfigError: The folder holds inputs of another flight.
     """
     path = folder / INPUTS
     if not path.is_file():
@@ -189,7 +192,7 @@ def kernel_targets(
 def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
     """The golden flight whose inputs `mavfi kernels` attacks.
 
-    Collision check, planner and control have the parameters of `hardened`.
+    Collision check, planner and control use the parameters of `hardened`.
     """
     return MissionConfig(world=world, seed=seed, stack="hardened")
 

@@ -1,4 +1,4 @@
-"""Checks of this machine, each with its finding and the remedy for a failure."""
+"""Checks of this machine, with findings and remedies."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
     from mavfi_cli.fi.tracer.tracee import Mechanism
 
 OK = "ok"
-LIMITED = "limited"  # flying works, but something else does not
-FAILED = "failed"  # flying does not work
+LIMITED = "limited"  # missions fly, but another feature does not work
+FAILED = "failed"  # missions do not fly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """One line of the report; it has a remedy unless the verdict is OK."""
+    """One check of the report, with a remedy unless the verdict is OK."""
 
     name: str
     verdict: str
-    found: str
+    finding: str
     remedy: str = ""
 
 
-def _check(name: str, found: str, *, remedy: str = "", failed: bool = False) -> Check:
+def _check(name: str, finding: str, *, remedy: str = "", failed: bool = False) -> Check:
     verdict = FAILED if failed else LIMITED if remedy else OK
-    return Check(name=name, verdict=verdict, found=found, remedy=remedy)
+    return Check(name=name, verdict=verdict, finding=finding, remedy=remedy)
 
 
 _WHEELS = {
@@ -86,8 +86,8 @@ def check_machine() -> Iterator[Check]:
     yield _wheels()
     have = [extra for extra, module in _EXTRAS.items() if importlib.util.find_spec(module)]
     lack = [extra for extra in _EXTRAS if extra not in have]
-    found = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
-    yield _check("Extras", found)
+    finding = f"installed: {', '.join(have) or 'none'}; not installed: {', '.join(lack) or 'none'}"
+    yield _check("Extras", finding)
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     remedy = "a campaign wants more room; name another folder with --out" if free <= 1.0 else ""
     yield _check("Disk", f"{free:.1f} GB free here", remedy=remedy)
@@ -113,21 +113,21 @@ def _processor() -> Check:
     if machine == "x86_64" and not level >= TARGET:
         remedy = f"records are equal from {TARGET} up: compare with flights of this computer only"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    found = f"{system} {level or machine}, {cores} core{'s' if cores != 1 else ''} usable"
-    return _check("Processor", found, remedy=remedy)
+    finding = f"{system} {level or machine}, {cores} core{'s' if cores != 1 else ''} usable"
+    return _check("Processor", finding, remedy=remedy)
 
 
 def _wheels() -> Check:
-    missing, found = [], []
+    missing, finding = [], []
     for name, module in _WHEELS.items():
         try:
             importlib.import_module(module)
-            found.append(f"{name} {importlib.metadata.version(name)}")
+            finding.append(f"{name} {importlib.metadata.version(name)}")
         except (ImportError, OSError) as error:
             missing.append(f"{name} ({error})")
     if missing:
         return _check("Libraries", "missing: " + "; ".join(missing), remedy=_INSTALL, failed=True)
-    return _check("Libraries", ", ".join(found))
+    return _check("Libraries", ", ".join(finding))
 
 
 def _loopback() -> Check:
@@ -158,10 +158,10 @@ def _physics() -> Check:
 
 
 def check_tracing(mechanism: Mechanism | None = None) -> Check:
-    """Start a program, stop it at its entry point, flip a register there and back, let it go.
+    """Check that a program can be stopped and its registers changed.
 
     Args:
-        mechanism: How executions are counted; by default the best that is allowed.
+        mechanism: How executions are counted; the best available one by default.
     """
     from mavfi_cli.fi.tracer.registers import widest_vector
     from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
@@ -190,7 +190,7 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
 
 
 def _counting() -> Check:
-    """Find the mechanism that counts executions here; the worse one is tried."""
+    """Report the mechanism that counts executions; try out the fallback if it is needed."""
     from mavfi_cli.fi.tracer.tracee import Mechanism, perf_allowed
 
     refused = perf_allowed()
@@ -198,8 +198,8 @@ def _counting() -> Check:
         return _check(_COUNTING, "by the kernel (perf_event_open)")
     tried = check_tracing(Mechanism.DEBUG)
     if tried.verdict != OK:
-        found = f"perf_event_open: {refused}; debug registers: {tried.found}"
-        return _check(_COUNTING, found, remedy=_ALLOW_PTRACE)
+        finding = f"perf_event_open: {refused}; debug registers: {tried.finding}"
+        return _check(_COUNTING, finding, remedy=_ALLOW_PTRACE)
     slower = "by debug registers, about three times slower a hit"
-    found = f"{slower}: perf_event_open is refused ({refused})"
-    return _check(_COUNTING, found, remedy=_PERF_REMEDY)
+    finding = f"{slower}: perf_event_open is refused ({refused})"
+    return _check(_COUNTING, finding, remedy=_PERF_REMEDY)

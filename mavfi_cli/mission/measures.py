@@ -1,10 +1,10 @@
-"""What a flight was: its quality, and the sections and measures of its result.json.
+"""The quality of a flight, and the sections and measures of its result.json.
 
-This is the one place where a result.json is read. Each measure is a column of a table of flights. A
-mission that crashed or hung before it could write its record has few fields; a measure that its
-record does not have is None. A source-level fault that struck several components has them joined by
-";", in one order in all measures; `struck_bits` has a list of bits for each. Of several strikes the
-measures have the first.
+Only this module reads a result.json. Every measure is a column of a table of flights. A mission
+that crashed or hung before it could write its record has few fields; measures of missing fields are
+None. If a source-level fault struck several components, the measures join them by ";" in a common
+order, and `struck_bits` has a list of bits for every component. Of several strikes the measures
+describe the first.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def quality_of(
     in the paper (section IV), where take-off precedes the measurement. Unknown values are None.
 
     Args:
-        log: Columns with one row per control tick: those of `sitl.referee`, or its stamp, position
-            and velocity only, because a foreign autopilot has no referee.
+        log: Columns with one row per control tick, as in `sitl.referee`. A foreign autopilot has
+            no referee, so its log has only stamp, position and velocity.
         start_s, end_s: Stamps of the companion's take-over and of the end.
         goal_enu_m: Goal (3,), m.
     """
@@ -74,7 +74,7 @@ def quality_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRecord:
-    """The sections of a result.json. A section without content is empty, or None if it is a value.
+    """The sections of a result.json. A missing section is empty, and a missing value is None.
 
     A mission that crashed or hung before it could write its record lacks most of them.
     """
@@ -118,7 +118,7 @@ class FlightRecord:
         return not (self.fault or self.detection)
 
 
-_SECTIONS = frozenset(each.name for each in fields(FlightRecord))
+_SECTIONS = frozenset(section.name for section in fields(FlightRecord))
 
 
 def record_of(result: Record) -> FlightRecord:
@@ -143,12 +143,12 @@ _PLACES = {
 
 
 def measures_of(record: Record) -> dict[str, Any]:
-    """All measures of a mission.
+    """Return all measures of a mission.
 
-    Beside those that are fields of the record: `straight_m`, from the take-off point to the edge of
-    the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
-    `first_bits`, when the fault was applied, and to what; `alarms`, those that are listed, oldest
-    first; `episodes`, alarms in a row counted once; and STRUCK.
+    They are the fields of the record; `straight_m`, the distance from the take-off point to the
+    edge of the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
+    `first_bits`, the time and place of the fault; `alarms`, the listed alarms, oldest first;
+    `episodes`, the number of runs of consecutive alarms; and STRUCK.
     """
     nodes, detection, fault = (record.get(name) or {} for name in ("nodes", "detection", "fault"))
     hit = _instruction(fault, nodes) if fault.get("level") == "instruction" else _source(fault)
@@ -169,12 +169,12 @@ def measures_of(record: Record) -> dict[str, Any]:
 
 
 def fields_of(record: Record) -> dict[str, Any]:
-    """The measures that are fields of a record."""
+    """Return the measures that are fields of a record."""
     return {name: _at(record, *place) for name, place in _PLACES.items()}
 
 
 def _at(record: Record, *place: str) -> Any:
-    """A field of a field; None where either is missing."""
+    """Return a field of a field; None if either is missing."""
     value: Any = record
     for name in place:
         value = (value or {}).get(name)
@@ -252,7 +252,9 @@ def _instruction(fault: Record, nodes: Record) -> dict[str, Any]:
         "struck_register": corruption.get("register") or corruption.get("site"),
         "struck_bits": [list(corruption["bits"])] if corruption else None,
         "strike_invocation": fault.get("invocation"),
-        "strikes": int(injection["applied"]) if injection else None,  # cut off: who knows
+        "strikes": int(injection["applied"])
+        if injection
+        else None,  # unknown, because the record was cut off
     }
     if not injection.get("applied"):
         return drawn
@@ -274,7 +276,7 @@ def _joined(values: Iterable[Any]) -> str:
 
 
 def _value(change: Record, when: str) -> Any:
-    """A value; what JSON cannot hold, infinities and NaN, from its bits."""
+    """Return a value, with infinities and NaN, which JSON lacks, restored from bits."""
     value, pattern = change[when], change[f"{when}_hex"]
     if value is not None:
         return value
@@ -298,17 +300,17 @@ _AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputati
 class DetectionCost:
     """Cost of a detector in one flight.
 
-    It is "the total detection and recomputation time for each mission" (paper, Table V). Checks
-    count with their time on the host of the flight. Recomputations count with their latency on the
-    flight's platform, in simulated time.
+    The cost is "the total detection and recomputation time for each mission" (paper, Table V).
+    Checks are measured in host time; recomputations in simulated time, by their latency on the
+    flight's platform.
 
     Attributes:
-        flight_s: Flight time, or simulated time of the whole mission if that is unknown, s.
+        flight_s: Flight time, or simulated time of the whole mission if the former is unknown, s.
         recomputations: Number of recomputations per stage. The record lists the first alarms and
             only counts the others, which are distributed over the stages in the same ratio.
             Numbers may therefore be fractions.
-        recovery_s: Simulated time of the recomputations per stage, each at the mean latency of its
-            kernels in this flight, s.
+        recovery_s: Simulated time of the recomputations per stage at the mean latency of the
+            stage's kernels in this flight, s.
     """
 
     detector: str

@@ -1,4 +1,4 @@
-"""Observers of a mission in flight: a `Watcher` of its progress, a `Recorder` of its inputs."""
+"""Observers of a flight: a `Watcher` of its progress and a `Recorder` of its inputs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Watcher:
 
 
 class Recorder:
-    """Records the briefing, and input and start stamp of every invocation by node."""
+    """Records the briefing, and the input and start stamp of every invocation, by node."""
 
     def __init__(self) -> None:
         self.briefing: Briefing | None = None
@@ -69,7 +69,7 @@ class Recorder:
 
 
 class FlightLogger:
-    """Detects events by comparing each tick with the last, and reports them to a watcher."""
+    """Detects events by comparing consecutive ticks, and reports them to a watcher."""
 
     def __init__(self, watcher: Watcher) -> None:
         self.events: list[Event] = []

@@ -1,4 +1,4 @@
-"""Flies one mission and writes its record: the function behind `mavfi fly`. Flies it again, too."""
+"""Flies one mission and writes its record (`mavfi fly`), or repeats a recorded one."""
 
 from __future__ import annotations
 
@@ -59,19 +59,19 @@ def fly_mission(
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
-    Every end of the flight, including a crash of the companion, is a result and is recorded.
+    Every end of the flight is recorded as a result, even a crash of the companion.
 
     Args:
-        out: where the run folder goes.
-        recorder: keeps what the flight asks of its nodes.
+        out: parent of the run folder.
+        recorder: records the inputs of the nodes.
         repeat: the record of an instruction-level fault to repeat, instead of drawing one.
         profiles: folder of the profiles of instruction-level faults; None for one in `out`.
-        for_debugger: called when the node waits for a debugger at the injected instruction.
+        for_debugger: called once the node waits for a debugger at the injected instruction.
         launch: starts the simulated vehicle.
 
     Raises:
-        MavfiError: the mission could not begin (unknown names, blocked start, no autopilot ...),
-            or its record could not be written.
+        MavfiError: the mission could not begin (unknown name, blocked start, no autopilot, ...), or
+            its record could not be written.
     """
     config = config.with_firmware()
     parts = CompanionParts.of(config)  # unknown names end here
@@ -110,7 +110,7 @@ def _plan_injection(
     repeat: FaultRecord | None,
     for_debugger: Callable[[int], None] | None,
 ) -> NoInjection:
-    """Plan the fault of a mission. Arguments as for `fly_mission`."""
+    """Plan the fault of a mission. The arguments are those of `fly_mission`."""
     if config.fault is not None:
         return SourceInjection(config.fault)
     if config.instruction is None:
@@ -138,7 +138,7 @@ def _begin(
     """Connect and brief the flight.
 
     Raises:
-        MavfiError: why it cannot fly; the vehicle's own reason where it has one.
+        MavfiError: the flight cannot begin; the vehicle's own reason takes precedence.
     """
     try:
         flight.connect()
@@ -155,7 +155,7 @@ def _begin(
 
 
 def _fly(flight: Flight, tlog: Path) -> str | None:
-    """Fly to the end. A crash of the companion's software is an outcome: returns its traceback."""
+    """Fly to the end; return the traceback if the companion's software crashed."""
     try:
         flight.fly(tlog)
     except MavfiError:
@@ -170,7 +170,7 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 
 
 def _host(config: MissionConfig, flight: Flight, truth: FlightTruth | None) -> dict[str, Any]:
-    """Return what this machine did for the flight, which no repetition repeats."""
+    """Return measurements of this machine, which differ between repetitions."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     of_vehicle = {} if truth is None else truth.stage_wall_s
     walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": of_vehicle}
@@ -286,7 +286,7 @@ def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
 
 
 def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
-    """Fly a mission that is of no use unless it is flown to its end. Options as for `fly_mission`.
+    """Fly a mission that must not be interrupted. The options are those of `fly_mission`.
 
     Raises:
         Interrupted: The user ended it. Nothing of it is kept.
@@ -295,15 +295,15 @@ def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
     flown = load_run(fly_mission(config, out, Watcher(), **options).path)
     if flown.record.interrupted:
         shutil.rmtree(flown.folder.path)
-        raise Interrupted("interrupted: the mission was not flown to its end")
+        raise Interrupted("interrupted before the mission ended")
     return flown
 
 
 def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
-    """Fly a golden run, from which faults or inputs are drawn. Raises as `fly_to_end`.
+    """Fly a golden run for drawing faults or inputs. Raises as `fly_to_end`.
 
     Raises:
-        VehicleProcessError: The vehicle died, so there is nothing to draw from.
+        VehicleProcessError: The vehicle died.
     """
     flown = fly_to_end(config, out, recorder=recorder)
     if flown.record.referee is None:
@@ -319,7 +319,7 @@ def fly_again(
     firmware: str | None = None,
     **options: Any,
 ) -> Run:
-    """Repeat a run, or fly its golden run. Arguments as for `fly_mission`, raises as `fly_to_end`.
+    """Repeat a run or fly its golden run. Arguments as in `fly_mission`; raises as `fly_to_end`.
 
     Args:
         firmware: as for `Run.mission`.
@@ -335,10 +335,10 @@ def fly_again(
 
 
 def watch_again(run: Run) -> tuple[Recorder, bool]:
-    """Repeat a run to see what its nodes received. Nothing of it is kept. Raises as `fly_again`.
+    """Repeat a run to capture the inputs of its nodes. Raises as `fly_again`.
 
     Returns:
-        Inputs of all nodes, and whether the repetition has the same trace, as it has unless the
+        Inputs of all nodes, and whether the repetition has the same trace. It differs only if the
         software or the machine differs.
     """
     recorder = Recorder()
@@ -349,11 +349,11 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
 
 
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
-    """Return the golden run of a run. It is flown once and kept in the run's folder.
+    """Return the golden run of a run, which is flown once and kept in the run's folder.
 
     Args:
         run: Run with a fault.
-        note: Callback with a message before the golden run is flown.
+        note: Called with a message before the golden run is flown.
 
     Raises:
         RecordError: The run is not repeatable, or its folder cannot be written.

@@ -1,4 +1,4 @@
-"""The folder of one run: its tables, and the run that is read from it and compared."""
+"""Reads and writes the folder of one run, and compares runs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpo
 
 
 class RunFolder:
-    """Paths in a run folder, and the tables of plans and kernels."""
+    """Paths of a run folder, with its tables of plans and kernels."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -67,7 +67,7 @@ class RunFolder:
 
     @classmethod
     def new(cls, parent: Path, world: str, seed: int) -> RunFolder:
-        """Create an empty folder `<world>-<seed>-<number>`; safe for parallel missions.
+        """Create an empty folder `<world>-<seed>-<number>`. Parallel missions may do so safely.
 
         Characters of the world's name that are unfit for paths are replaced.
 
@@ -91,7 +91,7 @@ class RunFolder:
         raise AssertionError("unreachable")
 
     def write_plans(self, plans: Sequence[Trajectory]) -> None:
-        """Write all plans, as received by the mission logic: one row per waypoint."""
+        """Write all plans that the mission logic received, with one row per waypoint."""
         import pyarrow as pa
 
         lengths = [len(plan.waypoints) for plan in plans]
@@ -106,7 +106,7 @@ class RunFolder:
         write_parquet(self.plans, pa.table(columns))
 
     def read_plans(self) -> list[Trajectory]:
-        """Read plans. The file does not contain plans without waypoints.
+        """Read plans, except plans without waypoints, which the file does not contain.
 
         Raises:
             RecordError: The file is missing, damaged, or of another format.
@@ -224,8 +224,8 @@ class Trace:
         """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
 
         The stamps of report and trajectory and the index of the waypoint identify the messages of
-        the states. A state is null before its first message. Truth is joined by stamp; between the
-        referee's rows, where only foreign autopilots have stamps, it is interpolated.
+        the states. A state is null before its first message. Truth is joined by stamp. Foreign
+        autopilots also have stamps between the referee's rows, where truth is interpolated.
         """
         import pyarrow as pa
 
@@ -271,7 +271,7 @@ class Trace:
 
 
 def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> FloatArray:
-    """Interpolate linearly; a value at share 0 stays as it is, also if it is infinite."""
+    """Interpolate linearly; a share of 0 returns the first value, even if it is infinite."""
     with np.errstate(invalid="ignore"):
         mixed: FloatArray = np.where(shares == 0.0, before, before + shares * (after - before))
     return mixed
@@ -295,7 +295,7 @@ class Run:
     """A run read from its folder.
 
     Attributes:
-        to_html: Returns summary and picture of a run; `mavfi_cli.library` sets it.
+        to_html: Renders summary and picture of a run; set by `mavfi_cli.library`.
     """
 
     to_html: ClassVar[Callable[[Run], str] | None] = None
@@ -307,7 +307,7 @@ class Run:
         return f"Run({str(self.folder.path)!r}, outcome={self.record.outcome!r})"
 
     def _repr_html_(self) -> str | None:
-        """Return what a notebook shows; None as long as the library is not loaded."""
+        """Return the notebook's view; None unless the library is loaded."""
         return None if Run.to_html is None else Run.to_html(self)
 
     @property
@@ -317,7 +317,7 @@ class Run:
 
     @property
     def golden(self) -> Run | None:
-        """The golden run that is kept in the folder; None if none was flown to its end."""
+        """The complete golden run in the folder; None if there is none."""
         path = self.folder.golden
         golden = load_run(path) if path.is_dir() else None
         return None if golden is None or golden.record.interrupted else golden
@@ -332,8 +332,8 @@ class Run:
 
         Raises:
             ConfigError: The run names another program.
-            RecordError: The run is not repeatable, because it flew a foreign autopilot, used
-                measured times, was interrupted by the user, or named a file that has changed since.
+            RecordError: The run is not repeatable: it flew a foreign autopilot, used measured
+                times, was interrupted by the user, or named a file that has changed since.
         """
         record, path, why = self.record, self.folder.path, ""
         if record.interrupted:
@@ -365,8 +365,8 @@ class Run:
         """Find the first difference between the traces of two runs; None if they are equal.
 
         Within a tick the columns are compared in the order of the pipeline: perception, planning,
-        control, then the vehicle. The referee's truth is ignored by default. Columns in `leave_out`
-        are ignored, too, and those that one run lacks.
+        control, then the vehicle. The referee's truth is ignored by default. Columns in
+        `leave_out`, and columns that one run lacks, are also ignored.
 
         Raises:
             RecordError: A run has no trace.
@@ -404,7 +404,7 @@ class Run:
     def largest_deviation_m(self, other: Run) -> float:
         """Return the largest distance between two vehicles at equal stamps, m; NaN without a trace.
 
-        A vehicle whose flight has ended stays where it is.
+        After the end of its flight, a vehicle keeps its last position.
         """
         if not (self.trace and other.trace):
             return float("nan")
@@ -420,7 +420,7 @@ def load_run(path: str | Path) -> Run:
     """Read a run from its folder or from the path of its result.json.
 
     Raises:
-        RecordError: There is no run, or it was cut off before its end or is damaged.
+        RecordError: The run is missing, incomplete or damaged.
     """
     path = Path(path)
     folder = RunFolder(path.parent if path.name == RESULT else path)

@@ -1,8 +1,8 @@
-"""The simulated vehicle of a mission: in the mission's own process, or beside it in another.
+"""The simulated vehicle of a mission, in the mission's process or in another.
 
-Either way companion and vehicle share the bytes of a MAVLink link. The vehicle gives its briefing
-before its first message, and the referee's truth at the end: as objects in this process, or in the
-files of another. This is the only module of the companion's side that imports the vehicle's.
+Either way companion and vehicle share the bytes of a MAVLink link. The vehicle provides its
+briefing before its first message and the referee's truth at the end: as objects in this process, or
+as files of another. This is the only module of the companion's side that imports the vehicle's.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Vehicle(ABC):
 
     Attributes:
         link: The companion's end of the link.
-        truth: What the referee saw; None before the end, or if the vehicle died before it.
+        truth: The referee's log; None before the end, or if the vehicle died.
     """
 
     link: Transport
@@ -61,17 +61,17 @@ class Vehicle(ABC):
 
     @abstractmethod
     def end(self) -> VehicleProcessError | None:
-        """Close the link and set the truth. Return why the vehicle ended before that, if it did.
+        """Close the link and set the truth. Return the reason if the vehicle ended earlier.
 
         May be called repeatedly.
         """
 
 
 class VehicleInProcess(Vehicle):
-    """The vehicle in this process; it flies while the companion waits for it.
+    """The vehicle in this process, which simulates while the companion waits for it.
 
     Raises:
-        MavfiError: The world, the vehicle, the start or the goal cannot be used.
+        MavfiError: The world, the vehicle, the start or the goal is invalid.
     """
 
     def __init__(self, config: MissionConfig) -> None:
@@ -97,7 +97,7 @@ class VehicleInProcess(Vehicle):
 
     @staticmethod
     def warm_up() -> None:
-        """Load and compile all that a vehicle in this process needs."""
+        """Load and compile everything that a vehicle in this process needs."""
         from sitl.server import warm_up
 
         warm_up()
@@ -126,7 +126,7 @@ def _at_flight_levels(briefing: Briefing) -> Briefing:
 
 
 def read_briefing(folder: Path) -> Briefing:
-    """Read the briefing that a vehicle in another process has left.
+    """Read the briefing that a vehicle process wrote.
 
     Raises:
         VehicleProcessError: There is none.
@@ -140,7 +140,7 @@ def read_briefing(folder: Path) -> Briefing:
 
 
 def _read_truth(folder: Path) -> FlightTruth | None:
-    """Read the truth that a vehicle in another process has left; None if it has not."""
+    """Read the truth that a vehicle process wrote; None if there is none."""
     report, host = folder / "truth.json", folder / "host.json"
     if not report.is_file():
         return None
@@ -183,7 +183,7 @@ class VehicleProcess(Vehicle):
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
-        """Return module and arguments of the process, which speaks on the descriptor."""
+        """Return module and arguments of the process, given the descriptor of its link."""
         line = ["sitl", *_arguments(config), "--fd", str(descriptor)]
         if config.autopilot == OWN_AUTOPILOT:  # real firmware is paced by the wall clock alone
             line.append("--lockstep")
@@ -241,7 +241,7 @@ class _EyesProcess(VehicleProcess):
 
 
 def _arguments(config: MissionConfig) -> list[str]:
-    """Return the arguments of `python -m sitl`, but for the link and the folder of the truth."""
+    """Return the arguments of `python -m sitl`, except the link and the folder of the truth."""
     line = _of_the_world(config, "--camera-size", "--camera-rate")
     if config.autopilot != OWN_AUTOPILOT:
         line += ["--hil" if config.autopilot == "px4" else "--json", config.autopilot]
@@ -251,7 +251,7 @@ def _arguments(config: MissionConfig) -> list[str]:
 
 
 def _of_the_world(config: MissionConfig, size: str, rate: str) -> list[str]:
-    """Return the options of world, vehicle and camera; those of the camera have other names."""
+    """Return the options of world, vehicle and camera."""
     return [
         "--world", config.world, "--seed", str(config.seed_of_world), "--vehicle", config.vehicle,
         size, f"{config.camera_columns}x{config.camera_rows}", rate, repr(config.camera_rate_hz),
@@ -271,7 +271,7 @@ StartVehicle = Callable[[MissionConfig], Vehicle]
 def other_end(
     config: MissionConfig, launch: StartVehicle = Vehicle.start
 ) -> Iterator[tuple[Transport, Vehicle | None]]:
-    """Connect to a mission's foreign autopilot, or else to a simulated vehicle that starts.
+    """Connect to the mission's foreign autopilot, or start and connect to a simulated vehicle.
 
     Raises:
         MavfiError: The link cannot be opened, or the vehicle cannot start.

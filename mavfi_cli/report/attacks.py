@@ -372,7 +372,7 @@ def _input(runs: TargetRuns, number: int) -> _InputCounts:
     profile, golden = runs.profiles[number], runs.goldens[number]
     length = None if profile is None else profile.instructions
     return _InputCounts(
-        population="moments of one call" if profile is None else profile.in_words(),
+        population="moments of one call" if profile is None else profile.describe(),
         complete=None if profile is None else profile.complete,
         instructions=None if length is None else length.value,
         instructions95=None if length is None else [length.low, _finite(length.high)],

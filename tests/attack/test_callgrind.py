@@ -91,7 +91,7 @@ def test_a_long_program_is_attacked_whole(native_program):
 
 
 def test_it_tells_how_fast_callgrind_counts_and_when_it_ends(native_program, monkeypatch):
-    monkeypatch.setattr(callgrind, "_TOLD_EVERY_S", 0.01)
+    monkeypatch.setattr(callgrind, "_REPORT_EVERY_S", 0.01)
     monkeypatch.setattr(callgrind, "_BLOCKS", 50_000)
     told = []
     command = Program.of([str(native_program("counting")), "100000"])

@@ -223,5 +223,5 @@ def test_what_can_be_compared():
     assert OutputComparison.of(["file:./out.txt"]).files == ("out.txt",)
     assert OutputComparison.of([]) == OutputComparison.of(["stdout"]) == OutputComparison()
     assert OutputComparison.of(["stdout", "file:a", "stdout"]).to_json()["file"] == [None, "a"]
-    with pytest.raises(ConfigError, match="known: stdout, file:PATH"):
+    with pytest.raises(ConfigError, match="must be stdout or file:PATH"):
         OutputComparison.of(["stderr"])

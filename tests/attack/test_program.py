@@ -338,7 +338,7 @@ def test_a_folder_does_not_choose_the_program_that_is_executed(replayed, tmp_pat
         (folder / "plan.json").write_text(json.dumps(plan | changes))
 
     hostile(program=["/usr/bin/touch", str(struck)])
-    assert "which would be executed: if it is yours" in str(replay(program=()).exception)
+    assert "which would be executed" in str(replay(program=()).exception)
     assert "it differs in ['program']" in str(replay().exception)
     hostile(environment={"LD_PRELOAD": "/tmp/theirs.so"})
     assert "it differs in ['environment']" in str(replay().exception)
@@ -359,7 +359,7 @@ def test_a_campaign_that_was_cut_off_goes_on(target, tmp_path):
     assert sorted(read_runs(tmp_path), key=itemgetter("run")) == list(second)
     assert second[:3] == first[:3]
     assert [entry["outcome"] for entry in second[:6]] == [entry["outcome"] for entry in first]
-    with pytest.raises(ConfigError, match="holds 8 runs already, 7 are asked for"):
+    with pytest.raises(ConfigError, match=r"holds 8 runs already: .* got 7"):
         go_on(7)
     with pytest.raises(ConfigError, match=r"another campaign; it differs in \['seed'\]"):
         go_on(8, seed=10)

@@ -197,7 +197,7 @@ def refused(mavfi, tmp_path):
         ('world = "farm"', 'world = "fram"', "unknown world 'fram'; did you mean 'farm'?"),
         ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
         ('world = "farm"', "world = []", "factors.world: an empty list of values"),
-        ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, is 0"),
+        ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, got 0"),
         ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
         ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
         ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt'; did you mean 'rrt'?"),
@@ -292,7 +292,7 @@ def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch
     for line in (("run", "fig8"), ("run", "fig8", "--scale", "0.01"), ("status", "fig8"),
                  ("export", "fig8", "-"), ("draw", "fig8", "--output", "pair.svg")):  # fmt: skip
         said = str(called(*line).exception)
-        assert "fig8 is a preset, and ./fig8 holds a campaign: say ./fig8" in said
+        assert "fig8 is a preset, and ./fig8 holds a campaign: use ./fig8" in said
         assert "campaigns/fig8" in said
     assert not (tmp_path / "campaigns").exists()
     assert called("plan", "fig8", "--scale", "0.01").exit_code == 0  # the preset: nothing is flown

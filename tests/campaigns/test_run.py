@@ -140,7 +140,7 @@ def test_a_mission_killed_from_outside_is_begun_again(campaign):
 
 
 def test_a_mission_killed_each_time_stays_missing(campaign):
-    with pytest.raises(CampaignStopped, match="1 missions were ended from outside 3 times"):
+    with pytest.raises(CampaignStopped, match="1 missions were killed from outside 3 times"):
         campaign.run(planned("fly", f"signal:{int(signal.SIGKILL)}"))
     with Ledger(campaign.folder) as ledger:
         assert [number for number, *_ in ledger.missing()] == [1]
@@ -148,7 +148,7 @@ def test_a_mission_killed_each_time_stays_missing(campaign):
 
 @pytest.mark.parametrize("world", ["end:link_lost", "untrue", "vehicle"])
 def test_a_mission_whose_vehicle_is_killed_each_time_is_still_to_be_flown(campaign, world):
-    with pytest.raises(CampaignStopped, match="1 missions were ended from outside 3 times"):
+    with pytest.raises(CampaignStopped, match="1 missions were killed from outside 3 times"):
         campaign.run(planned("fly", world))
     with Ledger(campaign.folder) as ledger:
         assert [number for number, *_ in ledger.missing()] == [1]
@@ -326,7 +326,7 @@ class Interrupting(Spectator):
 def test_ctrl_c_once_lets_missions_finish(campaign):
     campaign.notes = notes = Interrupting(1)
     missions = planned("sleep:1.5", "sleep:1.5", "fly")
-    with pytest.raises(Interrupted, match="run again to go on"):
+    with pytest.raises(Interrupted, match="run again to continue"):
         campaign.run(missions)
     assert notes.lines == ["finishing what flies; Ctrl-C once more ends it"]
     with Ledger(campaign.folder) as ledger:

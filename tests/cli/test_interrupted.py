@@ -17,7 +17,7 @@ from mavfi_cli.mission.run import paired_golden
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
-CUT_OFF = "interrupted: the mission was not flown to its end"
+CUT_OFF = "interrupted before the mission ended"
 traced = pytest.mark.skipif(
     not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
 )

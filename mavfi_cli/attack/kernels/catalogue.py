@@ -1,4 +1,4 @@
-"""The kernels that can be attacked in isolation: how they are called and their outputs compared."""
+"""The kernels that can be attacked in isolation: how to call them and compare their outputs."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ Output = dict[str, Array | Callable[[], Array]]
 Numbers = dict[str, Array]
 
 Call = Callable[[], Output]
-_FILLED_MB_PER_S = 512  # by a loop that allocates, at least
-_POSES = 5  # from which the collision check looks ahead
-_SMALL = 1e-6  # relative difference of numbers that nobody notices
+_FILLED_MB_PER_S = 512  # least rate of a loop that allocates
+_POSES = 5  # number of poses from which the collision check looks ahead
+_SMALL = 1e-6  # largest unnoticeable relative difference of numbers
 _HALF_A_VOXEL_M = 0.1  # finer than the map; also of a path
 _A_TICK_S = 0.1  # of a foreseen collision
 
@@ -62,7 +62,7 @@ def unpack(data: bytes) -> Numbers:
     """Read what `pack` wrote.
 
     Raises:
-        ValueError: the bytes are something else.
+        ValueError: the bytes are not a packed output.
     """
     buffer, output = io.BytesIO(data), {}
     try:
@@ -108,9 +108,10 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def _maps(golden: Numbers, output: Numbers) -> Difference:
-    """Number of nodes of the tree that are there only once or have another log-odds value.
+    """Compare two trees: number of nodes that only one has or whose log-odds differ.
 
-    It is noticeable if another voxel is occupied, in the tree or in the planner's map.
+    The difference is noticeable if the sets of occupied voxels differ, in the tree or in the
+    planner's map.
     """
     ours, theirs = _read_tree(golden["tree"].tobytes()), _read_tree(output["tree"].tobytes())
     if theirs is None or ours is None:
@@ -148,9 +149,9 @@ def _occupied(output: Numbers) -> set[tuple[int, int, int]]:
 
 
 def _checks(golden: Numbers, output: Numbers) -> Difference:
-    """Difference of the foreseen collisions, pose by pose.
+    """Compare the predicted collisions pose by pose.
 
-    A collision that is missed or made up is noticeable, and a gap in time above `_A_TICK_S`.
+    A missed or spurious collision is noticeable, and so is a shift in time above `_A_TICK_S`.
     """
     difference = _numbers(golden, output)
     times, others = golden["time_to_collision_s"], output.get("time_to_collision_s")
@@ -174,9 +175,9 @@ def _checks(golden: Numbers, output: Numbers) -> Difference:
 
 
 def _paths(golden: Numbers, output: Numbers) -> Difference:
-    """Difference of a planned path in length, and how far apart the two paths are, m.
+    """Compare two planned paths by their lengths and by the largest distance between them, m.
 
-    It is noticeable if either is above `_HALF_A_VOXEL_M`.
+    The difference is noticeable if either exceeds `_HALF_A_VOXEL_M`.
     """
     path, another = golden["path_enu_m"], output["path_enu_m"]
     ours, theirs = path.astype(np.float64), another.astype(np.float64)
@@ -202,7 +203,7 @@ def _length(path: NDArray[np.float64]) -> float:
 
 
 def _farthest(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """The largest distance of a vertex of one path (n, 3) from the other (m, 3)."""
+    """Return the largest distance of a vertex of one path (n, 3) from the other (m, 3)."""
     begins, steps = other[:-1], np.diff(other, axis=0)
     if not len(steps):
         begins, steps = other, np.zeros_like(other)
@@ -240,9 +241,9 @@ class _Tree:
         return (self.codes << 5) | self.depths
 
     def difference(self, other: _Tree) -> tuple[int, float]:
-        """Number of nodes that differ, and the largest difference of a log-odds value.
+        """Return the number of differing nodes and the largest difference of log-odds.
 
-        A node differs if only one tree has it, or has it as a leaf, or has another value.
+        A node differs if only one tree contains it or has it as a leaf, or if its values differ.
         """
         _, ours, theirs = np.intersect1d(
             self._keys, other._keys, assume_unique=True, return_indices=True
@@ -255,7 +256,7 @@ class _Tree:
         return alone + int(differs.sum()), float(gaps[np.isfinite(gaps)].max(initial=0.0))
 
     def occupied_but_not_in(self, other: _Tree) -> int:
-        """Number of occupied leaves whose first voxel is free or unknown in the other tree."""
+        """Count occupied leaves whose first voxel is free or unknown in the other tree."""
         occupied = self.codes[self.leaf & (self.values >= 0.0)]
         begins = other.codes[other.leaf]
         sizes = np.int64(1) << (3 * (TREE_DEPTH - other.depths[other.leaf]))
@@ -266,7 +267,7 @@ class _Tree:
 
 
 def _read_tree(data: bytes) -> _Tree | None:
-    """Read a tree from the bytes of an `.ot` file; None if they are no tree."""
+    """Read a tree from the bytes of an `.ot` file; None if they are malformed."""
     _, marker, nodes = data.partition(b"\ndata\n")
     if not marker or not nodes or len(nodes) % _NODE.itemsize:
         return None
@@ -289,7 +290,7 @@ def _place_nodes(
 ) -> int:
     """Fill codes and depths (n,) of nodes in the order of the file.
 
-    Returns the number of nodes of a tree that these make up; 0 if they make up none.
+    Returns the number of nodes of the tree, or 0 if they do not form a tree.
     """
     stack = np.empty((8 * TREE_DEPTH + 8, 2), np.int64)
     stack[0, 0], stack[0, 1] = 0, 0
@@ -320,16 +321,16 @@ class Kernel:
     """One kernel with everything that an isolated run of it needs.
 
     Attributes:
-        name: as `--kernel` takes it.
-        title: as tables print it.
-        prepare: function from the inputs to a call; everything before the kernel itself runs here.
-        compare: function that returns the size of the difference of two outputs.
-        tolerance: which differences `compare` does not call noticeable, in words.
+        name: value of `--kernel`.
+        title: name in tables.
+        prepare: maps the inputs to a call, and does everything that precedes the kernel.
+        compare: returns the difference of two outputs.
+        tolerance: description of the differences that `compare` treats as unnoticeable.
         repeatable: true if the call leaves no state behind, so that calling it warms it up.
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
         inner: compiled functions at which windows begin, beside those of its scope.
-        code: for a plug-in kernel, function that returns entry and scope; called after it has run.
-        memory_mb: memory that a run may take beyond that of the loaded kernel.
+        code: returns entry and scope of a plug-in kernel; called after the kernel has run.
+        memory_mb: memory that a run may allocate beyond that of the loaded kernel, MB.
     """
 
     name: str
@@ -345,14 +346,14 @@ class Kernel:
 
     @property
     def hang_s(self) -> float:
-        """CPU time beyond its golden one after which a run hangs.
+        """CPU time beyond the golden run's after which a run counts as hung, s.
 
-        A runaway fills its memory three times as fast, so it ends as a crash, never as a hang.
+        A runaway allocation fills the memory three times as fast, so it crashes before it hangs.
         """
         return self.memory_mb / _FILLED_MB_PER_S
 
     def scope(self) -> KernelScope:
-        """The machine code that can be hit, in a process in which the kernel has run."""
+        """Return the machine code in scope, in a process in which the kernel has run."""
         from mavfi_cli.attack.kernels.scope import compiled_scope, kernel_scope
 
         scope = kernel_scope(self.name) if self.code is None else self.code()
@@ -491,7 +492,7 @@ def find(name: str) -> Kernel:
     """Find a kernel by its name, or the `KERNEL` of a user's Python file.
 
     Raises:
-        UnknownName: there is no such kernel; names the nearest.
+        UnknownName: there is no such kernel.
         TargetError: the file has no kernel.
     """
     if name.endswith(".py"):
@@ -515,17 +516,17 @@ def _own(path: Path) -> Kernel:
         raise TargetError(str(path), f"cannot be loaded: {error!r}") from None
     kernel = getattr(module, "KERNEL", None)
     if not isinstance(kernel, Kernel):
-        raise TargetError(str(path), "has no Kernel of the name KERNEL")
+        raise TargetError(str(path), "defines no Kernel named KERNEL")
     return kernel
 
 
 def select(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names by which `find` knows the kernels; all of ours if none is named.
+    """Return kernels by the names that `find` accepts; without names, all built-in ones.
 
-    Ours come first, in the order of the pipeline.
+    Built-in kernels come first, in the order of the pipeline.
 
     Raises:
-        UnknownName: there is no kernel of a name; names the nearest.
+        UnknownName: there is no kernel of a name.
         TargetError: a file has no kernel, or several kernels have one name.
     """
     chosen = list(names)

@@ -1,4 +1,4 @@
-"""Inputs of the kernels, from several moments of a golden run."""
+"""Inputs of the kernels, recorded at several moments of a golden run."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
     """Read inputs that `save_inputs` wrote, and the SHA-256 of the file.
 
     Raises:
-        RecordError: no such file, or it holds something else.
+        RecordError: the file is missing or not a file of kernel inputs.
     """
     data = read_inputs(path)
     try:
@@ -76,15 +76,15 @@ def load_inputs(path: Path) -> tuple[tuple[KernelInputs, ...], str]:
 
 
 def read_inputs(path: Path) -> bytes:
-    """Read the bytes of such a file. Raises RecordError."""
+    """Read the bytes of a file of inputs. Raises RecordError."""
     return read_bounded(path, _LARGEST)
 
 
 def inputs_of_bytes(data: bytes) -> tuple[KernelInputs, ...]:
-    """Read the inputs from the bytes of such a file.
+    """Unpack the inputs from the bytes of a file.
 
     Raises:
-        ValueError: the bytes are something else.
+        ValueError: the bytes do not hold kernel inputs.
     """
     inputs = unpack(data, _Stored).inputs
     if not inputs:

@@ -1,11 +1,11 @@
 """Native entry and code in scope of a kernel, for instruction-level faults.
 
-A planner has two scopes. In isolation the kernel is a search, OMPL's `solve`, because there always
-is one. In a mission the kernel is the planner node's work for one request, with or without a
-search (`node_scope`).
+A planner has two scopes. In isolation the kernel is the search, OMPL's `solve`, which always runs.
+In a mission the kernel is the planner node's work for one request, with or without a search
+(`node_scope`).
 
-Call these functions in the process in which the kernel runs, after it has run once
-(`autonomy.warm`): a just-in-time compiled kernel has an address only then. The result can be
+Call these functions in the kernel's process, after the kernel has run once (`autonomy.warm`):
+a just-in-time compiled kernel has no address before. The result can be
 sent to a tracer.
 """
 
@@ -34,7 +34,7 @@ PLANNERS = ("rrtstar", "rrt", "rrtconnect")
 KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
 
 # A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
-# The classes that every planner here calls belong to it too. Mangled name, and what ends its class.
+# The classes that all planners call belong to it too. Mangled name, and the end of its class.
 _OMPL = {"rrtstar": ("7RRTstar", ""), "rrt": ("3RRT", "E"), "rrtconnect": ("10RRTConnect", "")}
 _OMPL_SHARED = ("4ompl4base20RealVectorStateSpace", "4ompl4base29PathLengthOptimizationObjective")
 _OCTOMAP_INSERT = (
@@ -64,16 +64,16 @@ class KernelScope:
     """Entry and scope of one kernel in one process.
 
     Attributes:
-        entry: one execution of it counts as one invocation of the kernel. The collision check
-            enters once for every point that it tries. A planner node enters where a request begins.
+        entry: the instruction whose execution counts as one invocation of the kernel. The
+            collision check enters once per tested point. A planner node enters where a request
+            begins.
         objects: names of the objects in scope, regions included.
-        regions: for `Image`: compiled code without a file, and objects that are only partly in
-            scope.
+        regions: for `Image`: compiled code without a file, and objects partly in scope.
         inner: functions of the kernel. If it executes too many instructions to profile them all,
             invocations of these functions are sampled. For a planner node, windows that begin at
             them are sampled, and the first function is the search.
-        end: if it is there, nothing is attacked from its first execution on: only the output is
-            written then.
+        end: an optional instruction from whose first execution on nothing is attacked, because
+            only the output is written then.
     """
 
     kernel: str
@@ -101,7 +101,7 @@ def kernel_scope(kernel: str) -> KernelScope:
 
 
 def library_scope(library: str, function: str) -> KernelScope:
-    """Find entry and scope of a function of a shared library; all the library's code counts.
+    """Find entry and scope of a function of a shared library; all code of the library is in scope.
 
     Raises:
         UnknownName: no such library or function; names the nearest.
@@ -113,8 +113,8 @@ def library_scope(library: str, function: str) -> KernelScope:
 def compiled_scope(kernel: str, function: Any) -> KernelScope:
     """Find entry and scope of a function that numba compiled and that has run in this process.
 
-    Python calls this entry. The compiled object identifies the build, because the code in memory
-    contains addresses of the process.
+    Python calls this entry. The hash of the compiled object identifies the build, because the code
+    in memory contains addresses of the process.
 
     Args:
         kernel: Name of the kernel.
@@ -136,11 +136,11 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
 
 
 def node_scope(node: str, planner: str) -> KernelScope:
-    """Find entry and scope of the work of a mission's node, in this process.
+    """Find entry and scope of a mission node's work in this process.
 
     A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
-    after that is in scope up to the answer: each test whether a straight segment or a piece of the
-    trajectory is free, and the search if there is one.
+    after that is in scope up to the reply: the tests of straight segments and of pieces of the
+        trajectory, and the search if there is one.
 
     Raises:
         UnknownName: no such node or planner; names the nearest.
@@ -168,7 +168,7 @@ def _whole_request(search: KernelScope) -> KernelScope:
 
 
 def kernel_of_node(node: str, planner: str) -> str:
-    """The kernel that a mission's node runs; `planner` is the mission's."""
+    """Return the kernel that a node runs, given the mission's planner."""
     if node != "planner":
         return node
     name = planner.lower().replace("*", "star").replace("-", "").replace("_", "")
@@ -257,11 +257,11 @@ def _object_of(image: Image, prefix: str, folder: str = "") -> str:
     for name in image.names:
         if name.startswith(prefix) and folder in image.path_of(name):
             return name
-    raise FaultError(f"{prefix} is not loaded: run the kernel once before asking for its scope")
+    raise FaultError(f"{prefix} is not loaded: the kernel must run once before its scope is known")
 
 
 def _part(functions: Iterable[Function]) -> Part:
-    """The code of functions; code between two of them on the same page counts too."""
+    """Return the code of functions, including code between two of them on the same page."""
     spans: list[range] = []
     for function in functions:
         start, end = function.start, function.start + function.size
@@ -273,7 +273,7 @@ def _part(functions: Iterable[Function]) -> Part:
 
 
 def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) -> Region:
-    """The text of the compiled object; the whole executable mapping if no cache has it."""
+    """Return the text of the compiled object, or the whole mapping if it is not cached."""
     code = _cached_object(dispatcher, signature)
     if code is not None:
         elf: Any = ELFFile(io.BytesIO(code))
@@ -289,7 +289,7 @@ def _object_region(dispatcher: Any, signature: Any, wrapper: str, address: int) 
 
 
 def _cached_object(dispatcher: Any, signature: Any) -> bytes | None:
-    """The relocatable object from numba's cache, as it was loaded."""
+    """Return the loaded relocatable object from numba's cache; None if it is not there."""
     cache = getattr(dispatcher, "_cache", None)
     try:
         key = cache._index_key(signature, dispatcher.targetctx.codegen())  # type: ignore[union-attr]

@@ -1,7 +1,7 @@
 """One kernel as a target: a template process that forks itself for every run.
 
-This is the attacker's side of `attack.kernels.template`. It starts a stopped run, takes its output
-afterwards, and judges it in terms of what the kernel computes.
+This is the attacker's side of `attack.kernels.template`. It starts a stopped run, then reads its
+output and judges it by what the kernel computes.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class KernelTarget:
     """A kernel and its inputs.
 
     Attributes:
-        kernel: name of one of ours, or the file of a user's kernel.
-        inputs: file with inputs of one flight; `flight` names that flight in words.
+        kernel: name of a built-in kernel, or the file of a user's kernel.
+        inputs: file with inputs of one flight, which `flight` describes.
         tolerance: relative error of an output that still counts as benign.
     """
 
@@ -60,11 +60,11 @@ class KernelTarget:
 
     @property
     def stream(self) -> tuple[str, ...]:
-        """The kernel's own stream: its faults do not depend on which other kernels are attacked."""
+        """Name of the kernel's random stream: its faults do not depend on other kernels."""
         return (self.name,)
 
     def known(self) -> dict[str, Any]:
-        """Everything that its results depend on."""
+        """Return everything that determines the results."""
         return {
             "inputs_sha256": self.inputs_sha256,
             "flight": self.flight,
@@ -82,8 +82,8 @@ class _KernelPlace:
     """Runs one kernel in forks of one template; use it only in the thread that made it.
 
     Attributes:
-        inputs: one place for each input of the kernel, all of the same template, which belongs to
-            the first.
+        inputs: one place per input of the kernel. All share one template, which belongs to the
+            first.
     """
 
     kind = "kernel"
@@ -122,7 +122,7 @@ class _KernelPlace:
         return scope
 
     def start(self) -> Tracee:
-        """Start a run, attached and stopped, that has not called the kernel yet.
+        """Start a run, attached and stopped before its call of the kernel.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -153,7 +153,7 @@ class _KernelPlace:
     ) -> TargetProfile:
         """Step a golden run of the kernel, or a sample of it if it is too long.
 
-        The inputs share the windows, because each is a part of the campaign only.
+        The windows are divided among the inputs, because each input is one part of the campaign.
 
         Raises:
             TargetError: the kernel never enters its native code.
@@ -188,7 +188,7 @@ class _KernelPlace:
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:
-        """Times and output, or error, of the ended run; None if it is not complete."""
+        """Read times and output, or error, of the last run; None if they are incomplete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None

@@ -1,14 +1,14 @@
 """A warm process with one kernel and its inputs loaded, which forks itself for every run.
 
-The first message is the kernel's name and its inputs; the answer is their number. Later requests
-are bytes on the same socket. The answer to `ASK_SCOPE` is the kernel's scope. For every `RUN` and
-the number of an input, a child is forked: it sends its process id (4 bytes), waits for `GO`, calls
-the kernel once, writes its output to standard output, a file, and ends. The next request must not
-come before the child has ended. The file holds CPU seconds and duration of the call (two float64),
-then the packed output, or the error's text if the exit code is `RAISED`.
+The first message holds the kernel's name and its inputs; the reply is their number. Later requests
+are bytes on the same socket. The reply to `ASK_SCOPE` is the kernel's scope. `RUN` and the number
+of an input fork a child: it sends its process id (4 bytes), waits for `GO`, calls the kernel once,
+writes its output to standard output, which is a file, and ends. The next request must not come
+before the child has ended. The file holds CPU time and duration of the call (two float64, s), then
+the packed output, or the text of the error if the exit code is `RAISED`.
 
-Every run starts from the same memory: garbage collection is off, and nothing is kept here from one
-fork to the next.
+Every run starts from the same memory: garbage collection is off, and this process keeps no state
+between forks.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ def main() -> None:
         pack(call())
     _limit(kernel.memory_mb)
     send(connection, (len(calls), newest_cache_ns()))
-    sys.dont_write_bytecode = True  # the second run must not find what the first has compiled
+    sys.dont_write_bytecode = True  # the second run must not load what the first compiled
     gc.collect()
     gc.freeze()
     gc.disable()
     while request := connection.recv(1):
         if request == ASK_SCOPE:
-            status = _in_child(lambda: _tell_scope(connection, kernel, calls[0]))
+            status = _in_child(lambda: _send_scope(connection, kernel, calls[0]))
             if os.WIFSIGNALED(status):
                 _give_up(f"fails without a fault: signal {os.WTERMSIG(status)}")
             elif status:
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def _give_up(why: str) -> NoReturn:
-    """End without the libraries' own last messages, which would hide ours."""
+    """Exit without the libraries' own final messages, which would hide this one."""
     os.write(2, f"{why}\n".encode())
     os._exit(1)
 
@@ -78,7 +78,7 @@ def _in_child(work: Callable[[], int]) -> int:
 
 
 def _limit(extra_mb: int) -> None:
-    """A corrupted size must not exhaust the machine's memory."""
+    """Limit resources, so that a corrupted size cannot exhaust the machine's memory."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -88,17 +88,17 @@ def _limit(extra_mb: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
 
 
-def _tell_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
-    """Find the kernel's code in a child, because that changes the memory much."""
+def _send_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
+    """Send the kernel's scope. Runs in a child, because finding it alters the memory."""
     try:
         call()
         send(connection, kernel.scope())
     except Exception as error:  # the user's kernel may raise anything
-        _give_up(f"fails without a fault: {_in_words(error)}")
+        _give_up(f"fails without a fault: {_describe(error)}")
     return 0
 
 
-def _in_words(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
@@ -114,7 +114,7 @@ def _run(connection: socket.socket, call: Call) -> int:
         data = pack(output)
     except Exception as error:  # any error of the corrupted kernel is a result
         times = TIMES.pack(time.process_time() - cpu_s, time.perf_counter() - wall_s)
-        data, code = _in_words(error).encode(), RAISED
+        data, code = _describe(error).encode(), RAISED
     os.pwrite(OUTPUT, times + data, 0)
     return code
 

@@ -15,9 +15,9 @@ CACHE = ".profiles"  # folder in that of the runs
 
 
 def kept_in(folder: Path, golden: MissionConfig) -> Path:
-    """Return where a golden mission's orders and profiles are kept in their folder.
+    """Return the subfolder for a golden mission's orders and profiles.
 
-    The name is a hash of everything that the golden run depends on.
+    Its name is a hash of everything that determines the golden run.
     """
     parts = [
         json.dumps(golden.to_dict(), sort_keys=True),

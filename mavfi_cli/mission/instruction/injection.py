@@ -1,10 +1,10 @@
-"""Plans one exact instruction-level fault of a mission, and injects it beside the flight.
+"""Plans one exact instruction-level fault of a mission, and injects it during the flight.
 
-A node is a function of its orders. In a rehearsal a separate node gets the orders of the golden run
-again, without a flight, at the speed of the machine. It forks for the last of them as often as it
-is asked: each fork works on the order and ends instead of answering. The orders, the number of
-entries of each kernel, and each profile are kept below the output folder, under a hash of
-everything that they depend on. In the flight a tracer thread injects the fault.
+A node is a function of its orders. A rehearsal replays the orders of the golden run to a separate
+node, without a flight and as fast as the machine allows. For the last order the node forks
+repeatedly: a fork works on the order and exits instead of replying. Orders, numbers of kernel
+entries and profiles are kept below the output folder, under a hash of everything that determines
+them. In the flight a tracer thread injects the fault.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _LARGEST = 1 << 31  # bytes of a kept file
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GoldenOrders:
-    """The briefing of a golden run, and the orders that it gave, by node."""
+    """The briefing of a golden run, and its orders by node."""
 
     briefing: Briefing
     point_cloud: tuple[_Order[DepthFrame], ...] = ()
@@ -82,7 +82,7 @@ class GoldenOrders:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Entries:
-    """Entries of a kernel up to each order of its node."""
+    """Cumulative number of kernel entries at the end of every order of its node."""
 
     counts: tuple[int, ...]
 
@@ -176,11 +176,11 @@ def draw_invocation(
 ) -> _KernelInvocation:
     """Draw one invocation of a kernel uniformly from the entries up to each order.
 
-    Each entry is an invocation, except for a planner node. It is entered each time it builds an
-    obstacle grid, once or more in a request, and the request is the invocation.
+    Every entry is an invocation, except for a planner node: it is entered whenever it builds an
+    obstacle grid, at least once per request, and the request is the invocation.
 
     Args:
-        counts: entries up to each order of the golden run, ascending; not empty.
+        counts: cumulative entries at the end of every order of the golden run; not empty.
     """
     before = np.array([0, *counts[:-1]])
     if node != "planner":
@@ -210,12 +210,12 @@ def _is_sound(profile: TargetProfile) -> bool:
 def _kept(
     path: Path, kind: type[T], make: Callable[[], T], *, sound: Callable[[T], bool] = lambda _: True
 ) -> T:
-    """Read a value from its file; if that is not there or damaged, make the value and write it.
+    """Read a value from its file; if the file is missing or damaged, make the value and write it.
 
-    A value that is made is read back, so that it is the same as in every later mission.
+    A new value is read back, so that this mission gets the same value as all later ones.
 
     Args:
-        sound: False for a value that was not made by this program.
+        sound: Returns False for a value that this program cannot have made.
     """
     with contextlib.suppress(RecordError, ValueError):
         if sound(kept := unpack(read_bounded(path, _LARGEST), kind)):
@@ -232,8 +232,8 @@ class Rehearsal:
     """The `AttackPlace` in which one invocation of a node's kernel runs.
 
     Args:
-        orders: inputs and start stamps, up to the order with the invocation.
-        entry: number of the kernel's entry in that order with which it begins, from 1.
+        orders: inputs and start stamps up to the order that contains the invocation.
+        entry: number, from 1, of the kernel entry in that order that begins the invocation.
     """
 
     kind = "node"
@@ -258,7 +258,7 @@ class Rehearsal:
         """Count the kernel's entries up to the end of each order.
 
         Raises:
-            TracingForbidden: the operating system neither counts nor lets us trace.
+            TracingForbidden: the operating system allows neither counting nor tracing.
         """
         counts, address = [], self._image.address(self.scope_of_node.entry)
         with contextlib.closing(EntryCounter(self._spawned.pid, address)) as counter:
@@ -285,13 +285,13 @@ class Rehearsal:
         return self._image
 
     def scope(self, image: Image) -> Scope:
-        """The code that may be hit."""
+        """The code in scope."""
         return image.scope(self.scope_of_node.objects)
 
     def profile(self, rng: np.random.Generator) -> TargetProfile:
         """Step the invocation, or a sample of it.
 
-        It runs on the node's own processor: switching between two doubles the time.
+        Stepping runs on the node's processor, because switching between two doubles the time.
         """
         linux.share_processor(self._spawned.pid)
         node, inner = self._setup.node, self.scope_of_node.inner
@@ -325,9 +325,9 @@ class Rehearsal:
         """Profile one invocation of a node's kernel in the last of the orders.
 
         Args:
-            orders: the orders up to the one with the invocation.
-            entry: number of the kernel's entries when it begins, itself included.
-            earlier: number of them in the earlier orders.
+            orders: the orders up to the one that contains the invocation.
+            entry: number of the kernel entry that begins the invocation, from 1.
+            earlier: number of kernel entries in the earlier orders.
             rng: draws the sample, if only a sample is stepped.
 
         Raises:
@@ -380,7 +380,7 @@ class InstructionInjection(NoInjection):
         """Draw the fault of a mission from its golden flight.
 
         Args:
-            profiles: Folder in which golden flights and profiles are kept.
+            profiles: Folder of golden flights and profiles.
             fly_golden: Flies the golden mission, if its orders are not kept yet.
 
         Raises:
@@ -458,7 +458,7 @@ class InstructionInjection(NoInjection):
         return done
 
     def _ending(self) -> str | None:
-        """How the node ended, if the tracer was told."""
+        """Return how the node ended, if the tracer noticed it."""
         ended = None if self._tracer is None else self._tracer.result().ended
         if ended is None:
             return None
@@ -467,15 +467,15 @@ class InstructionInjection(NoInjection):
         return f"ended with code {ended.exit_code}"
 
     def _note_strike(self) -> None:
-        """Ask between two inputs of the node: the tick of the news must not depend on speed.
+        """Check for a strike between two inputs, so that its tick does not depend on speed.
 
-        A detector may have changed the flight before the fault. Then the trigger comes in another
-        invocation than planned, or never.
+        If a detector changed the flight before the fault, the trigger comes in another invocation
+        than planned, or never.
         """
         self._struck = self._struck or self._reached.is_set()
 
     def news(self) -> list[str]:
-        """The fault as text, once the struck invocation is over."""
+        """Describe the fault once the struck invocation has ended."""
         if self._reported or self._tracer is None or not self._struck:
             return []
         self._reported = True
@@ -483,7 +483,7 @@ class InstructionInjection(NoInjection):
         return [] if self._fault.corruption is None else [_attack_text(done.record)]
 
     def finish(self) -> dict[str, Any]:
-        """The record at the end of the mission: the same in every repetition."""
+        """Return the record at the end of the mission, which is the same in every repetition."""
         assert self._tracer is not None
         written = self._tracer.result().record
         injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
