@@ -41,13 +41,13 @@ def fly(
             and `detector` are their dataclasses or mappings with the same keys.
 
     Raises:
-        ConfigError: `MissionConfig` does not have this setting. Names the nearest.
+        ConfigError: `MissionConfig` has no such setting. The message names the nearest.
         ConfigError: A setting has the wrong type or is out of range.
         MavfiError: The mission could not begin, or its record could not be written.
     """
     mission = _mission(config, settings)
     require_folder(Path(out))
-    if mission.instruction is not None:  # the attacked node loads as long as this process
+    if mission.instruction is not None:  # the attacked node loads in parallel
         from mavfi_cli.attack.served import ServedProcess
         from mavfi_cli.mission.instruction import PROGRAM
 
@@ -94,17 +94,17 @@ class Campaign:
         """Return the table, which a notebook shows; None without pandas."""
         if find_spec("pandas") is None:
             return None
-        shown: str = self.to_pandas()._repr_html_()
-        return shown
+        html: str = self.to_pandas()._repr_html_()
+        return html
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the table as a pandas data frame.
 
         Raises:
-            MavfiError: pandas is not installed. Says how to install it.
+            MavfiError: pandas is not installed.
         """
         try:
-            import pandas  # noqa: F401  pyarrow's own error does not say what to install
+            import pandas  # noqa: F401  pyarrow's own error does not name the extra
         except ImportError:
             raise MavfiError(
                 "to_pandas needs pandas; install it with: pip install 'mavfi[pandas]'"
@@ -113,7 +113,7 @@ class Campaign:
 
 
 def campaign(what: str | Path) -> Campaign:
-    """Read a campaign, also while it runs.
+    """Read a campaign, even while it runs.
 
     Args:
         what: Folder or exported .parquet file of a campaign, or the preset or TOML file whose

@@ -1,1 +1,1 @@
-"""What a user asks for: mission, fault, detector, stack and platform, as plain values."""
+"""Configuration of mission, fault, detector, stack and platform, as plain values."""

@@ -27,13 +27,13 @@ class DetectorConfig:
     """The detector of a mission.
 
     Attributes:
-        name: Name of the detector: gad, aad, range, l2 or a plug-in.
+        name: gad, aad, range, l2 or the name of a plug-in.
         protect: Stages with watched states.
         threshold: Replaces the model's threshold; a number of sigmas for gad.
         model: Path of a model file; None selects the one shipped for the mission's stack.
         alarms_max: Number of consecutive alarms of planning or control at which the vehicle holds
             and replans; also the maximum number of consecutive reports that are withheld.
-        any_stack: Allow a model for another stack than the mission's.
+        any_stack: Allow a model that was fitted to another stack.
         watch: Watched states: `paper` for the 13 states, `extended` adds three more.
     """
 
@@ -64,7 +64,7 @@ class DetectorConfig:
     def with_model(
         cls, name: str, models: Path | None, protect: tuple[str, ...] = STAGES
     ) -> DetectorConfig:
-        """Take the model from a folder of files `NAME.json`; None: the shipped one.
+        """Return the detector with the model NAME.json of a folder, or the shipped one for None.
 
         Raises:
             ModelError: The folder has no such file.
@@ -106,7 +106,7 @@ class DetectorConfig:
             stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
 
         Raises:
-            UnknownName: No detector has this name. Suggests the nearest.
+            UnknownName: No detector has this name. The message suggests the nearest.
             ModelError: The model cannot be used, or is for another stack without `any_stack`.
             ConfigError: The threshold is out of range, or the model lacks ranges of extended
                 states.

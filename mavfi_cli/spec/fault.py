@@ -39,7 +39,7 @@ class FaultConfig:
         seed: Root seed of the fault's random streams.
         at: Trigger: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
         together: Corrupt all components of the group at once.
-        exact_bits: Bits to flip instead of drawn ones.
+        exact_bits: Bits to flip instead of randomly drawn ones.
     """
 
     target: str
@@ -79,10 +79,10 @@ class FaultConfig:
         return self.target.partition(".")[2] or None
 
     def words(self, struck: str | None = None) -> str:
-        """The fault as a title says it, such as "an exponent bit of waypoint x, stuck-at".
+        """Describe the fault for a title, such as "an exponent bit of waypoint x, stuck-at".
 
         Args:
-            struck: the state that was drawn from the target; None if none was.
+            struck: state that was drawn from the target, if any.
         """
         where = struck or self.target
         where = where.partition(".")[2] if self.strikes_queue and "." in where else where
@@ -117,9 +117,9 @@ class FaultConfig:
         if node not in KERNELS:
             raise UnknownName("node", node, KERNELS)
         if replace(self, seed=1, at="random") != FaultConfig(target=self.target):
-            raise FaultSpecError(f"{self.target}: a process that is killed has no bits")
+            raise FaultSpecError(f"{self.target}: a fault that kills a process takes no bits")
         if self.trigger().when is When.INVOCATION:
-            raise FaultSpecError(f"{self.target}: a process is killed at a time, tick or phase")
+            raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
 
     def check_within(self, time_limit_s: float) -> None:
         """Reject a trigger beyond the mission's time limit. Also raises as `trigger`.
@@ -131,8 +131,8 @@ class FaultConfig:
         at_s = trigger.number * _UNIT_S.get(trigger.when, 0.0)
         if at_s > time_limit_s:
             raise FaultSpecError(
-                f"at {self.at}: {at_s:g} s into the flight lies beyond the mission's time limit "
-                f"of {time_limit_s:g} s"
+                f"at {self.at}: must be within the mission's time limit of {time_limit_s:g} s, "
+                f"got {at_s:g} s"
             )
 
     def trigger(self) -> Trigger:
@@ -146,7 +146,7 @@ class FaultConfig:
 
         kind, _, value = self.at.partition("=")
         if not value and kind.replace(".", "", 1).isdigit():
-            raise FaultSpecError(f"at {kind}: a number needs its kind, as in time={kind} (s)")
+            raise FaultSpecError(f"at {kind}: must name its kind, as in time={kind} (s)")
         when = named_member(When, "trigger", kind)
         if when in (When.RANDOM, When.FORESEEN):
             return Trigger(when=when)
@@ -155,7 +155,9 @@ class FaultConfig:
         try:
             return Trigger(when=when, number=float(value))
         except ValueError:
-            raise FaultSpecError(f"{self.at!r}: {kind} needs a number, as in {kind}=12") from None
+            raise FaultSpecError(
+                f"at {kind}: must have a number, as in {kind}=12, got {self.at!r}"
+            ) from None
 
     def corruption(self) -> Corruption:
         """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
@@ -173,7 +175,7 @@ class FaultConfig:
 
         Raises:
             UnknownName: A name does not exist.
-            FaultError: Values do not fit together.
+            FaultError: Values contradict each other.
         """
         target = self.target
         if self.strikes_queue:
@@ -182,7 +184,7 @@ class FaultConfig:
                 raise UnknownName("state of control's queue", target, _QUEUED)
             if self.trigger().when is When.INVOCATION:
                 raise FaultSpecError(
-                    f"{self.target}: a queue is not a message, so it has no invocation"
+                    f"{self.target}: at must not be an invocation, which only messages have"
                 )
         return draw_fault(
             target,
@@ -195,7 +197,7 @@ class FaultConfig:
 
 
 def target_names(*, instruction: bool = False) -> list[str]:
-    """Return all injection sites of the level: nodes, or states, groups and processes."""
+    """Return all injection sites of a level: nodes, or states, groups and processes."""
     if instruction:
         return [*_NODES]
     stages = [stage.value for stage in Stage]
@@ -207,18 +209,18 @@ def target_names(*, instruction: bool = False) -> list[str]:
 
 def _check_seed(seed: int) -> None:
     if seed < 0:
-        raise FaultSpecError(f"the seed of a fault must be 0 or above, got {seed}")
+        raise FaultSpecError(f"the seed of a fault must be at least 0, got {seed}")
 
 
 def _bits_in_words(count: int, field: str) -> str:
-    """A number of bits of a field in words, such as "a bit", "an exponent bit", "3 bits"."""
+    """Describe a number of bits of a field, such as "a bit", "an exponent bit", "3 bits"."""
     kind = "bit" if field == Field.ANY.value else f"{field} bit"
     if count > 1:
         return f"{count} {kind}s"
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 
 
-UNIFORM = "instruction-uniform"  # the one rule whose draws can be repeated
+UNIFORM = "instruction-uniform"  # the only sampling rule whose draws are repeatable
 _NODES = {
     "perception": ("point_cloud", "octomap", "collision_check"),
     "planning": ("planner",),
@@ -233,12 +235,12 @@ class InstructionConfig:
     Attributes:
         target: Injection site: a node, or a stage from which a node is drawn.
         seed: Root seed of the fault's random streams.
-        sampling: Sampling rule. Missions reject rules by time, which are not repeatable.
-        compat: Choose registers and bits as another injector does. The time stays uniformly
+        sampling: Sampling rule. Missions reject rules by time because they are not repeatable.
+        compat: Injector whose choice of registers and bits is copied. The time remains uniformly
             distributed over executed instructions.
         sites, roles: Kinds of operands; empty for the default.
         bits: Number of distinct bits to flip.
-        null: Null injection: do everything except the flip.
+        null: Null injection, which does everything except the flip.
     """
 
     target: str
@@ -255,10 +257,10 @@ class InstructionConfig:
         _check_seed(self.seed)
 
     def words(self, struck: str | None = None) -> str:
-        """The fault as a title says it, such as "a bit in an instruction of octomap".
+        """Describe the fault for a title, such as "a bit in an instruction of octomap".
 
         Args:
-            struck: the node that was drawn from the target; None if none was.
+            struck: node that was drawn from the target, if any.
         """
         bits = "no bit" if self.null else _bits_in_words(self.bits, self.field)
         where = f" ({', '.join((*self.sites, *self.roles))})" if self.sites or self.roles else ""
@@ -276,7 +278,7 @@ class InstructionConfig:
         return nodes[int(Stream.FAULT.generator(self.seed, "node").integers(len(nodes)))]
 
     def sampling_name(self) -> str:
-        """Return the name of the population, which every report states."""
+        """Return the name of the population of instructions, which every report states."""
         if self.compat is not None:
             return f"{UNIFORM} with the operands and bits of {self.compat}"
         return self.sampling

@@ -1,4 +1,4 @@
-"""Configuration of a mission: one frozen record that suffices to repeat the flight."""
+"""Configuration of a mission: a frozen record from which the flight can be repeated."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ OWN_AUTOPILOT = "ours"
 _REPEATING = (OWN_AUTOPILOT, "ardupilot")  # autopilots whose flights repeat exactly
 _LOSS_LIMIT_S = 5.0
 _NEEDS_LINK = "needs --link, a link to a foreign autopilot"
-_SIMULATED = "the simulated vehicle, which a flight with --link does not have"
+_NOT_WITH_LINK = "cannot be combined with --link"
 OF_THE_WORLD = (
     "world", "world_seed", "vehicle", "start", "camera_columns", "camera_rows",
 )  # fmt: skip
-"""Settings of the world and of what is simulated in it."""
+"""Settings of the world and of the simulation in it."""
 
 NOT_OF_GOLDEN: Mapping[str, Any] = {
     "fault": None, "instruction": None, "detector": None, "isolate": (),
 }  # fmt: skip
-"""Settings that a golden mission lacks, with its values."""
+"""Settings that a golden mission does not have, and their values in it."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
 _REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
-MARGIN_M = 30.0  # flight bounds round home and goal without a known world
-_MOUNT_FLU_M = (0.1, 0.0, 0.0)  # of the stand-alone camera, unless it is told another one
+MARGIN_M = 30.0  # flight bounds around home and goal without a known world
+_MOUNT_FLU_M = (0.1, 0.0, 0.0)  # default of the stand-alone camera
 
 Vector3 = tuple[float, float, float]
 LIMITS = {  # minimum and maximum of each number
@@ -75,20 +75,20 @@ class MissionConfig:
         platform: Compute platform, or path of a TOML file; it gives the kernels their latencies.
         stack: Stack of the companion, as for `load_stack`.
         vehicle: Simulated vehicle, or path of a TOML file.
-        start, goal: None selects the world's own.
+        start, goal: Positions; None selects the world's.
         takeoff_height_m: Height at which the companion takes over.
         v_max_mps, a_max_mps2: Limits of planned trajectories.
-        goal_tolerance_m: None selects the stack's own.
+        goal_tolerance_m: Distance from the goal that counts as reached; None selects the stack's.
         time_limit_s: Simulated time from take-off after which the mission ends as `timeout`.
         map_resolution_m, map_range_m: Edge of a voxel; length of the longest ray in the map.
-        camera_columns, camera_rows, camera_rate_hz: Depth image, and how often it comes.
+        camera_columns, camera_rows, camera_rate_hz: Size and rate of the depth images.
         world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
         eyes: Start depth camera and referee of the world beside a foreign autopilot.
-        origin: Where the local origin of a foreign autopilot with `eyes` lies in the world; None
+        origin: Position in the world of the local origin of a foreign autopilot with `eyes`; None
             for the world's start.
-        autopilot: Which autopilot flies the simulated vehicle: ours, or real firmware.
-        firmware: SITL binary of a real autopilot; None for that of its environment variable.
+        autopilot: Autopilot of the simulated vehicle: `ours` or real firmware.
+        firmware: SITL binary of a real autopilot; None takes it from the environment variable.
         key_file: File with the signing passphrase of the link; None for an unsigned link.
         loss_limit_s: Time without a new state of a foreign autopilot after which the link counts as
             lost, on its clock and on the wall's, s.
@@ -150,7 +150,10 @@ class MissionConfig:
             if not all(abs(coordinate) <= _REMOTE_M for coordinate in place):
                 raise ConfigError(f"must be within {_REMOTE_M:g} m of the origin", key=name)
         if self.fault is not None and self.instruction is not None:
-            raise ConfigError("one mission takes one fault", key="instruction")
+            raise ConfigError(
+                "cannot be combined with a fault in a state: a mission takes one fault",
+                key="instruction",
+            )
         if self.fault is not None:
             self.fault.check_within(self.time_limit_s)
         self._check_link()
@@ -170,11 +173,11 @@ class MissionConfig:
                 if getattr(self, name) not in (False, None, _LOSS_LIMIT_S):
                     raise ConfigError(_NEEDS_LINK, key=name)
         if self.origin is not None and not self.eyes:
-            raise ConfigError("needs --eyes, without which there is no world", key="origin")
+            raise ConfigError("needs --eyes, which starts a world", key="origin")
         if self.link is None:
             return
         if self.realtime:
-            raise ConfigError(f"paces {_SIMULATED}", key="realtime")
+            raise ConfigError(_NOT_WITH_LINK, key="realtime")
         if self.eyes:
             return
         if self.goal is None:
@@ -189,14 +192,13 @@ class MissionConfig:
             return
         if not self.realtime and self.link is None:
             raise ConfigError(
-                f"{self.platform} needs --realtime: measured times differ from flight to flight, "
-                "and without it every flight repeats",
+                f"{self.platform} needs --realtime, because measured times differ between flights",
                 key="platform",
             )
         if self.isolate or self.instruction is not None:
             raise ConfigError(
-                f"{self.platform} measures the kernels in the companion's own process: leave out "
-                "isolate and --level instruction",
+                f"{self.platform} cannot be combined with isolate or --level instruction, because "
+                "it measures the kernels in the companion's own process",
                 key="platform",
             )
 
@@ -206,13 +208,13 @@ class MissionConfig:
         if self.autopilot == OWN_AUTOPILOT:
             return
         if self.link is not None:
-            raise ConfigError(f"flies {_SIMULATED}", key="autopilot")
+            raise ConfigError(_NOT_WITH_LINK, key="autopilot")
         repeats = self.autopilot in _REPEATING and not self.realtime
         if self.instruction is not None and not repeats:
             paced = " with --realtime" if self.realtime else ""
             raise ConfigError(
-                f"flights of {self.autopilot}{paced} do not repeat exactly, and --level "
-                "instruction needs that",
+                f"{self.autopilot}{paced} cannot be combined with --level instruction, because its "
+                "flights do not repeat exactly",
                 key="autopilot",
             )
 
@@ -224,7 +226,7 @@ class MissionConfig:
             del values["autopilot"], values["firmware"]
         if self.link is None:
             del values["loss_limit_s"], values["eyes"], values["origin"]
-        elif not self.eyes:  # nothing of a world took part
+        elif not self.eyes:  # the flight had no world
             values.update(dict.fromkeys(OF_THE_WORLD))
         return values
 
@@ -240,15 +242,15 @@ class MissionConfig:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of settings that may be user files, whose contents the mission depends on."""
+        """User files whose contents the mission depends on."""
         model = None if self.detector is None else self.detector.model
-        stack = self.stack.partition(":")[0]  # without the changes of a variant
+        stack = self.stack.partition(":")[0]  # without the differences of a variant
         named = (self.world, self.platform, stack, self.vehicle)
         files = tuple(name for name in named if name.endswith(".toml"))
         return files + tuple(name for name in (model, self.firmware) if name)
 
     def loaded_stack(self) -> Stack:
-        """Return the stack of the mission with its goal tolerance. Raises as `load_stack`."""
+        """Load the stack of the mission, with its goal tolerance. Raises as `load_stack`."""
         stack, own_m = load_stack(self.stack), self.goal_tolerance_m
         return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
 
@@ -271,10 +273,10 @@ class MissionConfig:
         return replace(self, firmware=path)
 
     def require_firmware(self, *known: str | None) -> None:
-        """Refuse a recorded mission whose firmware is none of the known programs.
+        """Refuse a recorded mission whose firmware is not a known program.
 
-        A record may be somebody else's, and flying it executes the program that it names. The
-        program of the environment variable is known.
+        Flying a record executes the program that it names, and a record is untrusted. The program
+        of the environment variable counts as known.
 
         Raises:
             ConfigError: The mission names another program.
@@ -286,13 +288,13 @@ class MissionConfig:
             if path and os.path.realpath(path) == os.path.realpath(self.firmware):
                 return
         raise ConfigError(
-            f"the record names the program {self.firmware}, which would be executed: if it is "
-            f"yours, name it with --firmware or in {variable or 'the environment'}",
+            f"the record would execute the program {self.firmware}; to allow it, name it with "
+            f"--firmware or in {variable or 'the environment'}",
             key="firmware",
         )
 
     def briefing(self, start_enu_m: FloatArray) -> Briefing:
-        """Build the briefing for a foreign autopilot without a known world, from its place (3,)."""
+        """Build the briefing for a foreign autopilot at a position (3,) without a known world."""
         goal = np.array(self.goal)
         low, high = np.minimum(goal, start_enu_m), np.maximum(goal, start_enu_m)
         bounds = np.concatenate([low - MARGIN_M, high + MARGIN_M])
@@ -311,7 +313,7 @@ class MissionConfig:
             tolerance_m: Distance from the goal that counts as reached.
 
         Raises:
-            ConfigError: The goal is invalid. Says why.
+            ConfigError: The goal is invalid.
         """
         start, goal = briefing.start_enu_m, briefing.goal_enu_m
         takeoff = np.add(start, (0.0, 0.0, self.takeoff_height_m))

@@ -1,9 +1,9 @@
 """Compute platforms: the latency of each kernel in simulated time. One TOML file per platform.
 
-A file either gives the latency of every kernel, or names a shipped platform as its `base` with a
-factor `scale` for each kernel or for the whole file.
+A file either gives the latency of every kernel, or names a shipped platform as its `base` and a
+factor `scale` for single kernels or for all.
 
-`measured:FACTOR` needs no file. Its latencies are the kernel times that the host measures in
+`measured:FACTOR` needs no file. Its latencies are the kernel times measured on the host in
 flight, times the factor. Such a flight is not repeatable.
 """
 
@@ -21,14 +21,14 @@ MEASURED = "measured"
 FACTORS = (0.01, 1000.0)  # minimum and maximum factor of a measured platform
 KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 _LONGEST_S = 3600.0
-LARGEST = 1.0e6  # maximum mass or power; a larger value has the wrong unit
+LARGEST = 1.0e6  # maximum mass or power; a larger value is probably in the wrong unit
 HARDWARE = ("mass_kg", "power_w", "heatsink_kgpw")
 PLATFORMS = Shipped("platform", Path(__file__).parent / "platforms")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _KernelLatency:
-    """Latency of one kernel, log-normally distributed round its median."""
+    """Latency of one kernel, log-normally distributed around its median."""
 
     latency_s: float  # median latency of an invocation
     spread: float = 0.0  # standard deviation of the natural logarithm of the latency
@@ -100,14 +100,14 @@ class _KernelEntry:
 
     def __post_init__(self) -> None:
         if (self.latency_s is None) is (self.scale is None):
-            raise ValueError("needs either latency_s or scale")
+            raise ValueError("must have either latency_s or scale")
         _check_scale(self.scale)
         _check_latency(self.latency_s or 0.0, self.spread or 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlatformFile:
-    """A platform's TOML file: the keys of `PlatformProfile`, with other kernels."""
+    """A platform's TOML file: the keys of `PlatformProfile`, with `_Entry` for kernels."""
 
     name: str  # of the platform
     cores: int  # number of nodes that compute at the same time
@@ -135,7 +135,7 @@ class _PlatformFile:
 
 def _check_latency(latency_s: float, spread: float) -> None:
     if latency_s < 0.0:
-        raise ValueError(f"latency_s must not be negative, got {latency_s:g}")
+        raise ValueError(f"latency_s must be at least 0, got {latency_s:g}")
     if latency_s > _LONGEST_S:
         raise ValueError(f"latency_s must be at most {_LONGEST_S:g}, got {latency_s:g}")
     if not 0.0 <= spread <= 2.0:
@@ -144,21 +144,21 @@ def _check_latency(latency_s: float, spread: float) -> None:
 
 def _check_scale(scale: float | None) -> None:
     if scale is not None and scale <= 0.0:
-        raise ValueError(f"scale must be above zero, got {scale:g}")
+        raise ValueError(f"scale must be above 0, got {scale:g}")
 
 
 def check_hardware(board: object) -> None:
     """Reject a board with negative or implausibly large mass or power.
 
     Raises:
-        ValueError: names the key and the value.
+        ValueError: a value is out of range; the message names the key.
     """
     for key in HARDWARE:
         value = getattr(board, key)
         if value < 0.0:
-            raise ValueError(f"{key}: must not be negative, is {value:g}")
+            raise ValueError(f"{key}: must be at least 0, got {value:g}")
         if value > LARGEST:
-            raise ValueError(f"{key}: must be at most {LARGEST:g}, is {value:g}")
+            raise ValueError(f"{key}: must be at most {LARGEST:g}, got {value:g}")
 
 
 def load_platform(name_or_path: str) -> PlatformProfile:
@@ -175,7 +175,7 @@ def load_platform(name_or_path: str) -> PlatformProfile:
     path = PLATFORMS.path(name_or_path)
     file = load_toml(path, _PlatformFile)
     base = load_platform(PLATFORMS.base(file.base, path)) if file.base else None
-    values = {each.name: getattr(file, each.name) for each in fields(file) if each.name != "scale"}
+    values = {key.name: getattr(file, key.name) for key in fields(file) if key.name != "scale"}
     given = {key: value for key, value in values.items() if value is not None}
     own = () if path.parent == PLATFORMS.folder else ("cores", *HARDWARE)
     set_here = {key: f"set in {path.name}" for key in own if key in given}
@@ -188,12 +188,12 @@ def load_platform(name_or_path: str) -> PlatformProfile:
 
 
 def _measured(factor: float) -> PlatformProfile:
-    source = f"this host's own times while it flies, x {factor:g}"
+    source = f"kernel times measured on this host in flight, x {factor:g}"
     return PlatformProfile(
         name=f"{MEASURED}:{factor:g}",
         cores=len(os.sched_getaffinity(0)),
         kernels=dict.fromkeys(KERNELS, _KernelLatency(latency_s=0.0, source=source)),
-        description=f"{source}; needs --realtime, and does not repeat",
+        description=f"{source}; needs --realtime; flights do not repeat",
         carried=False,
         measured_factor=factor,
     )
@@ -202,7 +202,7 @@ def _measured(factor: float) -> PlatformProfile:
 def _kernels(
     file: _PlatformFile, base: PlatformProfile | None, path: Path
 ) -> dict[str, _KernelLatency]:
-    """Return the latency of each kernel: its own entry, or the base's times the file's factor."""
+    """Return the latencies of the kernels: from their entries, or the base's times `scale`."""
     based = {} if base is None else base.kernels
     scaled = _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
     kernels = {}

@@ -21,10 +21,10 @@ from mavfi_cli.core.types import StackMark
 from mavfi_cli.spec.platform import KERNELS
 
 DEFAULT = "mavbench"
-FIRST = "hardened"  # stack of records without a stack
+FIRST = "hardened"  # stack of records that name none
 STACKS = Shipped("stack", Path(__file__).parent / "stacks")
 _ABOUT = ("name", "description", "base", "sources")
-_PAIR = re.compile(r",(?=\s*\w+\s*=)")  # separator of KEY=VALUE pairs; arrays have commas, too
+_PAIR = re.compile(r",(?=\s*\w+\s*=)")  # separator of KEY=VALUE pairs; arrays contain commas too
 _LIMITS = {  # minimum and maximum of each number
     "tracking_guard_m": (0.1, 1000.0),
     "farthest_waypoint_m": (10.0, 1.0e6),
@@ -55,7 +55,7 @@ class Stack:
         shifts_path_to_vehicle: The collision check translates the path so that it begins at the
             vehicle.
         owns_sequence_numbers: Planner, check and pilot keep their own counters and reject lower
-            numbers. Otherwise each continues the number of the other.
+            numbers. Otherwise they continue each other's numbers.
         stops_on_report: A predicted collision ends the plan and the vehicle stops. Otherwise it
             flies on, slows down or stops along the plan.
         uses_time_to_collision: The time to collision delays a stop until braking must begin, or
@@ -73,11 +73,11 @@ class Stack:
             keeps each waypoint's velocity, and no node reads accelerations.
         check_radius_m, planner_radius_m: Clearance of the collision check and of the planner.
         goal_tolerance_m: Distance from the goal that counts as reached.
-        arrives_at_rest: The vehicle must be at rest to have arrived.
-        turns_before_departure: The vehicle turns once round before the first plan.
+        arrives_at_rest: The vehicle has arrived only when it is at rest.
+        turns_before_departure: The vehicle makes one full turn before the first plan.
         rejected_plan_pause_s: Pause between a rejected plan and the next request.
         slows_where_blind: The vehicle flies at half speed outside its field of view.
-        sources: Source of the value of each key.
+        sources: Sources of the values, by key.
     """
 
     name: str  # of the stack; by default that of the file
@@ -115,48 +115,50 @@ class Stack:
         for key, (low, high) in _LIMITS.items():
             value = getattr(self, key)
             if not (math.isfinite(value) and low <= value <= high):
-                raise ValueError(f"{key}: must be within {low:g} and {high:g}, is {value:g}")
+                raise ValueError(f"{key}: must be within {low:g} and {high:g}, got {value:g}")
         self._check_processes()
         if self.planner_radius_m < self.check_radius_m:
             raise ValueError(
-                f"planner_radius_m: {self.planner_radius_m:g} is below check_radius_m, "
-                f"{self.check_radius_m:g}: the check would refuse what the planner has made"
+                f"planner_radius_m: must be at least check_radius_m, {self.check_radius_m:g}, or "
+                f"the check would reject every plan, got {self.planner_radius_m:g}"
             )
         if self.acts_on_report_once and not (self.stops_on_report or self.plans_in_motion):
             raise ValueError(
-                "acts_on_report_once: a vehicle that neither stops on a report nor plans in motion "
+                "acts_on_report_once: needs stops_on_report or plans_in_motion, or the vehicle "
                 "would fly on into the obstacle"
             )
         for key in self.sources:
             if key not in KEYS:
-                raise ValueError(f"sources.{key}: no such key")
+                raise ValueError(f"sources.{key}: unknown key")
 
     def _check_processes(self) -> None:
         seen: set[str] = set()
         for nodes in self.processes:
             if len(nodes) < 2:
-                raise ValueError("processes: a process that is shared has two nodes or more")
+                raise ValueError("processes: a shared process must have at least two nodes")
             for node in nodes:
                 if node not in KERNELS:
                     raise ValueError(f"processes: no node {node!r}; known: {', '.join(KERNELS)}")
                 if node == "control":
-                    raise ValueError("processes: control works in every tick, alone in its process")
+                    raise ValueError(
+                        "processes: control works in every tick, so it must be alone in its process"
+                    )
                 if node in seen:
                     raise ValueError(f"processes: {node} is in two of them")
                 seen.add(node)
 
     def settings_of(self, params: type) -> dict[str, Any]:
-        """Return the keys that the parameters of a kernel have by the same name, with values."""
-        return {each.name: getattr(self, each.name) for each in fields(params) if each.name in KEYS}
+        """Return the values of the keys that a kernel's parameters share by name."""
+        return {key.name: getattr(self, key.name) for key in fields(params) if key.name in KEYS}
 
     @property
     def mark(self) -> StackMark:
-        """Return the identity of the stack for a detector's model."""
+        """Return the identity of the stack, which a detector's model stores."""
         text = json.dumps(self.settings_of(Stack), sort_keys=True)
         return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
 
 
-KEYS: tuple[str, ...] = tuple(each.name for each in fields(Stack) if each.name not in _ABOUT)
+KEYS: tuple[str, ...] = tuple(key.name for key in fields(Stack) if key.name not in _ABOUT)
 
 
 def load_stack(text: str) -> Stack:

@@ -1,4 +1,4 @@
-"""Contract suites for plug-ins, for pytest. A plug-in's author subclasses one in a test module.
+"""Contract suites for plug-ins, run by pytest. Subclass one in a test module.
 
 from mavfi_cli.testing import PlannerContract
 
@@ -8,7 +8,7 @@ class TestMine(PlannerContract):
 
 import pytest
 
-# Before the import: else a failed assertion is not explained.
+# Before the import, so that pytest explains failed assertions.
 pytest.register_assert_rewrite("mavfi_cli.testing.suites")
 
 from mavfi_cli.testing.suites import (  # noqa: E402

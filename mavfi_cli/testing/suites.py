@@ -1,4 +1,4 @@
-"""What every detector, planner and transport must do, whoever wrote it."""
+"""Contract tests of detectors, planners and transports."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _single(place: int, delta: int) -> Deltas:
 
 
 def _samples(count: int = 60, seed: int = 3) -> Deltas:
-    """Return small changes, as flights have them, and a few large ones."""
+    """Return small changes, as in flights, and a few large ones."""
     rng = np.random.default_rng(seed)
     drawn = rng.integers(-2, 3, size=(count, COUNT)) * (rng.random((count, COUNT)) < 0.2)
     drawn[::10] *= 100
@@ -55,13 +55,13 @@ def _alarms(detector: Detector, deltas: Deltas, stage: Stage) -> bool:
 
 
 def _run(detector: Detector, rows: Iterable[Deltas]) -> list[float]:
-    found = []
+    scores = []
     for number, deltas in enumerate(rows):
         stage = _STAGES[number % 3]
-        found.append(detector.score(deltas, stage))
-        if not found[-1] > detector.threshold:
+        scores.append(detector.score(deltas, stage))
+        if not scores[-1] > detector.threshold:
             detector.learn(deltas, stage)
-    return found
+    return scores
 
 
 class DetectorContract:
@@ -168,9 +168,7 @@ class DetectorContract:
         assert _run(twin, _samples(seed=5)) == _run(detector, _samples(seed=5))
         if isinstance(detector, FittedDetector):
             assert (twin.stack, twin.extended) == (detector.stack, detector.extended)
-        for (
-            array
-        ) in twin.memory.values():  # the twin's memory is its own, and is what it decides by
+        for array in twin.memory.values():  # the twin decides by its own memory
             array[...] = np.nan if array.dtype.kind == "f" else 0
         assert np.isfinite(detector.threshold)
         assert _alarms(twin, _single(0, 1000), Stage.PERCEPTION)
@@ -192,11 +190,11 @@ class DetectorContract:
                 assert detector.stack is not None
                 assert detector.stack.name == stack
 
-    def test_no_model_flies_a_stack_that_it_was_not_fitted_to_unless_that_is_asked_for(
+    def test_no_model_flies_a_stack_that_it_was_not_fitted_to_unless_allowed(
         self, name: str
     ) -> None:
-        asked = DetectorConfig(name=name, any_stack=True)
-        assert asked.built("mavbench-release").name == name
+        config = DetectorConfig(name=name, any_stack=True)
+        assert config.built("mavbench-release").name == name
         if isinstance(base.find_detector(name), FittedDetector):
             with pytest.raises(ModelError, match="mavfi train --stack mavbench-release"):
                 DetectorConfig(name=name).built("mavbench-release")
@@ -250,8 +248,8 @@ def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
         for share in np.linspace(0, 1, steps):
             point = fcl.Transform(start + share * (end - start))
             probe = fcl.CollisionObject(fcl.Sphere(1e-3), point)
-            found = fcl.distance(probe, tree, fcl.DistanceRequest(), fcl.DistanceResult())
-            smallest = min(smallest, found + 1e-3)
+            distance_m = fcl.distance(probe, tree, fcl.DistanceRequest(), fcl.DistanceResult())
+            smallest = min(smallest, distance_m + 1e-3)
     return smallest
 
 
@@ -266,7 +264,7 @@ class PlannerContract:
 
     @staticmethod
     def wall_with_gap(gap_m: float = 4.0) -> MapSnapshot:
-        """A wall across all of the bounds but for a gap at y = 6."""
+        """Return a wall across the bounds with a gap at y = 6."""
         below = _slab((10, -13, 0), (10.4, 6 - gap_m / 2, 11))
         above = _slab((10, 6 + gap_m / 2, 0), (10.4, 13, 11))
         return MapSnapshot.of_points(np.vstack([below, above]))
@@ -324,7 +322,7 @@ class PlannerContract:
         assert not result.found
         assert len(result.path_enu_m) == 0
         assert result.reason
-        # Nearest it can come to the goal is the inside of the box.
+        # It can only get as near to the goal as the inside of the box.
         assert 17.0 < result.nearest_m <= 20.0
 
     def test_free_sight_is_flown_straight(self, name: str) -> None:
@@ -369,12 +367,12 @@ class TransportContract:
     """The suite that every transport passes.
 
     A subclass has a fixture `pair` that yields two connected ends and closes them afterwards. The
-    second end is the one that calls.
+    second end opens the connection.
     """
 
     @staticmethod
     def message(number: int) -> object:
-        """Return a MAVLink message that carries a number."""
+        """Return a MAVLink message that contains a number."""
         return dialect.MAVLink_local_position_ned_message(number, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
 
     @staticmethod
@@ -390,14 +388,14 @@ class TransportContract:
         numbers: list[int] = []
         while len(numbers) < count:
             data = transport.receive(WAIT_S)
-            assert data, f"only {numbers} came"
+            assert data, f"only {numbers} arrived"
             numbers += [m.time_boot_ms for m in codec.decode(data, datagram=transport.datagram)]
         assert codec.bad_bytes == 0
         return numbers
 
     @staticmethod
     def introduce(near: Transport, far: Transport) -> None:
-        """Let the caller speak first, so that a listening end knows it."""
+        """Send from the second end first, so that a listening end learns its address."""
         TransportContract.send(far, Codec(2, 2), range(1))
         assert TransportContract.receive(near, 1) == [0]
 
@@ -429,13 +427,13 @@ class TransportContract:
 
 
 class StreamTransportContract(TransportContract):
-    """The suite that every transport passes whose other end learns that it was closed, as TCP."""
+    """The suite that every transport passes that reports closing to the other end, as TCP."""
 
     def test_a_closed_stream_is_a_lost_link_at_the_other_end(self, pair: Pair) -> None:
         near, far = pair
         self.introduce(near, far)
         self.send(far, Codec(2, 2), range(3))
         far.close()
-        assert self.receive(near, 3) == [0, 1, 2]  # what was sent before still arrives
+        assert self.receive(near, 3) == [0, 1, 2]  # data sent before still arrives
         with pytest.raises(LinkLost):
             near.receive(WAIT_S)

@@ -1,7 +1,7 @@
 """The F-1 model (Krishnan et al., IEEE CAL 19(1), 2020): its vehicles, boards and equations.
 
 A vehicle that sees `range_m` far and takes `response_s` from sensing to acting may fly only as
-fast as it can stop in front of what it sees. A board is the computer that it carries. A protection
+fast as it can stop within that range. A board is the computer that it carries. A protection
 scheme costs copies of the board, or compute time. Vehicles and boards are one TOML file each. All
 units are SI.
 """
@@ -58,7 +58,7 @@ class ModelVehicle:
     battery_wh: float  # energy of the full battery
     tilt_deg: float = 0.0  # tilt of the rotors while braking
     board: str = ""  # a shipped board, if no platform is named
-    flies_as: str = ""  # the simulated vehicle that stands in for it; empty: one of its size
+    flies_as: str = ""  # simulated vehicle that flies in its place; empty: one of its size
     description: str = ""  # for readers of the file
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
     calibration: _Calibration | None = None  # the number that a published ratio determines
@@ -81,9 +81,9 @@ class ModelVehicle:
         if free and getattr(self, free) is not None:
             raise ValueError(f"{free}: has a value, so it cannot be calibrated")
         if self.rotor_pull_n is None and free != "rotor_pull_n":
-            raise ValueError("rotor_pull_n: is missing, and no calibration sets it")
+            raise ValueError("rotor_pull_n: missing, and no calibration sets it")
         if free == "rotor_pull_n" and self.response_s is None:
-            raise ValueError("response_s: is missing, the calibration needs it")
+            raise ValueError("response_s: missing, and the calibration needs it")
 
     @classmethod
     def load(cls, name_or_path: str) -> ModelVehicle:
@@ -115,7 +115,7 @@ class Board:
     name: str  # of the board
     mass_kg: float  # without the heat sink
     power_w: float  # thermal design power
-    heatsink_kgpw: float  # mass of the heat sink for each watt of power_w
+    heatsink_kgpw: float  # mass of the heat sink per watt of power_w
     description: str = ""  # for readers of the file
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
 
@@ -310,7 +310,7 @@ class ModelInputs:
         return safe_velocity_mps(accel, self.response_s(scheme.overhead), self.range_m)
 
     def too_heavy(self, copies: int) -> CannotLift:
-        """The error that says why this many boards cannot be lifted."""
+        """Return the error that explains why this many boards are too heavy."""
         own_kg, compute_kg = self.vehicle.mass_kg, self.carried_kg(copies)
         limit_kg = self.mass_kg(copies) * (1.0 + self.acceleration_mps2(copies) / GRAVITY_MPS2)
         return CannotLift(

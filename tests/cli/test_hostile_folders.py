@@ -145,7 +145,7 @@ def test_the_firmware_of_a_record_flies_only_if_the_user_names_it(hostile, comma
     code, _, err = command_line("replay", hostile)
     script = hostile.parent / "firmware"
     assert code == 2
-    assert f"names the program {script}, which would be executed" in err
+    assert f"would execute the program {script}" in err
     code, _, err = command_line("replay", hostile, "--firmware", script)
     assert (hostile.parent / "struck").exists()
     assert code == 1

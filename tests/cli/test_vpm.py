@@ -135,8 +135,8 @@ KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
     [
         ("[kernels.control]\nlatency_s = 0.1\n", "", "error: p.toml: kernels.control: missing, a"),
         ("[kernels.planner]\nlatency_s = 0.1", "[kernels.planner]\nlatency_s = -0.1",
-         "error: p.toml:11: kernels.planner: latency_s must not be negative, got -0.1"),
-        ("power_w = 5.0", "power_w = -5.0", "error: p.toml: power_w: must not be negative, is -5"),
+         "error: p.toml:11: kernels.planner: latency_s must be at least 0, got -0.1"),
+        ("power_w = 5.0", "power_w = -5.0", "error: p.toml: power_w: must be at least 0, got -5"),
         ("mass_kg = 0.1", "mass_kg = 9.0",
          "error: vehicle 'spark' cannot lift its compute: 8.33 N of rotor pull lift less than "
          "0.850 kg, 0.300 kg + 9.000 kg of compute are 9.300 kg"),

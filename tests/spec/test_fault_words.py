@@ -43,7 +43,7 @@ def test_a_fault_in_an_instruction_in_words():
 
 @pytest.mark.parametrize("kind", [FaultConfig, InstructionConfig])
 def test_a_negative_seed_is_refused(kind):
-    with pytest.raises(FaultSpecError, match="seed of a fault must be 0 or above, got -1"):
+    with pytest.raises(FaultSpecError, match="seed of a fault must be at least 0, got -1"):
         kind(target="planning", seed=-1)
     with pytest.raises(ConfigError, match="seed of a fault must be"):
         structure({"target": "planning", "seed": -1}, kind)
