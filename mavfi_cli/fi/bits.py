@@ -1,4 +1,4 @@
-"""Every bit operation of the project: one module, one set of laws.
+"""All bit operations of the project.
 
 A value is handled as its *pattern*, an unsigned Python integer with bit 0 the least significant.
 Layouts of binary32 and binary64: IEEE 754-2019, section 3.4.
@@ -19,7 +19,7 @@ Scalar = float | int | bool
 
 
 class Field(Enum):
-    """The part of a value that is attacked."""
+    """The attacked part of a value."""
 
     SIGN = "sign"
     EXPONENT = "exponent"
@@ -27,7 +27,7 @@ class Field(Enum):
     ANY = "any"
 
 
-# How struct packs a value, and the unsigned integer with the same bits.
+# Codes of struct for a value, and for the unsigned integer of the same size.
 _FORMATS = {
     "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int16": ("<h", "<H"), "int32": ("<i", "<I"),
     "int64": ("<q", "<Q"), "bool": ("<?", "<B"),
@@ -36,7 +36,7 @@ _FORMATS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BitType:
-    """A type as bits: its name, its width, and the bits of each of its fields."""
+    """A type as bits: its name, its width, and the bits of its fields."""
 
     name: str
     width: int
@@ -66,13 +66,13 @@ class BitType:
         """The xor mask of distinct bits.
 
         Raises:
-            FaultSpecError: a bit that the type does not have.
+            FaultSpecError: the type does not have one of the bits.
         """
         mask = 0
         for bit in bits:
             if not 0 <= bit < self.width:
                 raise FaultSpecError(
-                    f"bit {bit} is outside {self.name}, which has bits 0 to {self.width - 1}"
+                    f"bit of {self.name} must be within 0 and {self.width - 1}, got {bit}"
                 )
             mask |= 1 << bit
         return mask

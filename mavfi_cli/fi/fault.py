@@ -1,6 +1,6 @@
 """Source-level faults: injection site, trigger and corruption as three small frozen types.
 
-`draw_fault` resolves a requested fault to one exact fault: names are looked up, the rest is drawn.
+`draw_fault` resolves a requested fault to one exact fault: it looks names up and draws the rest.
 `inject` flips bits of one value or of one element of an array, without a mission.
 
 Vocabulary: transient, intermittent and stuck-at faults as in Avizienis et al., "Basic concepts and
@@ -40,7 +40,7 @@ class Effect(Enum):
 
     FLIP = "flip"
     ZERO = "zero"
-    RANDOM = "random"  # every bit is drawn anew
+    RANDOM = "random"  # all bits are replaced by random ones
 
 
 class Persistence(Enum):
@@ -53,7 +53,7 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """The moment of the fault. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
+    """The time of the fault. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)
@@ -61,14 +61,17 @@ class Trigger:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.number) and self.number >= 0.0):
-            raise FaultSpecError(f"a trigger at {self.when.value} {self.number:g} is not possible")
+            raise FaultSpecError(
+                f"the number of trigger {self.when.value} must be finite and at least 0, "
+                f"got {self.number:g}"
+            )
         if self.when is When.INVOCATION and self.number < 1:
-            raise FaultSpecError("invocations are counted from 1")
+            raise FaultSpecError(f"the invocation must be at least 1, got {self.number:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corruption:
-    """The change to each attacked value, and its duration.
+    """The change to an attacked value, and its duration.
 
     Attributes:
         bits: number of distinct bits of `field` that are flipped.
@@ -84,14 +87,14 @@ class Corruption:
 
     def __post_init__(self) -> None:
         if self.bits < 1:
-            raise FaultSpecError(f"at least one bit must be flipped, not {self.bits}")
+            raise FaultSpecError(f"bits must be at least 1, got {self.bits}")
         if not self.duration_s > 0.0:
-            raise FaultSpecError(f"a duration of {self.duration_s:g} s is not possible")
+            raise FaultSpecError(f"duration_s must be above 0, got {self.duration_s:g}")
         if not (self.period_s > 0.0 and math.isfinite(self.period_s)):
-            raise FaultSpecError(f"a period of {self.period_s:g} s is not possible")
+            raise FaultSpecError(f"period_s must be finite and above 0, got {self.period_s:g}")
 
     def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
-        """Refuse a corruption whose bits the value of this name and type does not have.
+        """Refuse a corruption that needs bits that this type does not have.
 
         Raises:
             FaultError: an exact bit or the field is missing, or the field has too few bits.
@@ -110,8 +113,8 @@ class SourceFault:
 
     Attributes:
         states: the attacked states, all of one message. Several states are struck together,
-            each with its own bits.
-        bits: the exact bits of each state if they are prescribed, as in a replay; otherwise they
+            with separate bits.
+        bits: the exact bits of every state if they are given, as in a replay; otherwise they
             are drawn.
     """
 
@@ -136,11 +139,11 @@ def draw_fault(
     """Draw the fault of a target and a seed.
 
     Args:
-        target: a stage, a state, or a group of states. Of a stage, one state that has the
-            corruption's field is drawn. Of a group, one state is drawn, unless `together`.
+        target: a stage, a state, or a group of states. From a stage, one state with the
+            corruption's field is drawn; from a group, one state, unless `together`.
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
-        bits: exact bits, the same for each state; None draws them at the strike.
+        bits: exact bits, the same for all states; None draws them at the strike.
 
     Raises:
         UnknownName: no such stage, state or group.

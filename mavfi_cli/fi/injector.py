@@ -1,13 +1,13 @@
 """Applies a source-level fault to the messages between kernels.
 
 Every message passes through `pass_on` when it is published. The active plan also passes through
-`strike_latched` once a tick, because it lives for many seconds and a fault may hit it anytime.
+`strike_latched` once a tick, because a fault may hit it at any time of its long life.
 
-A listener hears of each strike *before* the changed message goes on, so that the record survives
-whatever the fault does.
+A listener is called with a strike *before* the changed message is passed on, so that the record
+survives any effect of the fault.
 
-A `Follower` finds out whether a corrupted value was read before it was replaced: a flip in a value
-that nobody reads is not a fault that the system survived. Its words are those of the instruction
+A `Follower` determines whether a corrupted value was read before it was replaced: a flip in a value
+that is never read is not a fault that the system survived. It uses the terms of the instruction
 level (`fi.tracer.inject.BitActivation`).
 """
 
@@ -43,7 +43,7 @@ _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Comman
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """The mission's present state, which triggers are compared with."""
+    """The mission's current state, which triggers are compared with."""
 
     stamp_s: float
     flight_s: float  # since the companion took over
@@ -53,7 +53,7 @@ class Moment:
 
 
 class _Pattern:
-    """The corruption of one value: its bits and what they are set to, drawn once.
+    """The corruption of one value, drawn once: its bits and their new values.
 
     Args:
         bits: the exact bits; None draws them at the first strike.
@@ -107,7 +107,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strike:
-    """One moment at which the fault acted."""
+    """One time at which the fault acted."""
 
     stamp_s: float
     tick: int
@@ -120,28 +120,28 @@ Listener = Callable[[Strike], None]
 
 
 class NoInjector:
-    """Null object that leaves everything as it is.
+    """Null object that changes nothing.
 
     Attributes:
-        follower: finds out who reads what was struck.
+        follower: determines who reads a struck value.
     """
 
     def __init__(self) -> None:
         self.follower = Follower()
 
     def watch(self, moment: Moment) -> None:
-        """Note the mission's present state, once a control tick and for every report."""
+        """Update the mission's current state, once per control tick and for every report."""
 
     def pass_on(self, message: M, moment: Moment) -> M:
         """Return a published message as its receiver gets it."""
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active plan as it is from this tick on; `index` is its present waypoint."""
+        """Return the active plan from this tick on; `index` is its current waypoint."""
         return trajectory
 
     def strike(self, moment: Moment) -> None:
-        """Strike a memory or a process if the fault is due, once a control tick."""
+        """Strike a memory or a process if the fault is due, once per control tick."""
 
 
 class Injector(NoInjector):
@@ -150,11 +150,11 @@ class Injector(NoInjector):
     Args:
         rng: draws the time of a random trigger first.
         shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
-            uniformly over it, so that the trigger always comes.
-        listener: called with every strike before the mission goes on.
+            uniformly over it, so that it is always reached.
+        listener: called with every strike before the mission continues.
     """
 
-    _awaits: str  # what the fault waits for, in words
+    _awaits: str  # description of the event that the fault waits for
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class Injector(NoInjector):
         super().__init__()
         self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
         self._trigger, self._corruption = trigger, corruption
-        self._came = False  # the trigger came, whether or not there was anything to strike
+        self._came = False  # the trigger has occurred, even if there was nothing to strike
         self._begun_s: float | None = None
         self._last_s = -math.inf
         self._listener = listener
@@ -175,7 +175,7 @@ class Injector(NoInjector):
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """Note the mission's present state, even if there is nothing to strike.
+        """Update the mission's current state, even if there is nothing to strike.
 
         A phase may begin and end before the next message with the attacked state.
         """
@@ -211,7 +211,7 @@ class Injector(NoInjector):
         return True
 
     def _comes(self, moment: Moment) -> bool:
-        """True if the trigger has come; invocations are counted with the messages instead."""
+        """True if the trigger has occurred; invocations are counted with the messages instead."""
         trigger = self._trigger
         return {
             When.TIME: moment.flight_s >= trigger.number - 1e-9,
@@ -284,7 +284,7 @@ class SourceInjector(Injector):
         return struck
 
     def _strikes_latched(self) -> bool:
-        """True for every trigger but an invocation, which is met on publication."""
+        """True for every trigger except an invocation, which is checked on publication."""
         return self.fault.trigger.when is not When.INVOCATION
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
@@ -297,7 +297,7 @@ class SourceInjector(Injector):
             change = self._change(place, state, changed)
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
-        # An unchanged message stays the same object: its readers may still read an earlier strike.
+        # An unchanged message remains the same object: its readers may read an earlier strike.
         struck: Any = changed if any(change.bits for change in changes) else message
         self.follower.struck(struck, self._tell(moment, self._invocations, changes))
         result: M = struck
@@ -333,10 +333,10 @@ Memory = Mapping[str, NDArray[Any]]
 class MemoryInjector(Injector):
     """Carries one fault in a memory, an element of one of several arrays, through one mission.
 
-    It attacks a detector's memory (thresholds, means, weights): a detector can be hit as well.
+    It attacks a detector's memory (thresholds, means, weights), which can be hit too.
 
     Args:
-        array: the attacked array; None draws one in proportion to its bits.
+        array: the attacked array; None draws one with a probability in proportion to its bits.
         trigger: when to strike; an invocation is a control tick.
         shortest_flight_s, listener: as for `Injector`.
 
@@ -344,7 +344,7 @@ class MemoryInjector(Injector):
         array, element: the attacked array, and the index of the element in C order.
 
     Raises:
-        UnknownName: there is no such array.
+        UnknownName: no array has this name.
         FaultError: the array's elements do not have these bits.
         FaultSpecError: the array has no elements, or the field too few bits.
     """
@@ -393,10 +393,10 @@ class MemoryInjector(Injector):
 
 
 class Activation(Enum):
-    """What happened to the corrupted values, over all strikes of a fault."""
+    """Fate of the corrupted values, over all strikes of a fault."""
 
     READ = "read"  # a receiver worked with a corrupted value
-    WITHHELD = "withheld"  # the detector's gate kept it from its receivers
+    WITHHELD = "withheld"  # the detector's gate withheld it from its receivers
     OVERWRITTEN = "overwritten"  # the message was replaced before anyone read it
     NOT_READ = "not_read"  # the mission ended before anyone read it
     UNCHANGED = "unchanged"  # the strike did not change the value
@@ -416,8 +416,8 @@ class Follower:
     """Follows the struck message until one of its corrupted values is read.
 
     Attributes:
-        activation: the activation so far; READ is final, WITHHELD holds until a value is read.
-        reader: the first one.
+        activation: the activation so far; READ is final, WITHHELD lasts until a value is read.
+        reader: the first reader.
     """
 
     def __init__(self) -> None:
@@ -428,11 +428,11 @@ class Follower:
 
     @property
     def waits(self) -> bool:
-        """True while a struck message is on its way and nobody has read it."""
+        """True while a struck message is in transit and unread."""
         return self._message is not None
 
     def struck(self, message: Message, strike: Strike) -> None:
-        """Note that a message was corrupted; it goes on as `message`."""
+        """Record that a message was corrupted; `message` is the changed one."""
         if self.activation is Activation.READ:
             return
         corrupted = {c.state: c.index for c in strike.changes if c.bits}
@@ -450,7 +450,7 @@ class Follower:
         states: Collection[str],
         index: int | None = None,
     ) -> None:
-        """Note that a receiver works with a message's states, at one waypoint or at all of them."""
+        """Record that a receiver reads a message's states, at one waypoint or at all."""
         if self._message is None or message is not self._message:
             return
         for state, at in self._corrupted.items():
@@ -460,12 +460,12 @@ class Follower:
                 return
 
     def withheld(self, message: Message) -> None:
-        """Note that the gate withheld a message, or the struck part of it."""
+        """Record that the gate withheld a message, or the struck part of it."""
         if message is self._message:
             self.activation, self._message = Activation.WITHHELD, None
 
     def settle(self, held: Callable[[Message], bool]) -> None:
-        """Note the message as overwritten if `held` says that it no longer counts."""
+        """Record the message as overwritten unless it is still `held`."""
         if self._message is not None and not held(self._message):
             self._message = None
             self._become(Activation.OVERWRITTEN)

@@ -216,7 +216,7 @@ def test_another_instruction_at_the_place_is_refused(target, workplace):
         instruction_bytes=b"\x90",
         corruption=fault.corruption,
     )
-    with pytest.raises(FaultError, match="expected 'nop'"):
+    with pytest.raises(FaultError, match="must hold 'nop'"):
         attacker.run(other)
 
 

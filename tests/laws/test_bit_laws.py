@@ -104,7 +104,7 @@ def test_every_bit_of_a_field_is_drawn():
 
 @pytest.mark.parametrize(("bit", "kind"), [(64, b.FLOAT64), (-1, b.INT32), (1, b.BOOL)])
 def test_a_bit_outside_the_width_is_refused_in_one_line(bit, kind):
-    with pytest.raises(FaultError, match=rf"bit {bit} is outside {kind.name}") as caught:
+    with pytest.raises(FaultError, match=rf"bit of {kind.name} must be .* got {bit}") as caught:
         kind.mask((bit,))
     assert "\n" not in str(caught.value)
 

@@ -1,15 +1,15 @@
-"""Executions of an instruction are counted: to one stop, by a detour, or over a whole run.
+"""Counts executions of instructions, up to one stop by a detour, or over a whole run.
 
-The k-th execution of an instruction is reached by counting. A *detour* counts inside the target, at
-a few nanoseconds each. The bytes of the counted instruction are replaced by a jump to a page of
-ours. The code there counts down without changing flags or stack, executes the replaced instructions
-and jumps back. At zero it stops at a breakpoint instead. Nobody may jump between the replaced
-instructions. If they have fewer than five bytes, a short jump leads over five bytes nearby that
-nobody executes.
+The k-th execution of an instruction is reached by counting. A *detour* counts inside the target, in
+a few nanoseconds per execution. A jump to a page of ours replaces the bytes of the counted
+instruction. The code there counts down without changing flags or stack, executes the replaced
+instructions and jumps back. At zero it stops at a breakpoint instead. No jump may lead between the
+replaced instructions. If they have fewer than five bytes, a short jump leads to five unused bytes
+nearby, which hold a second jump.
 
-A program that is too long to be stepped is known by its execution counts. Instructions that always
-execute together have the same counts. So a hot one is counted at a place among them where a detour
-fits: one of them leads to the next, and both are executed equally often.
+The population of a program that is too long to be stepped consists of its execution counts.
+Instructions of a block always execute together and have equal counts. So a frequent instruction is
+counted at any instruction of its block where a detour fits.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ Locate = Callable[[int], Location]
 CodeAt = Callable[[int], bytes]  # 16 bytes of code
 Executions = Callable[[int], int | None]  # of the instruction at an address
 
-_BY_BREAKPOINT = 100_000  # most executions that are counted by a breakpoint: about a second
+_BY_BREAKPOINT = 100_000  # maximum executions counted by a breakpoint: about a second
 _JUMP_BYTES, _SHORT_JUMP_BYTES = 5, 2
-_SHORT_JUMP = range(-126, 130)  # where a short jump leads, from its own address
+_SHORT_JUMP = range(-126, 130)  # reach of a short jump, from its own address
 _PAGE = 4096
 _SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets of the data
 _FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
@@ -47,11 +47,11 @@ class _DetourCode:
 
     jumps: dict[int, bytes]  # by address, in the code of the program
     pages: dict[int, bytes]  # by address
-    stop: int  # the instruction pointer when the count is over
+    stop: int  # instruction pointer when the count has reached zero
 
 
 class Counting(Enum):
-    """How executions are counted, from the quickest, which changes the most code."""
+    """Counting methods, from the fastest, which changes the most code."""
 
     FAR_DETOUR = "detour over unused bytes"
     DETOUR = "detour"
@@ -60,12 +60,12 @@ class Counting(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Detour:
-    """The place of a detour that counts the executions of an instruction.
+    """The location of a detour that counts the executions of an instruction.
 
     Attributes:
-        size: bytes of the whole instructions that the detour replaces; nothing jumps between them.
-        via: distance from the instruction to unused bytes that hold a second jump; 0 if one jump
-            is enough.
+        size: bytes of the instructions that the detour replaces; no jump leads between them.
+        via: distance from the instruction to the unused bytes of a second jump; 0 if one jump is
+            enough.
     """
 
     size: int
@@ -78,7 +78,7 @@ class Detour:
 
     @classmethod
     def at(cls, address: int, code_at: CodeAt, executions: Executions) -> Detour | None:
-        """The detour at one instruction; None if none fits there."""
+        """Return the detour at one instruction; None if none fits."""
         size = _straight_bytes(address, code_at, executions)
         return cls(size) if size >= _JUMP_BYTES else None
 
@@ -90,9 +90,9 @@ class Detour:
             pages: address of two pages of memory, less than 2 GB away.
 
         Returns:
-            None if an instruction cannot be executed elsewhere.
+            None if an instruction cannot be relocated.
         """
-        start = pages + _PAGE  # code beside data that is written would be slow
+        start = pages + _PAGE  # code next to written data would be slow
         parts = [
             _rcx(b"\x89", pages + _SAVED, start),
             _rcx(b"\x8b", pages + _COUNTER, start + 7),
@@ -102,12 +102,12 @@ class Detour:
         moved = _rcx(b"\x8b", pages + _SAVED, start + 27)
         at = address
         returns_to = address + len(code)
-        for found in engine.disasm(code, address):
-            piece = _moved(found, start + 27 + len(moved), pages + _RETURN)
+        for decoded in engine.disasm(code, address):
+            piece = _moved(decoded, start + 27 + len(moved), pages + _RETURN)
             if piece is None:
                 return None
             moved += piece
-            at = found.address + found.size
+            at = decoded.address + decoded.size
         if at != returns_to:
             return None
         moved += _jump(returns_to, start + 27 + len(moved))
@@ -128,38 +128,38 @@ class Detour:
 
 @dataclass(frozen=True, slots=True)
 class CountedStop:
-    """Run until `location` is about to execute for the `count`-th time since the stage before."""
+    """Run until `location` is about to execute for the `count`-th time since the previous stage."""
 
     location: Location
     count: int
-    detour: Detour | None = None  # None: the executions are counted by a breakpoint
+    detour: Detour | None = None  # None: a breakpoint counts the executions
 
 
-# -- how control flows
+# -- control flow
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Flow:
-    """How control flows through one instruction, and whether it can be executed elsewhere."""
+    """Control flow through one instruction, and whether it can be relocated."""
 
     size: int
-    straight: bool  # the next instruction follows, always
+    straight: bool  # always followed by the next instruction
     movable: bool
-    repeated: bool  # a string instruction that may repeat itself
+    repeated: bool  # a repeated string instruction
 
 
 @functools.lru_cache(maxsize=65536)
 def _flow(code: bytes, address: int) -> _Flow | None:
-    """How control flows through one instruction; None if the bytes are not an instruction."""
-    found = next(engine.disasm(code[:16], address, 1), None)
-    if found is None:
+    """Decode the control flow of one instruction; None if the bytes are not an instruction."""
+    decoded = next(engine.disasm(code[:16], address, 1), None)
+    if decoded is None:
         return None
-    leaves = not BRANCHES.isdisjoint(found.groups)
+    leaves = not BRANCHES.isdisjoint(decoded.groups)
     return _Flow(
-        size=found.size,
-        straight=not leaves and found.mnemonic not in _FIXED,
-        movable=_moved(found, address, address) is not None,
-        repeated=found.mnemonic.startswith("rep") and not leaves,
+        size=decoded.size,
+        straight=not leaves and decoded.mnemonic not in _FIXED,
+        movable=_moved(decoded, address, address) is not None,
+        repeated=decoded.mnemonic.startswith("rep") and not leaves,
     )
 
 
@@ -172,30 +172,30 @@ def _jump(target: int, at: int) -> bytes:
     return b"\xe9" + struct.pack("<i", target - at - 5)
 
 
-def _moved(found: Any, at: int, return_slot: int) -> bytes | None:
-    """The instruction as it has to be at another address; None if it cannot be moved."""
-    raw = bytes(found.bytes)
-    if found.mnemonic in _FIXED:
+def _moved(decoded: Any, at: int, return_slot: int) -> bytes | None:
+    """Return the instruction relocated to another address; None if it cannot be relocated."""
+    raw = bytes(decoded.bytes)
+    if decoded.mnemonic in _FIXED:
         return None
-    immediate = bool(found.operands) and found.operands[0].type == x86.X86_OP_IMM
-    if found.group(x86.X86_GRP_CALL):
+    immediate = bool(decoded.operands) and decoded.operands[0].type == x86.X86_OP_IMM
+    if decoded.group(x86.X86_GRP_CALL):
         if not immediate:
             return None
         push = b"\xff\x35" + struct.pack("<i", return_slot - at - 6)  # the true return address
-        return push + _jump(found.operands[0].imm, at + 6)
-    if found.group(x86.X86_GRP_JUMP) and immediate:
-        target = found.operands[0].imm
-        first, second = found.opcode[0], found.opcode[1]
+        return push + _jump(decoded.operands[0].imm, at + 6)
+    if decoded.group(x86.X86_GRP_JUMP) and immediate:
+        target = decoded.operands[0].imm
+        first, second = decoded.opcode[0], decoded.opcode[1]
         if first in (0xE9, 0xEB):
             return _jump(target, at)
         if first >> 4 != 7 and not (first == 0x0F and second >> 4 == 8):
             return None  # loop, jrcxz
         condition = (first if first >> 4 == 7 else second) & 15
         return bytes([0x0F, 0x80 | condition]) + struct.pack("<i", target - at - 6)
-    if any(op.type == x86.X86_OP_MEM and op.mem.base == x86.X86_REG_RIP for op in found.operands):
-        place = found.disp_offset
-        there = found.disp + found.address - at
-        if raw[place : place + 4] != struct.pack("<i", found.disp) or abs(there) >> 31:
+    if any(op.type == x86.X86_OP_MEM and op.mem.base == x86.X86_REG_RIP for op in decoded.operands):
+        place = decoded.disp_offset
+        there = decoded.disp + decoded.address - at
+        if raw[place : place + 4] != struct.pack("<i", decoded.disp) or abs(there) >> 31:
             return None
         return raw[:place] + struct.pack("<i", there) + raw[place + 4 :]
     return raw
@@ -206,14 +206,15 @@ def _moved(found: Any, at: int, return_slot: int) -> bytes | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CountedRun:
-    """How often each instruction in scope is executed in one run.
+    """Execution counts of the instructions in scope, over one run.
 
     Attributes:
         addresses: (n,) instructions, ascending.
-        counts: (n,) executions of each.
-        places: (n,) index of the instruction at which each is counted.
-        detours: for each instruction, the detour that counts it; None if none fits.
-        joined: for each instruction, whether it always leads to the next, and nothing else does.
+        counts: (n,) executions.
+        places: (n,) index of the instruction at which the executions are counted.
+        detours: (n,) detour that counts the instruction; None if none fits.
+        joined: (n,) whether the instruction is the only predecessor of the next, which always
+            follows it.
     """
 
     addresses: NDArray[np.int64]
@@ -224,10 +225,10 @@ class CountedRun:
 
     @classmethod
     def of(cls, executions: Mapping[int, int], code_at: CodeAt) -> CountedRun:
-        """Make the population from the number of executions of each address."""
+        """Make the population from execution counts by address."""
         addresses = sorted(executions)
         flows = [_flow(code_at(address), address) for address in addresses]
-        counts = _without_repeats(addresses, [executions[each] for each in addresses], flows)
+        counts = _without_repeats(addresses, [executions[address] for address in addresses], flows)
         joined = _joined(addresses, counts, flows)
         known = dict(zip(addresses, counts, strict=True))
         sizes = [_straight_bytes(address, code_at, known.get) for address in addresses]
@@ -241,14 +242,16 @@ class CountedRun:
         )
 
     def without(self, methods: Container[Counting]) -> CountedRun:
-        """The same run, of which fewer executions are reached, without some counting methods."""
-        detours = [None if each and each.counting in methods else each for each in self.detours]
+        """Return the same run without some counting methods, which reaches fewer executions."""
+        detours = [
+            None if detour and detour.counting in methods else detour for detour in self.detours
+        ]
         places = np.array(_places(detours, self.joined), np.int64)
         return replace(self, detours=tuple(detours), places=places)
 
     @functools.cached_property
     def reached(self) -> NDArray[np.int64]:
-        """(n,) executions of each instruction, from the first, that can be reached."""
+        """(n,) number of executions, from the first, that can be reached."""
         detoured = np.array([self.detours[place] is not None for place in self.places])
         return np.where(detoured, self.counts, np.minimum(self.counts, _BY_BREAKPOINT))
 
@@ -289,13 +292,13 @@ class CountedRun:
         detour = self.detours[place]
         if place == index:
             return (CountedStop(here, k, detour),)
-        before = k if place < index else k - 1  # executions of the place until then
+        before = k if place < index else k - 1  # executions of the counted instruction until then
         first = (CountedStop(there, before, detour),) if before else ()
         return (*first, CountedStop(here, 1))
 
 
 def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> int:
-    """Bytes of the instructions from one on that a detour can replace, as many as it needs."""
+    """Return the bytes of the instructions from one on that a detour would replace."""
     size, expected = 0, None
     while (how := _flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
@@ -310,7 +313,7 @@ def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> in
 def _without_repeats(
     addresses: list[int], counts: list[int], flows: list[_Flow | None]
 ) -> list[int]:
-    """Count a repeated string instruction once, however often it repeats itself."""
+    """Count a repeated string instruction once, whatever its number of iterations."""
     counts = list(counts)
     for at, how in enumerate(flows):
         if how is None or not how.repeated or at + 1 == len(addresses):
@@ -321,7 +324,7 @@ def _without_repeats(
 
 
 def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) -> list[bool]:
-    """Whether each instruction always leads to the next, and nothing else does."""
+    """Return whether instructions are the only predecessor of the next, (n,)."""
     joined = [
         how is not None
         and how.straight
@@ -335,7 +338,7 @@ def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) 
 def _detours(
     addresses: list[int], sizes: list[int], flows: list[_Flow | None]
 ) -> Iterator[Detour | None]:
-    """The detour at each instruction."""
+    """Return the detours at the instructions."""
     ends = [at + how.size if how else at for at, how in zip(addresses, flows, strict=True)]
     gaps = [
         range(end, start - _JUMP_BYTES + 1)
@@ -356,7 +359,7 @@ def _detours(
 
 
 def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> Detour | None:
-    """A detour over the first bytes nearby that nothing executes."""
+    """Return a detour through the first unused bytes nearby."""
     for gap in gaps:
         first = max(gap.start, near.start)
         if first >= near.stop:
@@ -367,13 +370,13 @@ def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> De
 
 
 def _places(detours: Sequence[Detour | None], joined: Sequence[bool]) -> list[int]:
-    """The index at which each is counted: its own, or the first possible of its block."""
+    """Return the indices at which instructions are counted: their own, or one of their block."""
     places: list[int] = []
     start = 0
     for at, more in enumerate(joined):
         if not more:
             block = range(start, at + 1)
-            fits = [each for each in block if detours[each]]
-            places += [each if detours[each] or not fits else fits[0] for each in block]
+            fits = [index for index in block if detours[index]]
+            places += [index if detours[index] or not fits else fits[0] for index in block]
             start = at + 1
     return places

@@ -1,13 +1,13 @@
-"""Decoder of x86-64 instructions to the register bits and memory bytes that they read and write.
+"""Decodes x86-64 instructions into the register bits and memory bytes that they read and write.
 
 A bit is *read* if its value can change a result elsewhere: another bit of a register, memory, an
-address or the flow of control. It is *written* if it holds part of the result; a 32-bit write also
-clears the upper half, a VEX-encoded one the whole rest (Intel SDM volume 1, sections 3.4.1.1 and
-14.1.1). Those bits are replaced, but no part of the result.
+address or the control flow. It is *written* if it holds part of the result; a 32-bit write also
+clears the upper half, a VEX-encoded one all other bits (Intel SDM volume 1, sections 3.4.1.1 and
+14.1.1). These bits are overwritten, but are not part of the result.
 
-Capstone decodes. `vectors` knows which bits of vector instructions count; here is what the others
-have of their own, the stack slots of push, pop, call and ret, and what the tracer has to know of an
-instruction to step over it. tests/fi/tracer/test_operands.py executes them.
+Capstone decodes. `vectors` has the tables of vector instructions. This module has the exceptions of
+all others, the stack slots of push, pop, call and ret, and the properties that the tracer needs to
+step over an instruction. tests/fi/tracer/test_operands.py compares them with real executions.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class RegisterUse:
     """Bits of a full register that an instruction reads or writes."""
 
     register: str
-    mask: int  # bits that the instruction reads, or that hold a part of its result
-    clears: int  # for a write: every bit that always gets a new value
+    mask: int  # bits that the instruction reads, or that hold part of its result
+    clears: int  # for a write: all bits that always get a new value
     explicit: bool
     operand: str  # as the assembler names it: eax, xmm1, zf
 
@@ -63,12 +63,12 @@ class MemoryUse:
 
     @property
     def operand(self) -> str:
-        """The operand as text, for a record."""
+        """Describe the operand for a record."""
         parts = [part for part in (self.segment, self.base, self.index) if part]
         return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
 
     def address(self, instruction: Instruction, read: Callable[[str], int]) -> int:
-        """The address before the instruction executes; `read` gives the value of a register."""
+        """Return the address before execution; `read` returns the value of a register."""
 
         def value(name: str | None) -> int:
             named = _GENERAL.get(name or "")
@@ -91,9 +91,9 @@ class Instruction:
     writes: tuple[RegisterUse, ...]
     memory: tuple[MemoryUse, ...]
     elements: tuple[str | None, str | None]  # float64 or float32, if it reads or writes them
-    scalar: bool  # it computes with the lowest element of its registers only
-    branches: bool  # it is a jump, a call or a return
-    run_over: bool  # one single step is not enough or leaves a trace: run past it
+    scalar: bool  # computes with the lowest element of its registers only
+    branches: bool  # a jump, a call or a return
+    run_over: bool  # a single step does not suffice or leaves a trace
 
     @property
     def next_address(self) -> int:
@@ -104,34 +104,34 @@ class Instruction:
 @functools.lru_cache(maxsize=65536)
 def decode(code: bytes, address: int) -> Instruction | None:
     """Decode one instruction from 16 bytes; None if the bytes are not an instruction."""
-    found = next(engine.disasm(code, address, 1), None)
-    if found is None:
+    decoded = next(engine.disasm(code, address, 1), None)
+    if decoded is None:
         return None
-    operands = _operands_of(found)
+    operands = _operands_of(decoded)
     return Instruction(
         address=address,
-        raw=code[: found.size],
-        mnemonic=found.mnemonic,
-        text=f"{found.mnemonic} {found.op_str}".strip(),
+        raw=code[: decoded.size],
+        mnemonic=decoded.mnemonic,
+        text=f"{decoded.mnemonic} {decoded.op_str}".strip(),
         reads=tuple(operands.reads.values()),
         writes=tuple(operands.writes.values()),
-        memory=(*_memory(found, operands), *_stack(found)),
-        elements=_elements(found.mnemonic),
-        scalar=found.mnemonic.endswith(("sd", "ss")) and "broadcast" not in found.mnemonic,
-        branches=not BRANCHES.isdisjoint(found.groups),
-        run_over=_run_over(found),
+        memory=(*_memory(decoded, operands), *_stack(decoded)),
+        elements=_elements(decoded.mnemonic),
+        scalar=decoded.mnemonic.endswith(("sd", "ss")) and "broadcast" not in decoded.mnemonic,
+        branches=not BRANCHES.isdisjoint(decoded.groups),
+        run_over=_run_over(decoded),
     )
 
 
-def _run_over(found: Any) -> bool:
-    """True if one single step is not enough, or leaves a trace.
+def _run_over(decoded: Any) -> bool:
+    """Return True if a single step does not suffice or leaves a trace.
 
     A step executes one iteration of a repeated string instruction. `rep ret` is a plain return.
-    After a step over a pop of the flags, Linux takes the trap flag for the program's own
-    (`enable_single_step` in arch/x86/kernel/step.c), and would leave it set.
+    After a step over a pop of the flags, Linux attributes the trap flag to the program
+    (`enable_single_step` in arch/x86/kernel/step.c) and leaves it set.
     """
-    repeated = found.mnemonic.startswith("rep") and BRANCHES.isdisjoint(found.groups)
-    return repeated or found.mnemonic in ("popfq", "popf")
+    repeated = decoded.mnemonic.startswith("rep") and BRANCHES.isdisjoint(decoded.groups)
+    return repeated or decoded.mnemonic in ("popfq", "popf")
 
 
 _FLOATS = {"sd": "float64", "pd": "float64", "ss": "float32", "ps": "float32"}
@@ -147,12 +147,12 @@ def _elements(mnemonic: str) -> tuple[str | None, str | None]:
     return element, element
 
 
-def _memory(found: Any, operands: _Operands) -> list[MemoryUse]:
-    if found.mnemonic == "lea":
+def _memory(decoded: Any, operands: _Operands) -> list[MemoryUse]:
+    if decoded.mnemonic == "lea":
         return []
 
     def name(number: int) -> str | None:
-        return str(found.reg_name(number)) if number else None
+        return str(decoded.reg_name(number)) if number else None
 
     return [
         MemoryUse(
@@ -166,13 +166,13 @@ def _memory(found: Any, operands: _Operands) -> list[MemoryUse]:
             reads=bool(bits.reads),
             writes=bool(bits.writes),
         )
-        for op, bits in zip(found.operands, operands.explicit, strict=True)
+        for op, bits in zip(decoded.operands, operands.explicit, strict=True)
         if op.type == x86.X86_OP_MEM and (mask := bits.reads | bits.writes)
     ]
 
 
-def _stack(found: Any) -> list[MemoryUse]:
-    mnemonic = found.mnemonic.split()[-1]  # without rep, bnd or notrack
+def _stack(decoded: Any) -> list[MemoryUse]:
+    mnemonic = decoded.mnemonic.split()[-1]  # without rep, bnd or notrack
     if mnemonic.startswith(("push", "call")):
         displacement, reads = -8, False
     elif mnemonic.startswith(("pop", "ret", "leave")) and not mnemonic.startswith("popcnt"):
@@ -202,7 +202,7 @@ _X87 = re.compile(r"st\((\d)\)$")
 
 @dataclass(frozen=True, slots=True)
 class _Named:
-    """A register as an operand names it: bits `shift` to `shift` + `width` of the full one."""
+    """A register of an operand: bits `shift` to `shift` + `width` of the full register."""
 
     full: str
     shift: int
@@ -231,7 +231,7 @@ _GENERAL = _general_names()
 
 @functools.cache
 def _named(name: str) -> _Named | None:
-    """None for flags, which are named bit by bit, and for segments and control words.
+    """Return the register of a name; None for flags, segments and control words.
 
     A vector register has its 512-bit name on every processor, so that records are equal.
     """
@@ -253,7 +253,7 @@ class _Operands:
     explicit: tuple[Touched, ...] = ()  # of each operand that the assembler names
 
     def touch(self, name: str, bits: Touched, *, explicit: bool = False) -> None:
-        """Note bits of a register, counted from the lowest that the name covers."""
+        """Add bits of a register, counted from the lowest bit of the name."""
         named = _named(name)
         if named is None:
             return
@@ -265,7 +265,7 @@ class _Operands:
             self._add(self.writes, name, named.full, written, cleared, explicit)
 
     def flag(self, name: str, *, reads: bool, defined: bool, clears: bool) -> None:
-        """Note a flag; one that the manual leaves undefined has no mask."""
+        """Add a flag; a flag that the manual leaves undefined has no mask."""
         bit = 1 << FLAG_BITS[name]
         (self.reads if reads else self.writes)[name] = RegisterUse(
             register="rflags", mask=bit * defined, clears=bit * clears, explicit=False, operand=name
@@ -284,45 +284,47 @@ class _Operands:
         )
 
 
-def _operands_of(found: Any) -> _Operands:
-    """What an instruction, as capstone decodes it, reads and writes."""
-    vector = vector_bits(found)
-    all_of = _Operands(explicit=_bits(found) if vector is None else vector)
-    for op, bits in zip(found.operands, all_of.explicit, strict=True):
+def _operands_of(decoded: Any) -> _Operands:
+    """Return what a decoded instruction reads and writes."""
+    vector = vector_bits(decoded)
+    all_of = _Operands(explicit=_bits(decoded) if vector is None else vector)
+    for op, bits in zip(decoded.operands, all_of.explicit, strict=True):
         if op.type == x86.X86_OP_REG:
-            all_of.touch(found.reg_name(op.reg), bits, explicit=True)
-        elif op.type == x86.X86_OP_MEM and not found.mnemonic.startswith(_NO_ADDRESS):
-            _address(found, op, all_of)
-    for name, bits in _implicit(found):
+            all_of.touch(decoded.reg_name(op.reg), bits, explicit=True)
+        elif op.type == x86.X86_OP_MEM and not decoded.mnemonic.startswith(_NO_ADDRESS):
+            _address(decoded, op, all_of)
+    for name, bits in _implicit(decoded):
         all_of.touch(name, bits)
-    if x86.X86_GRP_FPU not in found.groups:
-        _flags(found, all_of, vector is not None)
+    if x86.X86_GRP_FPU not in decoded.groups:
+        _flags(decoded, all_of, vector is not None)
     return all_of
 
 
 _NO_ADDRESS = ("nop", "prefetch")
 
 
-def _address(found: Any, op: Any, all_of: _Operands) -> None:
-    """Base and index; what the scale or a short result cuts off of them is not read."""
-    width = 8 * found.operands[0].size if found.mnemonic == "lea" else 64
+def _address(decoded: Any, op: Any, all_of: _Operands) -> None:
+    """Add base and index, without the bits that the scale or a short result discards."""
+    width = 8 * decoded.operands[0].size if decoded.mnemonic == "lea" else 64
     if op.mem.base and not (op.mem.index == op.mem.base and op.mem.scale == 1):
-        all_of.touch(found.reg_name(op.mem.base), Touched(reads=_kept(found, op.mem.base, width)))
+        all_of.touch(
+            decoded.reg_name(op.mem.base), Touched(reads=_kept(decoded, op.mem.base, width))
+        )
     if op.mem.index:
         twice = op.mem.index == op.mem.base and op.mem.scale == 1
         shift = op.mem.scale.bit_length() - 1 + twice
-        mask = _kept(found, op.mem.index, width, shift)
-        all_of.touch(found.reg_name(op.mem.index), Touched(reads=mask))
+        mask = _kept(decoded, op.mem.index, width, shift)
+        all_of.touch(decoded.reg_name(op.mem.index), Touched(reads=mask))
 
 
-def _kept(found: Any, register: int, width: int, shift: int = 0) -> int:
-    named = _named(found.reg_name(register))
-    if named is None or VECTOR.match(found.reg_name(register)):
+def _kept(decoded: Any, register: int, width: int, shift: int = 0) -> int:
+    named = _named(decoded.reg_name(register))
+    if named is None or VECTOR.match(decoded.reg_name(register)):
         return ALL if named is None else low(named.width)
     return low(min(width, named.width) - shift)
 
 
-# -- operands that the assembler names
+# -- explicit operands
 
 
 _ZEROING = ("xor", "sub", "sbb")
@@ -334,32 +336,32 @@ _COUNTED = {"shlx": 0, "shrx": 0, "sarx": 0, "bextr": 16, "bzhi": 8}  # bits of 
 _BIT_TESTS = ("bt", "bts", "btr", "btc")
 
 
-def _bits(found: Any) -> tuple[Touched, ...]:
-    if found.mnemonic.startswith(_NO_ADDRESS):
-        return tuple(Touched() for _ in found.operands)
-    touched = tuple(_default(op, 8 * op.size) for op in found.operands)
-    _except(found, touched)
+def _bits(decoded: Any) -> tuple[Touched, ...]:
+    if decoded.mnemonic.startswith(_NO_ADDRESS):
+        return tuple(Touched() for _ in decoded.operands)
+    touched = tuple(_default(op, 8 * op.size) for op in decoded.operands)
+    _except(decoded, touched)
     return touched
 
 
 def _default(op: Any, width: int) -> Touched:
-    """Capstone's access; an operand is as wide as it is named."""
+    """Return the bits by capstone's access flags, as wide as the operand's name."""
     mask = low(width)
     reads, writes = bool(op.access & capstone.CS_AC_READ), bool(op.access & capstone.CS_AC_WRITE)
     whole = mask if width < 32 else low(max(64, width))
     return Touched(reads=mask * reads, writes=mask * writes, clears=whole * writes)
 
 
-def _except(found: Any, touched: tuple[Touched, ...]) -> None:
-    """Change what capstone's access flags do not say."""
-    name = found.mnemonic.split()[-1]  # without lock or rep
-    names = [found.reg_name(op.reg) for op in found.operands if op.type == x86.X86_OP_REG]
-    width = 8 * found.operands[0].size if found.operands else 0
+def _except(decoded: Any, touched: tuple[Touched, ...]) -> None:
+    """Correct the bits where capstone's access flags are wrong."""
+    name = decoded.mnemonic.split()[-1]  # without lock or rep
+    names = [decoded.reg_name(op.reg) for op in decoded.operands if op.type == x86.X86_OP_REG]
+    width = 8 * decoded.operands[0].size if decoded.operands else 0
     if name in _ZEROING and len(names) == 2 and names[0] == names[1]:
         touched[0].reads = touched[1].reads = 0
-    elif name.startswith("cmov"):  # it may not write, but clears the upper half anyway
+    elif name.startswith("cmov"):  # it does not always write, but always clears the upper half
         touched[0].reads, touched[0].clears = 0, _FULL & ~low(32) if width == 32 else 0
-    elif name.startswith("set"):  # capstone has it read its memory
+    elif name.startswith("set"):  # capstone reports a read of its memory
         touched[0].reads, touched[0].writes, touched[0].clears = 0, low(8), low(8)
     elif name in ("bsf", "bsr"):  # it does not write if the source is zero
         touched[0].clears = 0
@@ -372,43 +374,46 @@ def _except(found: Any, touched: tuple[Touched, ...]) -> None:
     elif name == "cmpxchg":
         touched[0].reads = touched[0].writes = low(width)
         touched[0].clears = 0
-    elif name.startswith(("cmps", "scas")):  # capstone has them read nothing
-        for each in touched:
-            each.reads |= low(width)
+    elif name.startswith(("cmps", "scas")):  # capstone reports no reads
+        for bits in touched:
+            bits.reads |= low(width)
     elif match := _MASK_OPERATION.match(name):
-        _opmask(found, touched, match[1], {"b": 8, "w": 16, "d": 32, "q": 64}[match[2]])
+        _opmask(decoded, touched, match[1], {"b": 8, "w": 16, "d": 32, "q": 64}[match[2]])
 
 
-def _opmask(found: Any, touched: tuple[Touched, ...], name: str, width: int) -> None:
-    """Capstone gives all masks 16 bits; the suffix says how many count."""
-    for op, bits in zip(found.operands, touched, strict=True):
+def _opmask(decoded: Any, touched: tuple[Touched, ...], name: str, width: int) -> None:
+    """Limit opmasks to the width of the suffix; capstone gives all of them 16 bits."""
+    for op, bits in zip(decoded.operands, touched, strict=True):
         if op.type == x86.X86_OP_REG:
             read = width // 2 if name.startswith("unpck") else width
             bits.reads = bits.reads and low(read)
             bits.writes, bits.clears = bits.writes and low(width), bits.writes and _FULL
 
 
-# -- operands that it does not name
+# -- implicit operands
 
 
 _SIGN_COPIES = {"cwd": ("ax", "dx"), "cdq": ("eax", "edx"), "cqo": ("rax", "rdx")}
 _CALL_READS = ("rax", "rdi", "rsi", "rdx", "r10", "r8", "r9")
 
 
-def _implicit(found: Any) -> Iterator[tuple[str, Touched]]:
-    name = found.mnemonic
+def _implicit(decoded: Any) -> Iterator[tuple[str, Touched]]:
+    name = decoded.mnemonic
     if pair := _SIGN_COPIES.get(name):
         width = _GENERAL[pair[0]].width
         yield pair[0], Touched(reads=1 << width - 1)
         yield pair[1], _whole(pair[1])
         return
-    named = {op.reg for op in found.operands if op.type == x86.X86_OP_REG}
-    for register in [each for each in found.regs_read if each not in named]:
-        if not (name == "leave" and found.reg_name(register) == "rsp"):
-            yield found.reg_name(register), Touched(reads=_whole(found.reg_name(register)).writes)
-    for register in found.regs_write:
-        yield found.reg_name(register), _written(name, found.reg_name(register))
-    yield from _hidden(found)
+    named = {op.reg for op in decoded.operands if op.type == x86.X86_OP_REG}
+    for register in [number for number in decoded.regs_read if number not in named]:
+        if not (name == "leave" and decoded.reg_name(register) == "rsp"):
+            yield (
+                decoded.reg_name(register),
+                Touched(reads=_whole(decoded.reg_name(register)).writes),
+            )
+    for register in decoded.regs_write:
+        yield decoded.reg_name(register), _written(name, decoded.reg_name(register))
+    yield from _hidden(decoded)
 
 
 def _whole(name: str) -> Touched:
@@ -425,18 +430,18 @@ def _written(mnemonic: str, name: str) -> Touched:
     return _whole(name)
 
 
-def _hidden(found: Any) -> Iterator[tuple[str, Touched]]:
-    """Registers that capstone does not name: of a system call, the x87 stack top, cmpxchg."""
-    name = found.mnemonic.split()[-1]
+def _hidden(decoded: Any) -> Iterator[tuple[str, Touched]]:
+    """Yield registers that capstone omits: of system calls, the x87 stack top, cmpxchg."""
+    name = decoded.mnemonic.split()[-1]
     if name == "syscall":
         for register in _CALL_READS:
             yield register, Touched(reads=_FULL)
         for register in ("rax", "rcx", "r11"):
             yield register, _whole(register)
     elif name == "cmpxchg":
-        accumulator = {1: "al", 2: "ax", 4: "eax", 8: "rax"}[found.operands[0].size]
+        accumulator = {1: "al", 2: "ax", 4: "eax", 8: "rax"}[decoded.operands[0].size]
         yield accumulator, Touched(writes=_whole(accumulator).writes)
-    elif x86.X86_GRP_FPU in found.groups:
+    elif x86.X86_GRP_FPU in decoded.groups:
         if not name.startswith(("fld", "fild", "fbld")):
             yield "st(0)", Touched(reads=low(80))
         if not name.startswith(("fst", "fist", "fcom", "fucom", "ftst", "fxam")):
@@ -450,7 +455,7 @@ _VECTOR_TESTS = re.compile(r"v?u?comis|v?p?test(p[sd])?$|v?pcmp[ei]str|kortest|k
 _ARITHMETIC_FLAGS = tuple(name for name in FLAG_BITS if name != "df")
 _STRINGS = re.compile(r"(movs|stos|lods|scas|cmps|ins|outs)[bwdq]$|pushf")
 _DIRECTIONS = ("cld", "std", "popf")
-# What capstone's tables lack: flags that are read, and written.
+# Flags that capstone's tables omit: read, written.
 _LACKING_READS = {
     **dict.fromkeys(("rcl", "rcr", "cmc"), ("cf",)), "lahf": ("cf", "pf", "af", "zf", "sf"),
 }  # fmt: skip
@@ -465,19 +470,21 @@ _FLAGS = {
 _FLAGS["of", "RESET"] |= x86.X86_EFLAGS_RESET_0F  # capstone spells it with a zero
 
 
-def _flags(found: Any, all_of: _Operands, vector: bool) -> None:
-    mnemonic = found.mnemonic.split()[-1]
-    if vector or mnemonic.startswith("k"):  # capstone has the flags of a namesake
+def _flags(decoded: Any, all_of: _Operands, vector: bool) -> None:
+    mnemonic = decoded.mnemonic.split()[-1]
+    if vector or mnemonic.startswith(
+        "k"
+    ):  # capstone has the flags of an instruction of the same name
         for name in _ARITHMETIC_FLAGS if _VECTOR_TESTS.match(mnemonic) else ():
             all_of.flag(name, reads=False, defined=True, clears=True)
         return
-    by_count = mnemonic in _SHIFTS and found.op_str.endswith("cl")  # zero changes no flag
+    by_count = mnemonic in _SHIFTS and decoded.op_str.endswith("cl")  # zero changes no flag
     if _STRINGS.match(mnemonic):
         all_of.flag("df", reads=True, defined=True, clears=False)
     elif mnemonic.startswith(_DIRECTIONS):
         all_of.flag("df", reads=False, defined=True, clears=True)
     for name in _ARITHMETIC_FLAGS:
-        how = {each for each in _HOW if found.eflags & _FLAGS[name, each]}
+        how = {use for use in _HOW if decoded.eflags & _FLAGS[name, use]}
         if "TEST" in how or name in _LACKING_READS.get(mnemonic, ()):
             all_of.flag(name, reads=True, defined=True, clears=False)
         if how - {"TEST"} or name in _LACKING_WRITES.get(mnemonic, ()):

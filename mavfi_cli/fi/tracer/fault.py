@@ -1,9 +1,9 @@
 """Instruction-level faults, fully resolved, and the strategies by which they are drawn.
 
-Every result names its strategy: a sampling rule with a fault model, or another injector that is
-imitated so that published numbers can be compared. The released sources are the reference: ROSFI as
+Every result names its strategy: a sampling rule with a fault model, or an emulated injector, for
+comparison with published numbers. The released sources are the reference: ROSFI as
 in MAVBench/MAV_apps, branch mavfi, and PINFI as in DependableSystemsLab/pinfi, e14c129.
-docs/reference/instructions.md says what they do and where we differ.
+docs/reference/instructions.md describes both and our differences.
 """
 
 from __future__ import annotations
@@ -67,15 +67,15 @@ class InstructionCorruption:
     role: Role
     register: str  # the full register; empty for opcode and memory
     operand: str  # as the assembler names it
-    bits: tuple[int, ...]  # of the full register, of the opcode bytes, or of the memory operand
+    bits: tuple[int, ...]  # bits of the full register, opcode bytes or memory operand
     memory_operand: int = 0  # index among the instruction's memory operands
-    inverts: str = ""  # a conditional jump: only bits that make it go the other way are struck
+    inverts: str = ""  # only bits that invert the decision of a conditional jump are flipped
 
     def struck(self, flags: int) -> tuple[int, ...]:
-        """The bits that are inverted, given all flags if it inverts a jump.
+        """Return the inverted bits, given all flags if the corruption inverts a jump.
 
-        Where the jump tests two conditions ("below" or "equal"), each that holds is undone; if none
-        does, "equal" is made to hold.
+        If the jump tests two conditions ("below" or "equal"), all that hold are negated. If none
+        holds, "equal" is made to hold.
         """
         if not self.inverts:
             return self.bits
@@ -90,8 +90,8 @@ class InstructionCorruption:
     def to_json(self) -> dict[str, Any]:
         """The corruption part of a record."""
         names = {"site": self.site.value, "role": self.role.value, "bits": list(self.bits)}
-        told = asdict(self) | names
-        return told if self.inverts else {k: v for k, v in told.items() if k != "inverts"}
+        values = asdict(self) | names
+        return values if self.inverts else {k: v for k, v in values.items() if k != "inverts"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,10 +124,10 @@ class FaultModel:
     def named(
         cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
     ) -> FaultModel:
-        """Make a model from names; no site means the data registers, no role means both.
+        """Make a model from names. Without sites it has the data registers, without roles both.
 
         Raises:
-            UnknownName: a name that does not exist; names the nearest.
+            UnknownName: a name does not exist; the message suggests the nearest.
         """
         default = cls()
         return cls(
@@ -138,7 +138,7 @@ class FaultModel:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The model as plain values, without the peculiarities of compat modes."""
+        """Return the model as plain values, without the fields of compat modes."""
         return {
             "sites": sorted(site.value for site in self.sites),
             "roles": sorted(role.value for role in self.roles),
@@ -147,7 +147,7 @@ class FaultModel:
         }
 
 
-_Operand = tuple[InstructionCorruption, int]  # a corruption without bits, and those to draw from
+_Operand = tuple[InstructionCorruption, int]  # a corruption without bits, and the bits to draw from
 
 
 def _draw_corruption(
@@ -172,14 +172,14 @@ def _draw_corruption(
 
 
 def _operands(instruction: Instruction, model: FaultModel) -> list[_Operand]:
-    found: list[_Operand] = []
+    operands: list[_Operand] = []
     for role, uses in ((Role.SOURCE, instruction.reads), (Role.DESTINATION, instruction.writes)):
         if role in model.roles:
-            found += _registers(instruction, model, role, uses)
-            found += _memory(instruction, model, role)
+            operands += _registers(instruction, model, role, uses)
+            operands += _memory(instruction, model, role)
     if model.field is Field.ANY:
-        found += _control(instruction, model)
-    return found
+        operands += _control(instruction, model)
+    return operands
 
 
 def _operand(
@@ -231,18 +231,18 @@ def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Op
 
 
 def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
-    found = []
+    operands = []
     if Site.INSTRUCTION_POINTER in model.sites:
         mask = (1 << width_of("rip")) - 1
-        found.append(_operand(Site.INSTRUCTION_POINTER, Role.DESTINATION, mask, "rip", "rip"))
+        operands.append(_operand(Site.INSTRUCTION_POINTER, Role.DESTINATION, mask, "rip", "rip"))
     if Site.OPCODE in model.sites:
         mask = (1 << 8 * len(instruction.raw)) - 1
-        found.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
-    return found
+        operands.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
+    return operands
 
 
 def _site_of(register: str) -> Site:
-    """The site that a full register is."""
+    """Return the site of a full register."""
     return _SITES.get(register.rstrip("0123456789"), Site.GENERAL)
 
 
@@ -261,35 +261,35 @@ Draw = Callable[
 
 
 class Rule(Enum):
-    """How the moment of a fault is drawn."""
+    """How the time of a fault is drawn."""
 
     INSTRUCTION = "instruction-uniform"  # every executed instruction in scope is equally likely
-    CPU_TIME = "cpu-time"  # a moment of the CPU time of the fault-free run
-    WALL_CLOCK = "wall-clock"  # a moment of the duration of the fault-free run
+    CPU_TIME = "cpu-time"  # uniform over the CPU time of the fault-free run
+    WALL_CLOCK = "wall-clock"  # uniform over the wall-clock time of the fault-free run
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strategy:
-    """A sampling rule with its peculiarities."""
+    """A sampling rule, and the deviations of an emulated injector."""
 
     name: str
     rule: Rule
     model: FaultModel
-    imitates: Draw | None = None  # another injector, instead of the model
-    attempts: int = 1  # time rules: how many moments are tried
-    retry_s: float = 0.0  # time rules: how much later
-    whole_process: bool = False  # hits code out of scope as well
-    in_system_calls: bool = False  # hits a thread that waits in the operating system as well
+    imitates: Draw | None = None  # draws as another injector, in place of the model
+    attempts: int = 1  # time rules: maximum number of attempts
+    retry_s: float = 0.0  # time rules: delay between attempts
+    whole_process: bool = False  # also hits code out of scope
+    in_system_calls: bool = False  # also hits a thread that waits in the operating system
 
     @classmethod
     def of(
         cls, name: str, model: FaultModel | None = None, *, compat: str | None = None
     ) -> Strategy:
-        """The strategy of a sampling rule, or of another injector that is imitated.
+        """Return the strategy of a sampling rule or of an emulated injector.
 
         Raises:
-            UnknownName: no such rule or compatibility mode; names the nearest.
-            FaultSpecError: an injector that is imitated chooses operands and bits by its own rule.
+            UnknownName: no such rule or compatibility mode; the message suggests the nearest.
+            FaultSpecError: an emulated injector chooses operands and bits by its own rule.
         """
         if compat is not None:
             if compat not in COMPAT:
@@ -308,7 +308,7 @@ class Strategy:
         rng: np.random.Generator,
         following: Instruction | None = None,
     ) -> InstructionCorruption | None:
-        """Draw a corruption of an instruction, given the next one; None gives it up."""
+        """Draw a corruption of an instruction, given the next one; None if there is none."""
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
         return _draw_corruption(instruction, self.model, rng)
@@ -344,10 +344,10 @@ def _draw_pinfi(
 ) -> InstructionCorruption | None:
     """PINFI: one bit of a register that the instruction writes, after it has executed.
 
-    The flags are struck only where no other register is written: to invert the conditional jump
-    that follows, or else as 64 bits, most of which are no flag and change nothing. Without such a
-    jump, an instruction that also writes memory has a bit of its memory operand struck before it
-    executes.
+    Flags are flipped only if no other register is written: to invert the conditional jump that
+    follows, or else as 64 bits, most of which are not flags and change nothing. Without such a
+    jump, a bit of the memory operand of an instruction that also writes memory is flipped before
+    it executes.
     """
     written = [use for use in instruction.writes if use.mask]
     if instruction.branches or not written:
@@ -373,7 +373,7 @@ def _draw_pinfi_with_bugs(
 ) -> InstructionCorruption | None:
     """PINFI with its bugs: it numbers a vector register by the last digit of its name.
 
-    So xmm10 to xmm15 are taken for xmm0 to xmm5. A bit of a YMM register is sought in its upper
+    So it takes xmm10 to xmm15 for xmm0 to xmm5, and looks for a bit of a YMM register in its upper
     half.
     """
     drawn = _draw_pinfi(instruction, following, rng)

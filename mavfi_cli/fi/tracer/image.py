@@ -5,7 +5,7 @@ A location is `(object, offset)`. For an ELF object the offset is the address th
 code without a file (numba) is a named region, with offsets from its start.
 
 Functions are read from the raw symbol tables, because a library of 10 MB has tens of thousands of
-them and a mission waits for the answer.
+them and a slower reader would delay the mission.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class _ElfFacts:
     def function_at(self, address: int) -> Function | None:
         """The function that holds a linked address.
 
-        If several start at one address, the last of the greatest size and name counts. A
-        function without a size reaches to the next.
+        If several start at one address, the largest one with the last name is returned. A
+        function without a size extends to the next.
         """
         end = bisect.bisect_right(self.functions, address, key=attrgetter("start"))
         if not end:
@@ -127,7 +127,7 @@ def _functions(elf: Any) -> Iterator[Function]:
 
 
 def short_name(symbol: str) -> str:
-    """The plain name of a function in a mangled one: the last part of its qualified name."""
+    """Return the last part of the qualified name in a mangled function name."""
     mangled = symbol.partition("+")[0]
     for size in re.finditer(r"\d+", mangled):
         end = size.end() + int(size.group())
@@ -139,7 +139,7 @@ def short_name(symbol: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """One instruction, wherever its object is loaded."""
+    """One instruction, independent of the load address of its object."""
 
     object: str  # file name of the object, or the name of a region
     offset: int
@@ -189,14 +189,14 @@ class Region:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """The only code of an object that counts as its text."""
+    """The part of an object that counts as its text."""
 
     text: tuple[range, ...]  # offsets, ascending
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scope:
-    """The code that may be hit: the text of these objects, as addresses of one process."""
+    """The code in scope: the text of these objects, as addresses of one process."""
 
     objects: tuple[str, ...]
     spans: tuple[range, ...]
@@ -276,10 +276,10 @@ class Image:
         Raises:
             UnknownName: no such object is loaded.
         """
-        found = self.find(name)
-        if found is None:
+        loaded = self.find(name)
+        if loaded is None:
             raise UnknownName("object", name, [n for n in self.names if self.find(n) is not None])
-        return found
+        return loaded
 
     def locate(self, address: int) -> Location:
         """The location of an address; unknown memory is the object `?`."""
@@ -301,20 +301,20 @@ class Image:
         loaded = self.find(location.object)
         if loaded is None or loaded.facts is None:
             return ""
-        found = loaded.facts.function_at(location.offset)
-        return "" if found is None else f"{found.name}+{location.offset - found.start:#x}"
+        function = loaded.facts.function_at(location.offset)
+        return "" if function is None else f"{function.name}+{location.offset - function.start:#x}"
 
     def function(self, name: str, objects: Iterable[str]) -> Location:
         """The entry of a function in one of the named objects.
 
         Raises:
-            UnknownName: none of them has it; names the nearest.
+            UnknownName: none of them has it; the message suggests the nearest.
         """
         known: list[str] = []
         for loaded in map(self.named, objects):
-            found = next((each for each in loaded.functions if each.name == name), None)
-            if found is not None:
-                return Location(loaded.name, found.start)
+            function = next((entry for entry in loaded.functions if entry.name == name), None)
+            if function is not None:
+                return Location(loaded.name, function.start)
             known += [function.name for function in loaded.functions]
         raise UnknownName("function", name, known[:200])
 
@@ -322,7 +322,7 @@ class Image:
         """The text of the named objects.
 
         Raises:
-            UnknownName: an object is not loaded; names the nearest.
+            UnknownName: an object is not loaded; the message suggests the nearest.
         """
         names = tuple(objects)
         spans = [
@@ -341,7 +341,7 @@ def _mappings(pid: int) -> Iterator[_Mapping]:
 
 
 def executable_mapping(pid: int, address: int) -> range:
-    """The executable mapping that holds an address: the region of a just-in-time compiled kernel.
+    """Return the executable mapping of an address: the region of a JIT-compiled kernel.
 
     Raises:
         FaultError: nothing executable is mapped there.

@@ -1,4 +1,4 @@
-"""Corrupts a stopped thread, verifies the corruption, and follows what happens to it."""
+"""Corrupts a stopped thread, verifies the corruption and follows its effect."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Injection:
     """The result of corrupting at the stop."""
 
     applied: bool
-    reason: str  # why it was not applied, else empty
-    address: int  # of the corrupted memory or opcode, else of the instruction
+    reason: str  # why it was not applied; empty if it was
+    address: int  # address of the corrupted memory or opcode, otherwise of the instruction
     before: int  # the full register, the opcode bytes or the memory operand
     after: int  # as read back
-    stop_s: float  # from the report of the stop until the thread runs on
+    stop_s: float  # time from the stop's report until the thread resumes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ NOTHING = Followed(activation=BitActivation.NOT_INJECTED, after_instructions=0)
 
 
 def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
-    """Run to the exact execution that the trigger names.
+    """Run to the exact execution of the trigger.
 
     Returns:
         Why it was not reached, or the empty string.
@@ -72,7 +72,7 @@ def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
 
 
 def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
-    """Execute one whole instruction without leaving a trace of the trap flag in the target.
+    """Execute one whole instruction and leave no trap flag in the target.
 
     Returns:
         The end of the program, if it ended.
@@ -106,7 +106,7 @@ def _apply(
 ) -> Injection:
     """Invert the bits at the stop in front of `instruction`.
 
-    A destination is corrupted after the instruction has executed. The result is read back: a
+    A destination is corrupted after the instruction has executed. The result is read back. A
     change that the operating system discards or refuses counts as not applied.
     """
     start = time.perf_counter_ns()
@@ -202,7 +202,7 @@ def _follow(
 def strike(
     tracee: Tracee, fault: InstructionFault, *, window: int
 ) -> tuple[Injection | None, Followed]:
-    """Corrupt the target at the stop in front of the attacked instruction, and follow.
+    """Corrupt the target at the stop in front of the attacked instruction; follow the bits.
 
     Args:
         tracee: the process, stopped there.
@@ -214,8 +214,8 @@ def strike(
     """
     instruction = instruction_at(tracee, tracee.registers.ip)
     if instruction is None or instruction.raw != fault.instruction_bytes:
-        found = "nothing" if instruction is None else instruction.text
-        raise FaultError(f"{fault.target} holds {found!r}, expected {fault.instruction!r}")
+        text = "nothing" if instruction is None else instruction.text
+        raise FaultError(f"{fault.target} must hold {fault.instruction!r}, got {text!r}")
     if fault.corruption is None:
         return None, NOTHING
     injection = _apply(tracee, instruction, fault.corruption)
@@ -230,7 +230,7 @@ def _touch(
     place: int,
     remaining: int,
 ) -> tuple[bool, int]:
-    """Tell whether an instruction reads the remaining bits, and which it leaves."""
+    """Return whether an instruction reads the remaining bits, and the bits that it leaves."""
     if corruption.site is Site.MEMORY:
         return _touch_memory(tracee, current, place, remaining)
     register = corruption.register

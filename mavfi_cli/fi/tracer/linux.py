@@ -69,7 +69,7 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
 
 
 def require_supported() -> None:
-    """Refuse to trace on a processor that the tracer does not know.
+    """Refuse to trace on an unsupported processor.
 
     Raises:
         TracingForbidden: this is not x86-64 Linux.
@@ -86,7 +86,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
     """Attach without stopping; new threads and children are attached by the kernel.
 
     Raises:
-        TracingForbidden: the operating system refuses; the error says how to allow it.
+        TracingForbidden: the operating system refuses; the message explains how to allow it.
         ProcessLookupError: no such thread.
     """
     require_supported()
@@ -149,7 +149,7 @@ def fixed_addresses() -> Iterator[None]:
     """Start programs inside without address-space randomisation, so that addresses repeat."""
     before = int(_personality(0xFFFF_FFFF))
     if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
-        yield  # a sandbox may refuse: then offsets still repeat, but addresses do not
+        yield  # a sandbox may refuse; then only offsets repeat, not addresses
         return
     try:
         yield
@@ -158,10 +158,10 @@ def fixed_addresses() -> Iterator[None]:
 
 
 def share_processor(pid: int) -> None:
-    """Pin the calling thread and the main thread of `pid` to the processor where that ran last.
+    """Pin the calling thread and the main thread of `pid` to the processor where `pid` ran last.
 
-    Tracer and target switch at every step; on one processor that costs half. Nothing unpins
-    them, so call it only from a thread and for a process that were made for this.
+    Tracer and target alternate at every step, which is twice as fast on one processor. Nothing
+    unpins them, so call it only from a thread, and for a process, made for this.
     """
     stat = Path(f"/proc/{pid}/stat").read_text()
     processor = int(stat.rpartition(")")[2].split()[36])  # field 39, proc_pid_stat(5)
@@ -189,7 +189,7 @@ class Status:
 
     @property
     def stopped(self) -> bool:
-        """True if the thread waits for us."""
+        """True if the thread is stopped and waits for the tracer."""
         return os.WIFSTOPPED(self.raw)
 
     @property
@@ -217,18 +217,18 @@ def wait(tid: int) -> Status:
     """Wait for the next report of one thread, or of any with -1.
 
     Raises:
-        ChildProcessError: there is nobody to wait for.
+        ChildProcessError: there is no thread to wait for.
     """
-    found, raw = os.waitpid(tid, WALL)
-    return Status(found, raw)
+    stopped, raw = os.waitpid(tid, WALL)
+    return Status(stopped, raw)
 
 
 class ProcessTimer:
     """A timer on one process; leaving its context cancels it.
 
     It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
-    `wall_s` have passed, whichever is set and comes first. `fired` is true once it has. If it
-    has killed a stopped process, the next request to that leaves the context without an error.
+    `wall_s` have passed, whichever is set and comes first. `fired` is true from then on. If it
+    has killed a stopped process, the next request to it leaves the context without an error.
     """
 
     def __init__(
@@ -265,8 +265,8 @@ class ProcessTimer:
         try:
             signal.pidfd_send_signal(self._process, self._signal)
         except ProcessLookupError:
-            self.fired = False  # the process had ended
+            self.fired = False  # the process has ended
 
     def _left_s(self) -> float:
-        """Lower bound of the time left; CPU time passes no faster than wall time."""
+        """Lower bound of the remaining time; CPU time is not faster than wall-clock time."""
         return min(end_s - clock() for clock, end_s in self._ends)

@@ -1,7 +1,7 @@
-"""The fault record: one JSON file that says what will be hit, and then what was hit.
+"""The fault record, a JSON file that states what will be hit, and then what was hit.
 
-It is flushed to the disk *before* the target runs to the trigger, so that it survives whatever the
-fault does. It is completed afterwards. Each write leaves the old file or the new one, never a
+It is flushed to the disk *before* the target runs to the trigger, so that it survives any effect
+of the fault. It is completed afterwards. Each write leaves the old file or the new one, never a
 partial one.
 """
 
@@ -26,11 +26,11 @@ from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.inject import Followed, Injection
 from mavfi_cli.fi.tracer.record_fields import FaultRecord, StageRecord
 
-VERSION = 2  # 1 took whole registers for operands
+VERSION = 2  # version 1 had whole registers as operands
 
 
 def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecord:
-    """Make the record before the flip.
+    """Return the record before the flip.
 
     Args:
         image: image of the process, for symbols and build ids.
@@ -69,7 +69,7 @@ def _stage_to_json(stage: CountedStop) -> StageRecord:
 def completed(
     record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
 ) -> FaultRecord:
-    """Make the record after the run; `injection` is None if the trigger was not reached."""
+    """Return the record after the run; `injection` is None if the trigger was not reached."""
     what: dict[str, Any] = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}
@@ -116,7 +116,8 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
     """Refuse a record whose objects are not the loaded ones.
 
     Raises:
-        BuildMismatch: an object is missing or of another build; names each.
+        BuildMismatch: an object is missing or of another build; the message names all such
+            objects.
     """
     differences = []
     for name, build_id in record["build_ids"].items():
@@ -142,7 +143,7 @@ def read(path: Path) -> FaultRecord:
     """Read a record.
 
     Raises:
-        RecordError: no such file, or not a fault record.
+        RecordError: no such file, or it is not a fault record.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

@@ -2,7 +2,7 @@
 
 Layouts: `user_regs_struct` of `<sys/user.h>`; FXSAVE and XSAVE areas of Intel SDM volume 1,
 sections 10.5 and 13.4. The XSAVE offsets differ between processors: leaf 0xD of CPUID gives them
-(section 13.5), through a few bytes of machine code in an executable page.
+(section 13.5), which a few bytes of machine code execute.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ GENERAL = tuple(_GENERAL.split())
 FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
 _VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
 _X87 = re.compile(r"(st|mm|k)(\d)$")
-FLAGS = sum(1 << bit for bit in FLAG_BITS.values())  # that instructions read and write
+FLAGS = sum(1 << bit for bit in FLAG_BITS.values())  # flags that instructions read and write
 TRAP_FLAG, _RESUME_FLAG = 1 << 8, 1 << 16
-VECTOR_BITS = 512  # no vector register is wider
+VECTOR_BITS = 512  # width of the widest vector register
 CALL_ARGUMENTS = ("rdi", "rsi", "rdx", "r10", "r8", "r9")  # of a system call
 
 
@@ -163,7 +163,7 @@ class Registers:
         return int.from_bytes(b"".join(parts), "little")
 
     def write(self, name: str, value: int) -> None:
-        """Write a full register; read it again to see what the kernel stored.
+        """Write a full register. Read it again for the value that the kernel stored.
 
         Raises:
             OSError: the kernel refuses the value.
@@ -215,7 +215,7 @@ class Registers:
         return [_Span(OPMASK, _xsave_offsets()[OPMASK] + 8 * index, 8)]
 
     def rearm(self) -> None:
-        """Let a breakpoint on the very next instruction hit.
+        """Clear the resume flag, so that a breakpoint on the next instruction hits.
 
         A stop at an instruction breakpoint leaves the resume flag set, which hides the next
         execution (Intel SDM volume 3, section 18.3.1.1).

@@ -1,9 +1,9 @@
 """The population from which a fault is drawn: windows of executed instructions.
 
-A window of the golden run is single-stepped and the address of each
-instruction in scope is recorded, so that sampling can be uniform over them. Code out of scope runs
-natively. Meanwhile every byte of the code in scope is a breakpoint instruction, so that no way back
-in (return, callback, exception) is missed.
+A window of the golden run is single-stepped, and the addresses of the instructions in scope are
+recorded, so that sampling can be uniform over them. Code out of scope runs natively. Meanwhile
+every byte of the code in scope is a breakpoint instruction, which catches every re-entry (return,
+callback, exception).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Tracee
 
 _CHUNK = 16384
 _BREAKPOINT = b"\xcc"  # the instruction
-_STAGE_COST = 12  # one more stop costs about as much as 12 counted hits
+_STAGE_COST = 12  # a further stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20
-_NEAR = 16  # instructions before the target at which a detour is looked for
+_NEAR = 16  # instructions before the target that are searched for a detour
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,18 +54,18 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stratum:
-    """Windows that begin at the same instruction, with those that were stepped."""
+    """The windows that begin at one instruction, and those of them that were stepped."""
 
     segments: tuple[Segment, ...]
-    windows_in_run: int  # windows of the run; if more than were stepped, they are a sample
+    windows_in_run: int  # windows of the run; the stepped ones are a sample of them
     marker: Location | None = None  # None: the start of the run
     detours: bool = True  # whether detours count executions
 
     def without_detours(self) -> Stratum:
         """The same windows, without detours on the way to an execution."""
         segments = (
-            replace(each, start=tuple(replace(stop, detour=None) for stop in each.start))
-            for each in self.segments
+            replace(segment, start=tuple(replace(stop, detour=None) for stop in segment.start))
+            for segment in self.segments
         )
         return replace(self, segments=tuple(segments), detours=False)
 
@@ -125,7 +125,7 @@ def record_window(
     markers: Sequence[int] = (),
     watch: Callable[[int], None] | None = None,
 ) -> NDArray[np.int64]:
-    """Step from the present stop to the end of the program, of the function, or to a marker.
+    """Step from the current stop to the end of the program, of the function, or to a marker.
 
     Args:
         tracee: the process, stopped at the start of the window.
@@ -186,7 +186,7 @@ class _Blanket:
         self._code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
-        """Run foreign code; False if the program ended or the window's function returned."""
+        """Run foreign code. Return False if the program or the window's function ended."""
         tracee, registers, returns_to = self._tracee, self._tracee.registers, int(stop[0])
         with contextlib.ExitStack() as undo:
             if returns_to > 0 and returns_to not in self._scope:
@@ -210,7 +210,7 @@ class _Blanket:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Way:
-    """Stages to an executed instruction of a segment, and what they cost in counted hits."""
+    """Stages to an executed instruction of a segment, and their cost in counted hits."""
 
     cost: int
     stages: tuple[CountedStop, ...]
@@ -224,8 +224,8 @@ def _plan_trigger(
 ) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
 
-    Each counted hit costs the same. So a rarely executed instruction shortly before the target is
-    reached first, and the target's executions are counted from there, or a detour counts.
+    All counted hits cost the same. So the trigger first counts to a rarely executed instruction
+    shortly before the target and then counts the target's executions, or uses a detour.
 
     Args:
         code_at: 16 bytes of code at an address; None if there may be no detours.
@@ -243,7 +243,7 @@ def _plan_trigger(
 
 
 def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
-    """Count to the instruction before the target from which it costs least."""
+    """Count to the instruction before the target from which the cost is lowest."""
     target, k = segment.trace[index], int(segment.ranks[index])
     first = max(0, index - _HORIZON)
     before = segment.trace[first:index] == target

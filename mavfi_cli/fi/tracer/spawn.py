@@ -1,7 +1,7 @@
-"""Starts a program under the tracer, and watches once what else it does than compute.
+"""Starts a program under the tracer, and watches the system calls of one run.
 
-It is stopped at its first instruction or its entry point. The system calls of a fault-free run tell
-whether the program starts threads or other programs, which are not followed, what it writes where,
+The program is stopped at its first instruction or its entry point. The system calls of a fault-free
+run show whether it starts threads or other programs, which are not followed, which files it writes,
 and why it may have failed.
 """
 
@@ -22,10 +22,9 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS
 from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee
 
-# The shell says that it runs (so that its own exec is over) and waits for one line (so that the
-# tracer is attached before the program starts).
-# No core files, no endless output (in blocks of 512 bytes) and no endless memory (KiB) of a
-# corrupted program, and nothing in its environment that depends on where it runs.
+# The shell reports that it runs (its own exec is over) and waits for a line (so that the tracer can
+# attach before the program starts). A corrupted program leaves no core file and has bounded output
+# (blocks of 512 bytes) and memory (KiB). Its environment does not depend on the working directory.
 _LAUNCHER = (
     'ulimit -c 0; ulimit -f 2097152; ulimit -v "$1"; echo >&3 && read -r go <&3 && '
     'cd -- "$2" && shift 2 && unset PWD OLDPWD && exec "$@" 3<&-'
@@ -59,22 +58,22 @@ class Program:
         stdin: Path = Path(os.devnull),
         memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
-        """Make a command whose program is looked up on the path.
+        """Make a command whose program is searched on the path.
 
         Args:
-            environment: by default those of our own variables that say where things are, in which
-                language to speak, and how many threads to start.
-            variables: more variables, or other values.
+            environment: by default the variables of this process for paths, language and number of
+                threads.
+            variables: additional or changed variables.
 
         Raises:
             TargetError: no such program, or it cannot be executed.
         """
-        found = shutil.which(argv[0])
-        if found is None:
+        program = shutil.which(argv[0])
+        if program is None:
             raise TargetError(argv[0], "no such program, or it is not executable")
         chosen = _kept_environment() if environment is None else environment
         return cls(
-            argv=(str(Path(found).resolve()), *argv[1:]),
+            argv=(str(Path(program).resolve()), *argv[1:]),
             directory=(directory or Path.cwd()).resolve(),
             environment=tuple(sorted({**chosen, **(variables or {})}.items())),
             stdin=stdin,
@@ -83,7 +82,7 @@ class Program:
 
 
 def _kept_environment() -> dict[str, str]:
-    """Our own environment without what changes from shell to shell: it lies in memory."""
+    """Return this process's environment without variables that differ between shells."""
     return {
         name: value
         for name, value in os.environ.items()
@@ -162,9 +161,9 @@ def _await_exec(tracee: Tracee, command: Program) -> None:
 
 
 def _fix_random_bytes(tracee: Tracee) -> None:
-    """Replace the random bytes that the kernel hands to a program that has not begun.
+    """Replace the random bytes that the kernel passes to a program before it starts.
 
-    libc makes its stack canary of them.
+    libc derives its stack canary from them.
     """
     place = _auxiliary(tracee.pid, _AT_RANDOM)
     if place is not None:
@@ -177,7 +176,7 @@ def _auxiliary(pid: int, key: int) -> int | None:
     return next((value for name, value in words if name == key), None)
 
 
-# -- what it does in one run
+# -- the system calls of one run
 
 _CALL_STOP = signal.SIGTRAP | 0x80  # PTRACE_O_TRACESYSGOOD
 _STARTS = {
@@ -194,7 +193,7 @@ _TERMINAL_IOCTLS = frozenset((0x5401, 0x5402, 0x5403, 0x5404, 0x5413))  # TCGETS
 _IOCTL, _MAPS = 16, (9, 25)  # mmap, mremap
 _NAMES = {56: "clone", 57: "fork", 58: "vfork", 59: "execve", 322: "execveat", 435: "clone3"}
 
-# Number: arguments with the folder's descriptor (-1: none), the path, and the flags of an opening.
+# Number: arguments with the folder's descriptor (-1: none), the path, and the flags of open.
 _PATHS = {
     2: (-1, 0, 1), 257: (0, 1, 2),  # open, openat
     437: (0, 1, -1), 85: (-1, 0, -1), 76: (-1, 0, -1),  # openat2, creat, truncate
@@ -210,10 +209,10 @@ class Watched:
     """What a program did in one run.
 
     Attributes:
-        company: the first thread, child or other program that it started, in words; empty if none.
-            The run was not watched any further.
+        company: description of the first thread, child or program that it started; empty if none.
+            The rest of the run was not watched.
         written: absolute paths that it wrote, made, renamed or removed, in order.
-        terminal: whether it asked for a terminal.
+        terminal: whether it requested a terminal.
         lacked_memory: whether it was refused memory.
     """
 
@@ -250,7 +249,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
 
 
 def _note_request(tracee: Tracee, watched: Watched) -> None:
-    """Note what a system call asks for, at its entry."""
+    """Record the request of a system call, at its entry."""
     registers = tracee.registers
     number = registers.system_call
     if number == _IOCTL:
@@ -269,13 +268,13 @@ def _note_request(tracee: Tracee, watched: Watched) -> None:
 
 
 def _note_answer(tracee: Tracee, watched: Watched) -> None:
-    """Note whether a system call was refused memory, at its end."""
+    """Record whether a system call was refused memory, at its end."""
     refused = _signed(tracee.registers.read("rax"), 64) == _NO_MEMORY
     watched.lacked_memory |= refused and tracee.registers.system_call in _MAPS
 
 
 def _absolute(pid: int, folder: int, path: str) -> str:
-    """The path that a process names, relative to its folder or to that of a descriptor."""
+    """Resolve a path against the process's folder or that of a descriptor."""
     base = f"/proc/{pid}/cwd" if folder == _HERE else f"/proc/{pid}/fd/{folder}"
     try:
         return os.path.normpath(Path(os.readlink(base)) / path)

@@ -1,4 +1,4 @@
-"""The compiled single-step loop: a step costs little more than its system calls.
+"""The compiled single-step loop, in which a step costs little more than its system calls.
 
 The loop returns to Python for code out of scope, a system call, a push of the flags or a signal.
 `ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
@@ -17,8 +17,8 @@ from mavfi_cli.core.compiled import compiled
 _PEEKTEXT, _PEEKUSER, _SINGLESTEP, _WALL = 1, 3, 9, 0x4000_0000
 _STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
 
-# Why the recording of steps returned: no room for more, foreign code is next, the next instruction
-# leaves traces of the stepping, the wait status was not that of a step, the window is over.
+# Why recording returned: the trace is full, foreign code is next, a step over the next instruction
+# would leave traces, the wait status was not that of a step, the window is over.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
 _IP, _SP = 128, 152  # offsets in `struct user`
 
@@ -32,7 +32,7 @@ _wait4: Any = types.ExternalFunction(
 
 @compiled
 def _is_repeated(word: int) -> bool:
-    """True for F2 or F3, an optional REX prefix and a string opcode (Intel SDM volume 2, REP)."""
+    """Return True for F2 or F3, optional REX and a string opcode (Intel SDM volume 2, REP)."""
     first = word & 0xFF
     if first != 0xF2 and first != 0xF3:
         return False
@@ -44,7 +44,7 @@ def _is_repeated(word: int) -> bool:
 
 @compiled
 def _needs_care(word: int) -> bool:
-    """True for a push or a pop of the flags, or a system call."""
+    """Return True for a push or a pop of the flags, or a system call."""
     first = word & 0xFF
     second = (word >> 8) & 0xFF
     code = second if first == 0x66 or 0x40 <= first <= 0x4F else first
@@ -93,7 +93,7 @@ def _run(
 def record_steps(
     tid: int, spans: NDArray[np.int64], trace: NDArray[np.int64], stop: NDArray[np.int64]
 ) -> tuple[int, int, int]:
-    """Single-step a stopped thread and record the address of each instruction before it executes.
+    """Single-step a stopped thread and record the addresses of instructions before they execute.
 
     Args:
         spans: (n, 2) addresses in scope.

@@ -1,18 +1,18 @@
-"""One traced process: attach, stop exactly, step, resume, and learn how it ended.
+"""One traced process: attach, stop exactly, step, resume, and report how it ended.
 
 Every thread and child of the process is traced, so that none outlives the tracer. The *target*
-thread is stopped and corrupted; the others keep running. There is no sleep and no polling: each
+thread is stopped and corrupted; the others keep running. There is no sleep and no polling: every
 step waits for the kernel's report. Call all methods from the thread that attached.
 
-There are two mechanisms for stops exactly before the k-th execution of an instruction, the better
-first. `PERF`: the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-th
+Two mechanisms stop exactly before the k-th execution of an instruction. The better one is `PERF`:
+the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-th
 (`perf_event_open` with `sigtrap`, Linux 5.13, perf_event_open(2)). It needs no performance counter,
 so it works in virtual machines. `DEBUG`: the tracer writes the debug register itself and counts,
-with one stop a hit.
+with one stop per hit.
 
-Either takes microseconds a hit. Where it is known that nothing jumps between the instructions at
-the counted place, many hits are counted in the target itself, by a detour. When the target has
-stopped, the detour is gone and the memory is as before.
+Both take microseconds per hit. If no jump leads between the instructions at the counted address,
+many hits are counted in the target itself, by a detour. When the target has stopped, the detour has
+been removed and the memory is restored.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS, Registers
 
-DETOUR_COST = 20  # counted hits from which a detour is quicker; to make one takes some 15 hits
-_DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # of a detour's pages from the code, bytes
+DETOUR_COST = 20  # counted hits from which a detour is faster; making one costs about 15 hits
+_DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # distance of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
 _MMAP, _MUNMAP, _PERF_EVENT_OPEN = 9, 11, 298  # system calls
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
@@ -45,7 +45,7 @@ _USER_ONLY = 1 << 5 | 1 << 6  # exclude_kernel, exclude_hv
 _ATTRIBUTES = struct.Struct("<IIQQQQQIIQQ56x")  # perf_event_attr, version 7: 128 bytes
 
 _DEBUG_REGISTERS = 848  # offset of debug register 0 in `struct user`
-_TAKEN = 3 | 0xF << 16  # bits of debug register 7 that belong to it
+_TAKEN = 3 | 0xF << 16  # bits of debug register 7 for debug register 0
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -86,7 +86,7 @@ class _DebugBreakpoint:
         self._tid = tid
         self._enable(0)
         self._poke(0, address)
-        self._enable(1)  # for the thread; type execute, length 1: zeros
+        self._enable(1)  # enable for the thread; type execute and length 1 are zeros
 
     def close(self) -> None:
         """Remove the breakpoint; the thread must be stopped or gone."""
@@ -116,12 +116,12 @@ class ExecutionCounter:
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
-        """Remove the counter, or the breakpoint that it is."""
+        """Remove the counter and its breakpoint."""
         os.close(self._fd)
 
 
 def perf_allowed() -> str | None:
-    """None if counted breakpoints can be opened, else the reason why not."""
+    """Return why counted breakpoints cannot be opened, or None if they can."""
     try:
         os.close(_open_event(0, 0x1000, 1_000_000))
     except OSError as error:
@@ -166,7 +166,7 @@ class Tracee:
     group: int  # argument of waitpid: -process group, or any child of this thread
     mechanism: Mechanism = Mechanism.PERF
     ended: Ended | None = None
-    signals: list[int] = field(default_factory=list)  # delivered to the process, in order
+    signals: list[int] = field(default_factory=list)  # signals delivered to the process, in order
     registers: Registers = field(init=False)
     memory: linux.Memory = field(init=False)
     _pending_signal: int = 0
@@ -214,7 +214,7 @@ class Tracee:
         return self._go(linux.SINGLESTEP)
 
     def resume(self) -> Ended | None:
-        """Run until our own trap stops the target thread: None; or to the end."""
+        """Run until the tracer's trap stops the target thread. Return None then, or the end."""
         return self._go(linux.CONT)
 
     def resume_until_alarm(self, alarm: ProcessTimer) -> Ended | None:
@@ -230,10 +230,10 @@ class Tracee:
     def run_to(self, address: int, count: int = 1, detour: Detour | None = None) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
 
-        If the thread is stopped in front of an execution, that one counts as the first.
+        If the thread is stopped in front of an execution, this execution counts as the first.
 
         Args:
-            detour: where a detour fits that counts them.
+            detour: the place of a detour that can count them.
 
         Returns:
             False if the process ended first.
@@ -266,7 +266,7 @@ class Tracee:
         return count
 
     def breakpoint_at(self, address: int, count: int = 1) -> ExecutionCounter | _DebugBreakpoint:
-        """A breakpoint before execution `count` of `address`; a debug register stops at each."""
+        """Set a breakpoint before execution `count` of `address`; DEBUG stops at every one."""
         if self.mechanism is Mechanism.PERF:
             try:
                 return ExecutionCounter(self.tid, address, count)
@@ -275,7 +275,7 @@ class Tracee:
         return _DebugBreakpoint(self.tid, address)
 
     def detach(self) -> None:
-        """Let the process go on without a tracer; the target thread must be stopped."""
+        """Let the process continue without a tracer; the target thread must be stopped."""
         self.memory.close()
         for thread in _threads_of(self.pid):
             if thread != self.tid:
@@ -283,7 +283,7 @@ class Tracee:
         linux.request(linux.DETACH, self.tid, 0, self._take_signal())
 
     def kill(self) -> Ended:
-        """End the process and what it started, and wait until all of it is gone."""
+        """Kill the process and its children, and wait until all are gone."""
         if self.ended is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -317,11 +317,11 @@ class Tracee:
         return number
 
     def _await(self, how: int = linux.CONT) -> Ended | None:
-        """Handle reports until the target thread stops for us or the process ends."""
+        """Handle reports until the target thread stops for the caller or the process ends."""
         return self.handle(self._wait(), how)
 
     def handle(self, status: linux.Status, how: int) -> Ended | None:
-        """Handle a report and all that follow, until the target stops for us or ends.
+        """Handle a report and its successors, until the target stops for the caller or ends.
 
         Args:
             how: the request that resumes the target after a passing stop.
@@ -339,8 +339,8 @@ class Tracee:
             status = self._wait()
 
     def _wait(self) -> linux.Status:
-        found, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
-        return linux.Status(found, raw)
+        stopped, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
+        return linux.Status(stopped, raw)
 
     def _note_end(self, status: linux.Status) -> bool:
         if status.tid != self.pid:
@@ -370,12 +370,12 @@ class Tracee:
             return self._interrupting
         if status.trapped:
             code = _signal_code(self.tid)
-            sent = self._expecting_alarm and code <= 0  # by a process
+            sent = self._expecting_alarm and code <= 0  # sent by a process
             if sent or code in _TRACER_TRAPS:
                 return True
         if self._interrupting:
-            # Another stop, such as the end of an exec, came first and takes the interrupt's place:
-            # Linux drops that. A signal is delivered when the thread goes on.
+            # Another stop, such as the end of an exec, came first in place of the interrupt,
+            # which Linux drops. A signal is delivered when the thread continues.
             self._pending_signal = status.signal if status.event == 0 else 0
             self._interrupting = False
             return True
@@ -389,7 +389,7 @@ class Tracee:
             number = status.signal if status.event == 0 else 0
         if number:
             self.signals.append(number)
-        # Killed meanwhile? Then its end is reported next.
+        # If it was killed meanwhile, its end is reported next.
         with contextlib.suppress(ProcessLookupError):
             linux.request(how, status.tid, 0, number)
 
@@ -429,7 +429,7 @@ class Tracee:
             self.memory.write(address, data)
 
     def _map_near(self, address: int) -> int | None:
-        """Map pages where neither heap nor libraries will come, near enough for a jump."""
+        """Map pages within reach of a jump, where neither heap nor libraries are mapped later."""
         for distance in _DISTANCES:
             pages = (address - distance) & ~4095
             if pages > 0 and self._system_call(
@@ -439,7 +439,7 @@ class Tracee:
         return None
 
     def _system_call(self, number: int, *arguments: int) -> int:
-        """Make the stopped target execute a system call; nothing else of it changes."""
+        """Make the stopped target execute a system call and restore its state."""
         before, here = self.registers.general(), self.registers.ip
         code = self.memory.read(here, len(_SYSTEM_CALL))
         self.memory.write(here, _SYSTEM_CALL)

@@ -1,9 +1,9 @@
-"""Which bits of its explicit operands a vector instruction reads and writes (Intel SDM volume 2).
+"""Bits of explicit operands that vector instructions read and write (Intel SDM volume 2).
 
-Capstone's access flags are wrong for many VEX and EVEX forms and never say which element counts.
-So the first operand is the destination and the others are sources, and the tables below say which
-of their bits count: the lowest element of scalar instructions, the elements that a shuffle moves,
-the half that a conversion reads. A bit that only stays in its place is neither read nor written.
+Capstone's access flags are wrong for many VEX and EVEX forms and do not distinguish elements. So
+the first operand is the destination and the others are sources, and the tables below give the bits
+that are used: the lowest element of scalar instructions, the elements that a shuffle moves, the
+half that a conversion reads. A bit that only keeps its value is neither read nor written.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Piece = tuple[str, int] | None  # operand "a" (first source) or "b" (last one) a
 
 @dataclass(slots=True)
 class Touched:
-    """Bits of one explicit operand; `clears` are those that always get a new value."""
+    """Bits of one explicit operand; `clears` are the bits that always get a new value."""
 
     reads: int = 0
     writes: int = 0
@@ -60,13 +60,13 @@ def low(count: int) -> int:
 class _VectorForm:
     """The operands of one vector instruction, by their roles."""
 
-    def __init__(self, found: Any) -> None:
-        self.mnemonic = found.mnemonic
+    def __init__(self, decoded: Any) -> None:
+        self.mnemonic = decoded.mnemonic
         self.vex = self.mnemonic.startswith("v")
         self.bare = self.mnemonic.removeprefix("v")
-        operands = list(found.operands)
+        operands = list(decoded.operands)
         self.names = [
-            found.reg_name(op.reg) if op.type == x86.X86_OP_REG else "" for op in operands
+            decoded.reg_name(op.reg) if op.type == x86.X86_OP_REG else "" for op in operands
         ]
         self.widths = [_width(name, op.size) for name, op in zip(self.names, operands, strict=True)]
         self.writemask = next(
@@ -95,11 +95,11 @@ class _VectorForm:
         return bool(VECTOR.match(self.names[position]))
 
     def read(self, position: int, mask: int) -> None:
-        """Note that bits of an operand are read."""
+        """Add bits of an operand that are read."""
         self.touched[position].reads |= mask
 
     def write(self, mask: int, kept: int = 0) -> None:
-        """Note that bits of the destination are written; others but the kept ones are zeroed."""
+        """Add bits of the destination that are written; all but the kept ones are zeroed."""
         target = self.touched[self.target]
         target.writes = mask
         if self.is_vector(self.target):
@@ -117,16 +117,16 @@ def _width(name: str, size: int) -> int:
     return {"x": 128, "y": 256, "z": 512}[match[1]] if match else 8 * size
 
 
-def vector_bits(found: Any) -> tuple[Touched, ...] | None:
-    """The bits of each explicit operand that a vector instruction reads and writes.
+def vector_bits(decoded: Any) -> tuple[Touched, ...] | None:
+    """Return the bits of the explicit operands that a vector instruction reads and writes.
 
     Returns:
         None if no explicit operand is a vector register.
     """
-    registers = [found.reg_name(op.reg) for op in found.operands if op.type == x86.X86_OP_REG]
+    registers = [decoded.reg_name(op.reg) for op in decoded.operands if op.type == x86.X86_OP_REG]
     if not any(map(VECTOR.match, registers)):
         return None
-    form = _VectorForm(found)
+    form = _VectorForm(decoded)
     scalar = _scalar(form)
     if not (scalar or _permuted(form)):
         _packed(form)
@@ -139,7 +139,7 @@ def vector_bits(found: Any) -> tuple[Touched, ...] | None:
 
 
 def _scalar(form: _VectorForm) -> int:
-    """Scalar instructions; the width of the element, or 0 for another instruction."""
+    """Handle scalar instructions. Return the width of the element, or 0 for any other."""
     name = form.mnemonic
     if match := _COMPARISON.match(name):
         for position in (form.target, form.last):
@@ -171,7 +171,7 @@ def _operation(form: _VectorForm, lane: int) -> int:
 
 
 def _merged(form: _VectorForm, source: int, lane: int) -> int:
-    """The last operand is converted; the rest of a vector comes from the first source."""
+    """Handle a conversion of the last operand; other elements come from the first source."""
     if lane and form.is_vector(form.target):
         _write_lane(form, lane)
     else:
@@ -204,15 +204,15 @@ def _between(form: _VectorForm) -> bool:
     return form.is_vector(form.target) and form.is_vector(form.last)
 
 
-# -- elements that change their place
+# -- instructions that move elements
 
 
 def _permuted(form: _VectorForm) -> bool:
-    """Instructions that move elements; False for another instruction."""
-    found = _pieces(form)
-    if found is None:
+    """Handle instructions that move elements. Return False for any other."""
+    moved = _pieces(form)
+    if moved is None:
         return False
-    element, pieces = found
+    element, pieces = moved
     kept = written = 0
     for place, piece in enumerate(pieces):
         if piece is None:
@@ -296,7 +296,7 @@ def _interleave(start: Callable[[int], int]) -> _Lane:
 
 
 def _chosen(operands: str, bits: int, step: int = 0) -> _Lane:
-    """Each element by its own bits of the immediate, which are others in the next lane."""
+    """Select every element by its own bits of the immediate, which differ between lanes."""
 
     def lane(imm: int, count: int, number: int) -> list[Piece]:
         return [
@@ -378,7 +378,7 @@ _BY_IMMEDIATE = [lane for name, (_, lane) in _SHUFFLES.items() if not re.match("
 
 
 def _packed(form: _VectorForm) -> None:
-    """All other instructions: the whole registers, but for conversions, sign masks and counts."""
+    """Handle all others: whole registers, except in conversions, sign masks and counts."""
     name, width = form.mnemonic, form.widths[form.target]
     alone = form.same(form.first, form.last) and len(form.sources) == 1 + form.vex
     sources = [] if alone and _ZEROING.match(name) else list(form.sources)
@@ -409,7 +409,7 @@ def _packed(form: _VectorForm) -> None:
 
 
 def _each(element: int, mask: int) -> int:
-    """The same bits of every element."""
+    """Return the same bits of every element."""
     return sum(mask << place for place in range(0, 512, element))
 
 
@@ -417,7 +417,7 @@ def _signs(element: int) -> int:
     return _each(element, 1 << element - 1)
 
 
-# Operands that say which element goes where: their element, and its bits that count.
+# Operands that select elements: the width of their elements, and the bits that are used.
 _CONTROLS: dict[str, tuple[str, int, Callable[[int], int]]] = {
     "pshufb": ("b", 8, lambda _width: 0x8F),
     "permilps": ("b", 32, lambda _width: 3),
@@ -429,7 +429,7 @@ _TWO_TABLES = re.compile(r"vperm([ti])2(ps|pd|[bwdq])$")
 
 
 def _mask(form: _VectorForm, lane: int) -> None:
-    """An AVX-512 mask has a bit for each element; without zeroing, masked elements may stay."""
+    """Apply an AVX-512 mask, a bit per element; without zeroing, masked elements stay."""
     assert form.writemask is not None
     target = form.touched[form.target]
     compares = not form.is_vector(form.target)  # into a mask, whose masked bits are cleared
