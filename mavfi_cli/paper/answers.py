@@ -362,7 +362,7 @@ def delay_sentence(parts: Sequence[Delays]) -> str:
                 for name, count in longer.items()
             )
             sentences.append(
-                f"Of {faults:,} faults in {LEVELS[part.level]}, {bare:,} lose the mission or delay "
-                f"it by over 1 s without a detector, {watched}."
+                f"{faults:,} faults in {LEVELS[part.level]} were flown without and with detectors. "
+                f"Lost, or late by over 1 s: {bare:,} without a detector, {watched}."
             )
     return " ".join(sentences)

@@ -102,19 +102,19 @@ COMMANDS = {
     # Renewed when operands became the bits that are read or written, and when the settings got the
     # memory of a run, and with the code of x86-64-v3.
     # Renewed when the summary got the null runs; all else is equal.
-    # Renewed when Wilson's intervals became SciPy's: the last digit of the bound of null runs.
-    "kernels": ("8f12c7a042eae4d3", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    "kernels": ("7d1fc4ea7f2c0829", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    # Renewed when `difference` became `success_difference` (schema 3); all else is equal.
     "compare": (
-        "eac34e35e3c1cd54",
+        "4c6261a169806646",
         [
             *("compare", "--platform", "x86", "--platform", "tx2", "--world", "farm"),
             *("--inject", "waypoint_position", "--field", "exponent", "--detector", "none,gad"),
             *("--missions", "1", "--quiet", "--json"),
         ],
     ),
-    # Renewed when Wilson's intervals became SciPy's: the last digits of bounds.
+    # Renewed when harm began at 10 % and `otherwise` and `golden` went (schema 2).
     "evaluate": (
-        "aa9d00cc0f3b1cde",
+        "aa876b5f18a0a188",
         [
             *("detect", "evaluate", "--world", "farm", "--detector", "none,gad", "--flights", "1"),
             *("--golden-flights", "1", "--field", "exponent"),
