@@ -106,8 +106,8 @@ def test_added_time_is_that_of_the_same_faults():
     assert [*delay.added_s["gad"]] == [pytest.approx(2.0)] * 2
     assert delay.golden_s == pytest.approx(20.0)
     assert delay_sentence([delay]) == (
-        "Of 2 faults in states, 1 lose the mission or delay it by over 1 s without a detector, "
-        "2 with the Gaussian detector."
+        "2 faults in states were flown without and with detectors. "
+        "Lost, or late by over 1 s: 1 without a detector, 2 with the Gaussian detector."
     )
 
 
