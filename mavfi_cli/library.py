@@ -91,7 +91,7 @@ class Campaign:
         return f"Campaign({str(self.folder)!r}, missions={self.table.num_rows})"
 
     def _repr_html_(self) -> str | None:
-        """Return the table, which a notebook shows; None without pandas."""
+        """Return the table as HTML for a notebook; None without pandas."""
         if find_spec("pandas") is None:
             return None
         html: str = self.to_pandas()._repr_html_()

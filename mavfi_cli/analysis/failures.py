@@ -1,8 +1,7 @@
 """Failures caused by faults, across the layers and per flight hour.
 
-Every injected fault counts if the golden flight of its mission succeeds, even if it was not read,
-because such a flip is also one of the kernel's benign runs. So a campaign and `mavfi kernels` count
-the same population.
+Every injected fault counts if the golden flight of its mission succeeds, even if nothing read it.
+`mavfi kernels` counts such a flip as a benign run, so both count the same population.
 """
 
 from __future__ import annotations
@@ -27,29 +26,29 @@ KERNELS = "kernels.json"
 
 
 def kernel_summary(path: Path) -> Mapping[str, Any]:
-    """Read a summary; a RecordError says why it cannot be read, or is none."""
+    """Read a summary of `mavfi kernels`; RecordError if the file is missing or is no summary."""
     try:
-        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        found["plan"]["rule"], found["plan"]["compat"], found["plan"]["model"]
-        for each in found["kernels"]:
-            sdc = each["outcomes"]["sdc"]
-            each["kernel"], sdc["count"], sdc["of"]
+        summary: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        summary["plan"]["rule"], summary["plan"]["compat"], summary["plan"]["model"]
+        for kernel in summary["kernels"]:
+            sdc = kernel["outcomes"]["sdc"]
+            kernel["kernel"], sdc["count"], sdc["of"]
     except OSError as error:
         raise RecordError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack_of(error)})") from None
-    return found
+    return summary
 
 
 def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
     """The share of an outcome in a kernel of a summary, with the interval of the summary.
 
-    That interval is wider than one of independent runs, because runs of one input are alike.
+    It is wider than that of independent runs, because runs on one input are correlated.
     """
-    told = kernel["outcomes"][outcome]
-    low, high = told["wilson95"]
-    share = math.nan if told["share"] is None else told["share"]
-    return Share(count=told["count"], total=told["of"], share=share, low=low, high=high)
+    entry = kernel["outcomes"][outcome]
+    low, high = entry["wilson95"]
+    share = math.nan if entry["share"] is None else entry["share"]
+    return Share(count=entry["count"], total=entry["of"], share=share, low=low, high=high)
 
 
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
@@ -57,7 +56,7 @@ _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SettingFailures:
-    """Missions of a setting that its faults fail.
+    """Missions of a setting that fail because of its faults.
 
     Attributes:
         name: phrase for the setting.
@@ -91,7 +90,7 @@ def setting_failures(
 
     Raises:
         RecordError: the folder does not exist or cannot be read.
-        ConfigError: the kernels were attacked with other faults; a negative rate.
+        ConfigError: the kernels were attacked with other faults, or the rate is negative.
     """
     alone = None if kernels is None else kernel_summary(kernels / KERNELS)
     silent = {part["kernel"]: part["outcomes"]["sdc"] for part in alone["kernels"]} if alone else {}
@@ -149,7 +148,7 @@ def _require_same_faults(config: MissionConfig, plan: Mapping[str, Any], path: P
     theirs = {name: plan[name] for name in ours}
     if ours != theirs:
         raise ConfigError(
-            f"faults were drawn by {canonical(theirs)}, in the campaign by {canonical(ours)}: not "
-            "the same population",
+            f"faults must be drawn as in the campaign, by {canonical(ours)}, "
+            f"got {canonical(theirs)}",
             path=path,
         )

@@ -1,6 +1,6 @@
-"""A ledger as one table: one row per finished mission, in the order of the list.
+"""A campaign as one table: one row per finished mission, in the order of the mission list.
 
-The list supplies the configuration of the missions, the records their results. The table is a
+Configurations come from the mission list, results from the records. The table is a
 `pyarrow.Table`; `to_pandas()` turns it into a data frame.
 """
 
@@ -50,7 +50,7 @@ EXPORTED = (
     "wall_s", *COSTS, "attempts", "path", "changes",
 )  # fmt: skip
 BITS = pa.list_(pa.list_(pa.int64()))  # of each struck component, its bits
-_TYPES = {  # of the columns that are not text; one without a value has its type, too
+_TYPES = {  # of the columns that are not text, even if they hold no value
     "struck_bits": BITS,
     **dict.fromkeys(
         ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
@@ -64,12 +64,13 @@ IntArray = NDArray[np.int64]
 
 
 def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
-    """The finished missions; those that could not begin have the state `error`.
+    """Return the finished missions. Missions that could not begin have the state `error`.
 
-    Columns: what `mission.measures` tells of a record, of CONFIG and of the fault's FAULT
-    what was asked for, each label as `label_NAME` and all of them as text in `labels`; `succeeded`;
-    `counted`: golden, or with a fault that struck something that was read or caught; and the shares
-    of the flight time that detection takes (`check_share`) and recovery (`recovery_share_STAGE`).
+    The columns are the measures of `mission.measures`, the requested values of CONFIG and of the
+    fault's FAULT, each label as `label_NAME`, and all labels as text in `labels`. `succeeded` means
+    that the mission reached its goal. `counted` means that it is golden, or that its fault struck
+    something that was read or caught. `check_share` and `recovery_share_STAGE` are the shares of
+    the flight time that detection and recovery take.
 
     Args:
         among: numbers of the missions to choose from; None means all.
@@ -133,7 +134,7 @@ def _column(values: Sequence[Any]) -> pa.Array:
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """The rows whose columns have these values; None means empty, and a tuple allows several."""
+    """The rows that have these values. None matches empty cells, a tuple any of its items."""
     for name, value in values.items():
         allowed = value if isinstance(value, tuple) else (value,)
         equal = (
@@ -149,7 +150,7 @@ def flown(table: pa.Table) -> pa.Table:
 
 
 def errors(table: pa.Table, phrase: str) -> list[str]:
-    """A phrase of the columns `number`, `labels` and `reason` for each that could not begin."""
+    """Format `phrase` with number, labels and reason of every mission that could not begin."""
     rows = table.select(["number", "labels", "state", "reason"]).to_pylist()
     return [phrase.format_map(row) for row in rows if row["state"] == ResultState.ERROR.value]
 
@@ -184,7 +185,7 @@ def exported(ledger: Ledger) -> pa.Table:
 
 
 def read_export(path: Path) -> pa.Table:
-    """Read a file of `exported`. One of an earlier version gets the types of this one.
+    """Read a file of `exported`. Files of earlier versions get the column types of this one.
 
     Raises:
         RecordError: the file is missing or damaged.
@@ -212,7 +213,7 @@ def _parsed(text: str | None) -> list[list[int]] | None:
 
 
 def _typed(table: pa.Table) -> pa.Table:
-    """A table whose columns without a value have the types that they have with values."""
+    """Give columns without values the types that they have when they hold values."""
     kinds = {
         field.name: _TYPES.get(field.name, pa.string())
         for field in table.schema
@@ -227,11 +228,11 @@ def _typed(table: pa.Table) -> pa.Table:
 
 
 def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
-    """Return what built and flew a campaign, from its ledger or from an export; {} if unknown.
+    """Return the provenance of a campaign, from its ledger or from an export; {} if unknown.
 
     Returns:
-        `name` of the campaign, `planned`: missions on its list, `versions` of the programs, and of
-        the `host` of the first record `machine`, `cores` and `started`.
+        `name` of the campaign; `planned`, the number of missions on its list; `versions` of the
+        programs; and `host`, with the `machine`, `cores` and `started` of the first record.
     """
     table = source if isinstance(source, pa.Table) else source.export
     if table is not None:
@@ -254,7 +255,7 @@ def changed(
     ratio: bool = True,
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Geometric mean of second over first, whose interval is that of the mean logarithm.
+    """Return the geometric mean of second / first, with the interval of the mean logarithm.
 
     Pairs with a value that is not positive are left out. Several pairs of one mission are not
     independent, so their mean counts as one value.
@@ -262,18 +263,18 @@ def changed(
     Args:
         missions: key that dependent pairs share, (n,).
         first, second: values of each pair, (n,).
-        ratio: false takes the mean of second minus first, of values that may be zero.
+        ratio: False averages second - first instead, for values that may be zero.
     """
     changes: dict[Hashable, list[float]] = {}
     for mission, a, b in zip(missions, first, second, strict=True):
         if a > 0.0 and b > 0.0 if ratio else not math.isnan(b - a):
             changes.setdefault(mission, []).append(math.log(b / a) if ratio else b - a)
-    means = [math.fsum(each) / len(each) for each in changes.values()]
-    found = interval(means, resamples=resamples)
+    means = [math.fsum(logs) / len(logs) for logs in changes.values()]
+    mean = interval(means, resamples=resamples)
     if not ratio:
-        return found
-    value, low, high = (math.exp(each) for each in (found.value, found.low, found.high))
-    return Interval(value=value, low=low, high=high, count=found.count)
+        return mean
+    value, low, high = (math.exp(end) for end in (mean.value, mean.low, mean.high))
+    return Interval(value=value, low=low, high=high, count=mean.count)
 
 
 # One mission --------------------------------------------------------------------------------------
@@ -282,7 +283,7 @@ _COMPARED = frozenset(measures_of({})) | {"outcome"}
 
 
 def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
-    """One mission by its number, and its row of `flights`.
+    """Return a mission's configuration and its row of `flights`.
 
     Raises:
         RecordError: the campaign cannot be read.
@@ -292,18 +293,18 @@ def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str,
         if row["outcome"] is not None:
             (config,) = ledger.configs([number])
             return config, row
-    problem = f"has no mission {number} that has flown ({number_span(ledger)})"
+    problem = f"has no flown mission {number}; the list has {number_span(ledger)}"
     raise ConfigError(problem, path=ledger.folder)
 
 
 def number_span(ledger: Ledger) -> str:
-    """The numbers of a campaign's missions, such as `0 to 199`."""
+    """The range of a campaign's mission numbers, such as `missions 0 to 199`."""
     numbers = [number for number, *_ in ledger.rows()]
-    return f"{min(numbers)} to {max(numbers)}" if numbers else "it has none"
+    return f"missions {min(numbers)} to {max(numbers)}" if numbers else "no missions"
 
 
 def differing(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
-    """The columns in which a repetition differs; mixed columns of an export are text."""
+    """Return the columns in which a repetition differs. Exports store mixed columns as text."""
     again = {**measures_of(result), "outcome": record_of(result).outcome}
     return [
         name

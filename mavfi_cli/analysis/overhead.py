@@ -1,9 +1,9 @@
 """The cost of detection and recovery, relative to flight time and to kernel time (Table V).
 
-Relative to flight time, each number of a setting is the mean over the missions of the success rate,
-with its bootstrap interval. Relative to kernel time, each number covers all error-free flights of a
-detector. Kernels and recomputations have the latencies of the flight's platform. The checks have
-their duration on the host.
+Relative to flight time, each number of a setting is the mean over the missions that count for the
+success rate, with its bootstrap interval. Relative to kernel time, each number covers all
+error-free flights of a detector. Kernels and recomputations have the latencies of the flight's
+platform. Checks take the time measured on the host.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class FlightOverhead:
 
     Attributes:
         labels: of the setting, with the detector.
-        flights: with checks.
+        flights: number of flights with checks.
         checks_per_s: checks per second of flight.
         check_host_s: mean time of a check on the host that flew.
-        detection_host_share: all checks, time of the host that flew.
+        detection_host_share: share of all checks, in time of the host that flew.
         recomputations: number in all flights, by stage.
         recovery_share: simulated latency of recomputations, by stage.
-        recovery_share_in_all: sum over the stages.
+        recovery_share_in_all: its sum over the stages.
         share_in_all: detection and recovery, host time and simulated time added up as the paper
             does.
     """
@@ -231,13 +231,15 @@ def recorded_overheads(
         platform: use only flights on this platform; None uses all.
 
     Raises:
-        RecordError: there are none; the message says what is there.
+        RecordError: no such flight is recorded; the message lists the recorded ones.
     """
     of_each = ComputeOverhead.of(_records(path), platform)
-    known = {name: each for name, each in of_each.items() if name in detectors}
+    known = {name: overhead for name, overhead in of_each.items() if name in detectors}
     if not known:
         everywhere = ComputeOverhead.of(_records(path)).values()
-        there = [f"{each.detector} on {' and '.join(each.platforms)}" for each in everywhere]
+        there = [
+            f"{overhead.detector} on {' and '.join(overhead.platforms)}" for overhead in everywhere
+        ]
         only = f", only {', '.join(there)}" if there else ""
         wanted = f" on {platform} (--platform)" if platform else ""
         flags = f"--platform {platform} " if platform else ""
@@ -253,7 +255,7 @@ def _records(path: Path) -> Iterator[Mapping[str, Any]]:
     if path.is_file() or (path / RESULT).is_file():
         yield load_run(path).result
         return
-    for ledger in (each for pattern in _LEDGERS for each in sorted(path.glob(pattern))):
+    for ledger in (file for pattern in _LEDGERS for file in sorted(path.glob(pattern))):
         with Ledger(ledger.parent) as opened:
             yield from (entry.result for entry in opened.results())
     for run in sorted(path.glob(f"*/{RESULT}")):

@@ -1,4 +1,4 @@
-"""Summary of a campaign: settings; cost of faults and benefit of protection mission by mission.
+"""Summary of a campaign: its settings, and paired comparisons of their missions.
 
 Reads the short rows of the ledger, because a campaign may have a million missions.
 """
@@ -27,7 +27,7 @@ RESAMPLES = TABLE_RESAMPLES
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
-INACTIVE = frozenset(each.value for each in Injected) - COUNTED
+INACTIVE = frozenset(kind.value for kind in Injected) - COUNTED
 _WHOLE = ("cell", "number")
 _WORDS = ("outcome", "injected", "pair")
 
@@ -41,11 +41,11 @@ class SettingSummary:
 
     Attributes:
         name: its labels in one phrase.
-        planned, errors: missions on the list; those of them that could not begin.
-        outcomes, injected: number of flown missions by outcome, and by what became of the fault.
-        success: over golden missions and faults that struck.
-        inactive: over faults that were not injected or not activated.
-        every: over all flown missions, as the paper counts.
+        planned, errors: number of missions on the list, and of those that could not begin.
+        outcomes, injected: number of flown missions by outcome, and by the fate of the fault.
+        success: share over golden missions and faults that struck.
+        inactive: share over faults that were not injected or not activated.
+        every: share over all flown missions, as in the paper.
         metrics: means over the successful missions of `success`, by METRICS.
     """
 
@@ -68,17 +68,17 @@ class SettingSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """Two settings over the missions that both flew.
+    """Comparison of two settings over the missions that both flew.
 
     Attributes:
         first, second: labels of the reference and of the other setting.
         name: phrase for the other setting.
         corrected_p: p-value of `success`, corrected by Holm over all comparisons of this kind.
         differences: second minus first over the pairs in which both succeeded, by METRICS.
-        over_own: largest flight time over that of the golden flight of the same mission, both
-            successful.
-        over_mean: longest of the same flights over the mean of the same golden ones, as in the
-            paper. Both include what protection recovers, if the second setting is protected.
+        over_own: largest ratio of a flight time to that of the golden flight of the same mission,
+            if both succeeded.
+        over_mean: ratio of the longest of these flights to the mean of their golden flights, as in
+            the paper. If the second setting is protected, both hold what protection recovers.
     """
 
     first: Labels
@@ -115,10 +115,11 @@ class CampaignSummary:
     """A campaign by setting.
 
     Attributes:
-        missions, over, missing: on the list; with a result; without one.
+        missions: number on the list.
+        over, missing: number with a result, and without one.
         confidence: of all intervals.
-        faults: each setting with faults against the golden one.
-        protection: each protected setting against the unprotected one with the same faults.
+        faults: comparisons of settings with faults with the golden one.
+        protection: comparisons of protected settings with the unprotected one with the same faults.
     """
 
     name: str
@@ -141,11 +142,12 @@ class Group:
     Attributes:
         labels: common labels.
         lacked: grouping labels that these missions lack.
-        planned, errors: missions on the list; those of them that could not begin.
+        planned, errors: number of missions on the list, and of those that could not begin.
         watched: whether a detector watches all of them.
-        flights: the flown ones, in the order of the list: `number`, `outcome`, `injected`, METRICS;
-            `pair` and `strike` are codes: of what golden, faulty and protected flights share, and
-            of what the labels say but for the treatment, which is the fault.
+        flights: the flown missions, in the order of the list: `number`, `outcome`, `injected`,
+            METRICS, `pair` and `strike`. Golden, faulty and protected flights of a mission share
+            the code `pair`. Labels that differ only in TREATMENT share the code `strike`, which
+            stands for the fault.
     """
 
     labels: Labels
@@ -157,7 +159,7 @@ class Group:
 
     @property
     def name(self) -> str:
-        """A phrase of their labels and of the grouping labels that they lack."""
+        """A phrase of the labels and of the grouping labels that the missions lack."""
         if not self.lacked or "setting" in self.labels:  # its name identifies it
             return label_text(self.labels)
         less = "golden" if self.flights.num_rows and self.golden else f"no {', '.join(self.lacked)}"
@@ -194,13 +196,13 @@ class Group:
 
     def among(self, name: str, words: Iterable[str]) -> BoolArray:
         """Whether each mission has one of these words in a text column, (n,)."""
-        found = pc.is_in(self.flights[name], value_set=pa.array(sorted(words), pa.string()))
-        return np.asarray(found.to_numpy(), dtype=bool)
+        matches = pc.is_in(self.flights[name], value_set=pa.array(sorted(words), pa.string()))
+        return np.asarray(matches.to_numpy(), dtype=bool)
 
     def counts(self, name: str) -> dict[str, int]:
         """Number of occurrences of each word in a column."""
-        found = pc.value_counts(self.flights[name]).to_pylist()
-        return dict(sorted((each["values"], each["counts"]) for each in found))
+        entries = pc.value_counts(self.flights[name]).to_pylist()
+        return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
 
     def successes(self, metric: str) -> FloatArray:
         """A metric of the counted successful missions that have it."""
@@ -211,7 +213,7 @@ class Group:
 
         The order is that of the other. Missions with faults match if the same faults strike them.
         If a pair was flown several times, the first flights match, then the second ones, and so on.
-        One golden flight matches all.
+        A golden flight matches every flight of its pair.
         """
         there = np.flatnonzero(other.counted)
         here = partners(
@@ -230,28 +232,30 @@ def untreated(labels: Labels) -> str:
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
-    """The settings, merged by equal labels `by`; UnknownName if no setting has such a label."""
+    """Merge settings whose labels `by` are equal; UnknownName if no setting has such a label."""
     labels = ledger.cells()
-    names = {name for each in labels for name in each}
+    names = {name for setting in labels for name in setting}
     for name in by:
         if name not in names:
             raise UnknownName("label", name, names)
-    kept = [{name: each[name] for name in by or each if name in each} for each in labels]
+    kept = [
+        {name: setting[name] for name in by or setting if name in setting} for setting in labels
+    ]
     members: dict[str, list[int]] = {}
-    for cell, each in enumerate(kept):
-        members.setdefault(canonical(each), []).append(cell)
+    for cell, setting in enumerate(kept):
+        members.setdefault(canonical(setting), []).append(cell)
     planned, errors = ledger.planned_by_cell(), ledger.errors_by_cell()
     parts = _parts(_short_rows(ledger, labels), list(members.values()), len(labels))
     return [
         Group(
-            labels=kept[those[0]],
-            lacked=[name for name in by if name not in kept[those[0]]],
-            planned=sum(planned[cell] for cell in those),
-            errors=sum(errors.get(cell, 0) for cell in those),
-            watched=all(labels[cell].get("detector") not in (None, "none") for cell in those),
+            labels=kept[cells[0]],
+            lacked=[name for name in by if name not in kept[cells[0]]],
+            planned=sum(planned[cell] for cell in cells),
+            errors=sum(errors.get(cell, 0) for cell in cells),
+            watched=all(labels[cell].get("detector") not in (None, "none") for cell in cells),
             flights=part,
         )
-        for those, part in zip(members.values(), parts, strict=True)
+        for cells, part in zip(members.values(), parts, strict=True)
     ]
 
 
@@ -264,7 +268,7 @@ def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
     ]
     whole = pa.concat_tables(portions or [schema.empty_table()]).combine_chunks()
     strikes: dict[str, int] = {}
-    coded = [strikes.setdefault(untreated(each), len(strikes)) for each in labels]
+    coded = [strikes.setdefault(untreated(setting), len(strikes)) for setting in labels]
     pairs = pc.dictionary_encode(whole["pair"]).combine_chunks()
     indices = pairs.indices if isinstance(pairs, pa.DictionaryArray) else pairs.chunk(0).indices
     return whole.set_column(whole.schema.get_field_index("pair"), "pair", indices).append_column(
@@ -275,8 +279,8 @@ def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
 def _parts(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
     """The rows of each group of cells, in the order of the list."""
     group_of = np.zeros(cells, dtype=np.int64)
-    for index, those in enumerate(members):
-        group_of[those] = index
+    for index, cells_of_group in enumerate(members):
+        group_of[cells_of_group] = index
     mine = group_of[whole["cell"].to_numpy()]
     ordered = whole.take(np.argsort(mine, kind="stable"))
     ends = np.searchsorted(np.sort(mine), np.arange(len(members)), side="right").tolist()
@@ -306,7 +310,7 @@ class _Match:
         return known((change - self.first.metrics[metric][self.at_first])[first & second])
 
     def worst(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Worst cases over own golden flights, and over the mean of these, within the pairs.
+        """Worst cases relative to each pair's own golden flight, and to the mean of these.
 
         A pair counts only if its golden flight succeeded.
         """
@@ -317,14 +321,16 @@ class _Match:
             sides = [(self.first, self.at_first), (self.second, self.at_second)]
         reference = self._times(self.golden, golden)
         times = [self._times(group, places) for group, places in sides]
-        shown = [~np.isnan(reference) & ~np.isnan(each) for each in times]
-        used = np.logical_or.reduce(shown)
+        usable = [~np.isnan(reference) & ~np.isnan(times_s) for times_s in times]
+        used = np.logical_or.reduce(usable)
         _, once = np.unique(golden[used], return_index=True)
         golden_s = reference[used][once]
-        pairs = list(zip(times, shown, strict=True))
+        pairs = list(zip(times, usable, strict=True))
         return (
-            worst_case(OWN, *((each[both] / reference[both]).tolist() for each, both in pairs)),
-            worst_case(golden_s.tolist(), *(each[both].tolist() for each, both in pairs)),
+            worst_case(
+                OWN, *((times_s[both] / reference[both]).tolist() for times_s, both in pairs)
+            ),
+            worst_case(golden_s.tolist(), *(times_s[both].tolist() for times_s, both in pairs)),
         )
 
     def _golden_of_first(self) -> IntArray:
@@ -337,10 +343,10 @@ class _Match:
     @staticmethod
     def _times(group: Group, places: IntArray) -> FloatArray:
         """Flight times of successful flights, (m,); NaN for others and at index -1."""
-        found = np.full(len(places), np.nan)
+        times_s = np.full(len(places), np.nan)
         there = (places >= 0) & group.succeeded[places]
-        found[there] = group.metrics["flight_time_s"][places[there]]
-        return found
+        times_s[there] = group.metrics["flight_time_s"][places[there]]
+        return times_s
 
 
 def _against_golden(groups: Sequence[Group], confidence: float) -> list[Comparison]:

@@ -31,14 +31,14 @@ Span = tuple[float, float]  # begin and end, s from the frame's stamp
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """A second of a flight after a typical depth frame. Times in s count from the frame's stamp.
+    """At least a second of a flight after a typical depth frame, in s from the frame's stamp.
 
     Attributes:
         platform: its name.
         frame_stamp_s: simulated time of the frame.
-        response_s: first setpoint that depends on the frame.
-        answer: what the pilot did.
-        plan_setpoint_s: first setpoint of the new plan; None without one.
+        response_s: time of the first setpoint that depends on the frame.
+        answer: the pilot's reaction.
+        plan_setpoint_s: time of the first setpoint of the new plan; None without one.
         shown_s: the window.
         chain_s: the invocations that led to the setpoints, by kernel.
         lanes_s: all invocations in the window, by kernel.
@@ -57,10 +57,10 @@ class Timeline:
 
 
 def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
-    """Timelines of the platforms that answered, over the same time.
+    """Return the timelines of the platforms whose flight reacted to a frame, equally long.
 
     Args:
-        runs: with time table and trace, by platform.
+        runs: runs with time table and trace, by platform.
 
     Raises:
         RecordError: a time table cannot be read.
@@ -71,7 +71,7 @@ def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
 
 
 def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) -> Timeline | None:
-    """The timeline of a flight, at least `least_s` long; None if no frame was answered.
+    """The timeline of a flight, at least `least_s` long; None without a reaction.
 
     If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the
     timeline ends with the first setpoint of the new plan.
@@ -98,15 +98,20 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
         platform=platform,
         frame_stamp_s=zero_s,
         response_s=answer_s - zero_s,
-        answer=answers.get(answer_s, "knows of the frame"),
+        answer=answers.get(answer_s, "uses the frame"),
         plan_setpoint_s=None if plan_setpoint_s is None else plan_setpoint_s - zero_s,
         shown_s=(begin_s - zero_s, end_s - zero_s),
-        chain_s={each.node: span(each) for each in (*chain, *(() if plan is None else (plan,)))},
+        chain_s={
+            invocation.node: span(invocation)
+            for invocation in (*chain, *(() if plan is None else (plan,)))
+        },
         lanes_s={
             kernel: [
-                span(each)
-                for each in ran
-                if each.node == kernel and each.end_s >= begin_s and each.start_s <= end_s
+                span(invocation)
+                for invocation in ran
+                if invocation.node == kernel
+                and invocation.end_s >= begin_s
+                and invocation.start_s <= end_s
             ]
             for kernel in KERNELS
         },
@@ -115,17 +120,23 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
 
 
 def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> Reaction | None:
-    """The reaction whose time is nearest the median of the flight's; the first of equals.
+    """The reaction whose duration is nearest the flight's median; the first of equals.
 
     Args:
         answers: stamps of setpoints; reactions that end in one of them are preferred.
     """
     if not reactions:
         return None
-    times_s = {each: each.setpoint_stamp_s - each.frame_stamp_s for each in reactions}
+    times_s = {
+        reaction: reaction.setpoint_stamp_s - reaction.frame_stamp_s for reaction in reactions
+    }
     median_s = statistics.median(times_s.values())
-    chosen = [each for each in reactions if each.setpoint_stamp_s in answers] or reactions
-    return min(chosen, key=lambda each: (abs(times_s[each] - median_s), each.frame_stamp_s))
+    chosen = [
+        reaction for reaction in reactions if reaction.setpoint_stamp_s in answers
+    ] or reactions
+    return min(
+        chosen, key=lambda reaction: (abs(times_s[reaction] - median_s), reaction.frame_stamp_s)
+    )
 
 
 def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
@@ -133,35 +144,35 @@ def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Inv
 
     The list is shorter if the time table lacks some.
     """
-    found: list[Invocation] = []
+    chain: list[Invocation] = []
     before_s = reaction.setpoint_stamp_s
-    for kernel in reversed(_CHAIN):  # the newest output of each
+    for kernel in reversed(_CHAIN):  # the newest output of each kernel
         over = [e for e in invocations if e.node == kernel and e.end_s <= before_s + _SAME_S]
         if not over:
             break
-        found.insert(0, max(over, key=lambda each: each.end_s))
-        before_s = found[0].start_s
-    ends_s = found[-1].end_s if found else reaction.frame_stamp_s
+        chain.insert(0, max(over, key=lambda invocation: invocation.end_s))
+        before_s = chain[0].start_s
+    ends_s = chain[-1].end_s if chain else reaction.frame_stamp_s
     control = [e for e in invocations if e.node == "control" and ends_s - _SAME_S <= e.start_s]
-    return [*found, *control[:1]]
+    return [*chain, *control[:1]]
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
-    """The first planning after the reaction to a verdict, in motion or at rest."""
-    for each in invocations:
-        if each.node == "planner" and each.start_s >= answer_s - _SAME_S:
-            return each if each.start_s <= answer_s + _PLAN_WITHIN_S else None
+    """The first invocation of the planner after a reaction, in motion or at rest."""
+    for invocation in invocations:
+        if invocation.node == "planner" and invocation.start_s >= answer_s - _SAME_S:
+            return invocation if invocation.start_s <= answer_s + _PLAN_WITHIN_S else None
     return None
 
 
 def _answered(
     invocations: Sequence[Invocation], stamps_s: Sequence[float], ready_s: float
 ) -> float | None:
-    """The first setpoint that uses an output that was ready at a time."""
-    for each in invocations:
-        if each.node == "control" and each.start_s >= ready_s - _SAME_S:
-            delay_s = each.end_s - each.start_s
-            due_s = each.start_s if delay_s < SAME_TICK_S else each.end_s
+    """The stamp of the first setpoint that uses an output that was ready at `ready_s`."""
+    for invocation in invocations:
+        if invocation.node == "control" and invocation.start_s >= ready_s - _SAME_S:
+            delay_s = invocation.end_s - invocation.start_s
+            due_s = invocation.start_s if delay_s < SAME_TICK_S else invocation.end_s
             return next((stamp for stamp in stamps_s if stamp >= due_s - _SAME_S), None)
     return None
 
@@ -169,7 +180,7 @@ def _answered(
 def timeline_seed(flights: pa.Table, platforms: Sequence[str]) -> int | None:
     """Seed of the first mission that succeeds and replans on all platforms.
 
-    Without one, the first that succeeds on all platforms; else None.
+    If none replans, the first that succeeds on all platforms; None without such a mission.
 
     Args:
         flights: golden and other flights, with the columns of `platforms.SCHEMA`.

@@ -1,4 +1,4 @@
-"""The flights of one picture: a mission golden, with faults, and protected (Fig. 13)."""
+"""The golden, faulty and protected flights of one mission, for a picture (Fig. 13)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.mission.run_folder import RESULT
 
-_KEPT = "mavfi campaign run --keep all, into another folder, keeps them"
+_KEPT = "`mavfi campaign run --keep all` into another folder keeps them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +24,7 @@ class DrawnFlight:
 
     Attributes:
         number: of its mission.
-        name: of its setting, no longer than the flights beside it require.
+        name: of its setting, as short as the other flights of the panel allow.
         flight_time_s: None if the flight has none.
         path: its run folder.
     """
@@ -55,7 +55,7 @@ class MissionPicture:
 
     Attributes:
         panels: one for each fault; at least one.
-        absent: what is not in the picture, and why, a line each.
+        absent: one line per mission that is not in the picture, with the reason.
     """
 
     panels: Sequence[Panel]
@@ -92,7 +92,7 @@ class _Flown:
 
     @property
     def treatment(self) -> list[str]:
-        """The rest of its treatment, which distinguishes settings of one name."""
+        """The rest of its treatment, which distinguishes settings of the same name."""
         values = (self.labels.get(name) for name in TREATMENT[1:])
         return [
             "no detector" if value == "none" else str(value)
@@ -120,7 +120,7 @@ def pair(
     chosen = listed.keys() if among is None else among
     number = _most_prolonged(ledger, chosen) if number is None else number
     if number not in listed:
-        problem = f"no mission {number}: the list has {number_span(ledger)}"
+        problem = f"has no mission {number}; the list has {number_span(ledger)}"
         raise ConfigError(problem, path=ledger.folder)
     pairs = {other: pair for other, _, pair, _ in listed.values()}
     mine = [other for other in pairs if pairs[other] == pairs[number] and other in chosen]
@@ -136,7 +136,7 @@ def pair(
         if row["state"] == ResultState.FLOWN.value
     ]
     if not flown:
-        raise RecordError(f"{ledger.folder}: nothing of mission {number}'s pair is flown")
+        raise RecordError(f"{ledger.folder}: no flight of mission {number}'s pair has been flown")
     lost = [flight.number for flight in flown if flight.path is None]
     if lost:
         raise RecordError(f"{ledger.folder}: no run folder of {_missions(lost)} was kept; {_KEPT}")
@@ -181,7 +181,7 @@ def _most_prolonged(ledger: Ledger, among: Collection[int]) -> int:
                 faulty_s[name] = max(time_s, faulty_s.get(name, 0.0))
     complete = [name for name in first if kept[name]]
     if not complete:
-        raise RecordError(f"{ledger.folder}: no pair of which all run folders were kept; {_KEPT}")
+        raise RecordError(f"{ledger.folder}: no pair has all its run folders; {_KEPT}")
     increase = {name: faulty_s[name] / golden_s[name] for name in faulty_s.keys() & golden_s.keys()}
     return first[max(complete, key=lambda name: (increase.get(name, 0.0), -first[name]))]
 
@@ -193,10 +193,10 @@ def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[Panel]:
         if not flight.golden:
             struck.setdefault(untreated(flight.labels), []).append(flight)
     panels = []
-    for those in struck.values():
-        (config,) = ledger.configs([those[0].number])
+    for faulty in struck.values():
+        (config,) = ledger.configs([faulty[0].number])
         fault = config.fault or config.instruction
-        panels.append(_panel("" if fault is None else fault.words(), golden + those))
+        panels.append(_panel("" if fault is None else fault.words(), golden + faulty))
     return panels or [_panel("", golden)]
 
 

@@ -18,8 +18,8 @@ from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.terminal import exit_code
 
-# name -> (module, what it does); the help page must not import the modules. One of the vehicle's
-# side takes the place of this process.
+# name -> (module, what it does); the help page must not import the modules. A command of the
+# vehicle's side replaces this process.
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
     "sitl": ("sitl", "Run the simulated vehicle alone, for any MAVLink client."),
@@ -67,13 +67,13 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete a command from the table, because importing every command would be slow."""
-        found = [
+        """Complete a command from the table, because importing every module would be slow."""
+        items = [
             CompletionItem(name, help=text)
             for name, (_, text) in _COMMANDS.items()
             if name.startswith(incomplete)
         ]
-        return found or click.Command.shell_complete(self, ctx, incomplete)
+        return items or click.Command.shell_complete(self, ctx, incomplete)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -85,23 +85,23 @@ class _LazyGroup(click.Group):
 
 
 class _VehicleSide(click.Command):
-    """A command of the vehicle's side. What follows `mavfi world` is completed by its program."""
+    """A command of the vehicle's side. Its program completes the words after `mavfi world`."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Ask the program; `mavfi sitl` completes nothing, because it would start the vehicle."""
+        """Run the program to complete; `mavfi sitl` completes nothing, as it would start to fly."""
         from mavfi_cli.core.processes import PYTHON
 
         if self.name != "world":
             return []
         words = [self.name, *ctx.params["arguments"]]
-        asked = {
+        request = {
             "_MAVFI WORLD_COMPLETE": "bash_complete",
             "COMP_WORDS": shlex.join([*words, incomplete]),
             "COMP_CWORD": str(len(words)),
         }
         line = [*PYTHON, "-m", _COMMANDS[self.name][0]]
-        done = subprocess.run(line, env=os.environ | asked, capture_output=True, text=True)
-        items = (answer.partition(",") for answer in done.stdout.splitlines() if answer)
+        done = subprocess.run(line, env=os.environ | request, capture_output=True, text=True)
+        items = (row.partition(",") for row in done.stdout.splitlines() if row)
         return [CompletionItem(value, type=kind) for kind, _, value in items]
 
 
@@ -130,9 +130,10 @@ def cli() -> None:
 
 
 def main() -> NoReturn:
-    """Entry point: errors are one line with exit code 1, usage errors with exit code 2.
+    """Run the command line and exit.
 
-    An unknown name is a usage error.
+    An error prints one line and exits with code 1, a usage error with code 2. An unknown name is a
+    usage error.
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
@@ -144,7 +145,7 @@ def main() -> NoReturn:
 
 
 def _interrupt(*_: object) -> NoReturn:
-    """End as Ctrl-C does, so that no process and no temporary folder stays."""
+    """End as Ctrl-C does, leaving no process and no temporary folder behind."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _terminated.append(True)
     raise KeyboardInterrupt

@@ -51,8 +51,8 @@ _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` that imply --full.
 _FULL = {"by", "confidence", "quality", "overhead", "failures"}
 _OPEN_CLUSTER = (
-    "warning: {} has no TLS: any user who can connect to it, and that is every user of its host, "
-    "can run programs as you there, on the workers and here (docs/how-to/cluster.md)"
+    "warning: {} has no TLS: anyone who can connect to it, including every user of its host, can "
+    "run programs as you there, on the workers and on this machine (docs/how-to/cluster.md)"
 )
 
 
@@ -73,7 +73,7 @@ def campaign() -> None:
 @_SET
 @_what("--missing-only", is_flag=True,
        help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
-@_what("--append", is_flag=True, help="Add the missions that the folder's list lacks.")
+@_what("--append", is_flag=True, help="Add the missions that are not yet on the folder's list.")
 @_what("--retry-errors", is_flag=True, help="Repeat the missions that could not begin.")
 @_execution("--jobs", type=JOBS,
             help="Number of parallel missions  [one per core].")  # fmt: skip
@@ -82,19 +82,19 @@ def campaign() -> None:
 @_execution("--cluster-key", type=_FOLDER, metavar="DIR",
             help="Keys of the cluster, made by `mavfi campaign keys`.")  # fmt: skip
 @_execution("--firmware", metavar="PATH",
-            help="SITL binary that the missions of a folder name. It is executed only if it is "
-                 "this one, or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
+            help="SITL binary to trust. A binary that the missions of a folder name is executed "
+                 "only if it is this one or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
 @_execution("--limit", "limit_s", type=ABOVE_ZERO, default=900.0,
             show_default=True,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
                  "`hang`.")  # fmt: skip
 @_output("--out", type=OUT, help="Folder of the campaign  [campaigns/NAME].")
 @_output("--keep", type=click.Choice(_KEEP),
-         help="Run folders to keep  [as the campaign says].")  # fmt: skip
+         help="Run folders to keep  [the campaign's choice].")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Fly the missing missions of a campaign: all, or those that an earlier run left.
+    """Fly all missions of a campaign that have no result yet.
 
     Ctrl-C waits for the missions in flight; a second one kills them. The next run resumes the
     campaign in either case.
@@ -156,15 +156,16 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 def status(
     what: str, by: str | None, confidence: float, as_json: bool, full: bool, **parts: Any
 ) -> None:
-    """Show what is flown, the time left and one table, also while the campaign runs.
+    """Show the progress, the time left and one table, even while the campaign runs.
 
-    The table is the paper's if the campaign is a preset of the paper, else that of the settings.
+    The table is the paper's if the campaign is a preset of the paper; otherwise it lists the
+    settings.
     `mavfi campaign report` prints it in other formats and draws it.
     """
     from mavfi_cli.campaigns.begin import opened
 
     if not parts["failures"] and (parts["kernels"] or parts["upsets"] is not None):
-        raise click.UsageError("--kernels and --upsets go with --failures")
+        raise click.UsageError("--kernels and --upsets need --failures")
     full = full or bool(given_options().keys() & _FULL)
     with opened(what) as ledger:
         _show(ledger, names_in(by or ""), confidence, as_json=as_json, full=full, **parts)
@@ -173,8 +174,8 @@ def status(
 @campaign.command()
 @click.argument("what", metavar="WHAT", type=CAMPAIGN)
 @click.option("--item", type=ITEM, metavar="ITEM",
-              help="Figure or table of the paper, such as fig12 of table4; needed in the folder "
-                   "of `mavfi reproduce`  [that of the preset].")  # fmt: skip
+              help="Figure or table of the paper, such as fig12 for flights of table4. Required "
+                   "in the folder of `mavfi reproduce`  [that of the preset].")  # fmt: skip
 @click.option("--format", "form", type=click.Choice([*FORMATS]),
               default="text", show_default=True, help="Format of the table.")  # fmt: skip
 @click.option("--output", metavar="FILE", type=OutFile(PICTURES),
@@ -182,9 +183,9 @@ def status(
 @click.option("--columns", type=click.Choice(["one", "two"]), default="one", show_default=True,
               help="Width of the figure in columns of a printed page.")  # fmt: skip
 def report(what: str, item: str | None, form: str, output: Path | None, columns: str) -> None:
-    """Print the paper's table or the numbers of its figure, ours beside the paper's.
+    """Print the table, or the numbers of the figure, with our values beside the paper's.
 
-    A campaign that is not in the paper has the table of its settings.
+    For a campaign that is not in the paper, print the table of its settings.
     """
     from mavfi_cli.campaigns.begin import opened
     from mavfi_cli.paper.figures import draw
@@ -211,7 +212,7 @@ def export(what: str, path: Path, as_json: bool) -> None:
     from mavfi_cli.report.campaign import flights_file
 
     if as_json and path == Path("-"):
-        raise click.UsageError("--json needs a file, because - is stdout")
+        raise click.UsageError("--json needs a file, because - writes the CSV to stdout")
     table = library.campaign(what).table
     content = flights_file(table, path)
     if path == Path("-"):
@@ -227,15 +228,15 @@ def export(what: str, path: Path, as_json: bool) -> None:
 @click.argument("what", metavar="WHAT", type=CAMPAIGN)
 @click.option("--pair", "number", type=NUMBER, metavar="NUMBER",
               help="Draw the pair of this mission. The number is the first part of the run "
-                   "folder's name  [the pair in which a fault costs most flight "
-                   "time].")  # fmt: skip
+                   "folder's name  [the pair whose flight time a fault increases "
+                   "most].")  # fmt: skip
 @click.option("--output", metavar="FILE", type=OutFile(PICTURES),
               required=True, help="The .svg, .pdf or .png file to write.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
 def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     """Draw the golden, faulty and protected flights of one pair from above.
 
-    Reads the kept run folders of all settings of the pair. Each fault has a panel.
+    Needs the run folders of all settings of the pair. Each fault gets its own panel.
     """
     from dataclasses import asdict
 
@@ -250,8 +251,8 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         flown = Trajectories.of(chosen)
         write_figure(flown.draw(), output)
     if as_json:
-        told = {**asdict(chosen), "picture": output}
-        echo(json.dumps(plain(told), indent=2, default=str))
+        summary = {**asdict(chosen), "picture": output}
+        echo(json.dumps(plain(summary), indent=2, default=str))
     else:
         absent = [f"not in the picture: {text}" for text in chosen.absent]
         echo_lines([*flown.lines(), *absent, f"Picture  {output}"])
@@ -291,32 +292,32 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
         refuse_given(("confidence",), "needs --margin or --difference")
     if what is None:
         refuse_given(("scale", "changes"), "needs a campaign")
-    told: dict[str, Any] = {}
+    answer: dict[str, Any] = {}
     lines: list[str] = []
     names = ("margin", "expected", "difference", "discordant", "power", "confidence")
     margin, expected, difference, discordant, power, confidence = (options[n] for n in names)
     sure = f"{100 * confidence:g} % confidence"
     if margin is not None:
         count = missions_for_margin(margin, expected=expected, confidence=confidence)
-        told["missions"] = count
+        answer["missions"] = count
         lines.append(
-            f"{count} missions a setting: Wilson interval of +-{margin:g} at a rate of "
+            f"{count} missions per setting: Wilson interval of +-{margin:g} at a rate of "
             f"{expected:g}, {sure}"
         )
     if difference is not None:
         count = pairs_for_difference(difference, discordant, confidence=confidence, power=power)
-        told["pairs"] = count
+        answer["pairs"] = count
         lines.append(
-            f"{count} pairs: a difference of {difference:g} found with {100 * power:g} % power, "
+            f"{count} pairs: a difference of {difference:g} detected with {100 * power:g} % power, "
             f"{sure}, where {100 * discordant:g} % of the pairs end differently "
             f"(--discordant {discordant:g})"
         )
     if what is not None:
-        told["campaign"], more = _planned(what, scale, options["changes"])
+        answer["campaign"], more = _planned(what, scale, options["changes"])
         lines += more
-    if not told:
+    if not answer:
         raise click.UsageError("name a campaign, --margin or --difference")
-    echo_lines(json.dumps(told, indent=2).split("\n") if as_json else lines)
+    echo_lines(json.dumps(answer, indent=2).split("\n") if as_json else lines)
 
 
 @campaign.command()
@@ -336,7 +337,7 @@ def keys(folder: Path) -> None:
 def _planned(
     what: str, scale: float | None, changes: Sequence[str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """The missions of a campaign, as plain values and in lines."""
+    """The missions of a campaign, as a dict for JSON and as lines of text."""
     from collections import Counter
 
     from mavfi_cli.campaigns.begin import chosen_spec, flyable
@@ -347,11 +348,11 @@ def _planned(
     settings = Counter(label_text(mission.labels) for mission in missions)
     rule = None if spec.fixed_world is None else spec.fixed_world.describe()
     pairs = len({mission.pair for mission in missions})
-    told = {
+    summary = {
         "name": spec.name, "about": spec.about, "fixed_world": rule, "missions": len(missions),
         "pairs": pairs, "settings": dict(settings),
     }  # fmt: skip
-    return told, [
+    return summary, [
         f"{spec.name}: {spec.about}" if spec.about else spec.name,
         *([rule] if rule else []),
         *(f"{count:>7}  {labels}" for labels, count in settings.items()),

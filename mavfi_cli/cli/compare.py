@@ -78,7 +78,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
     from mavfi_cli.studies.compare import compare as run
 
     if as_json and as_csv:
-        raise click.UsageError("--json and --csv exclude each other")
+        raise click.UsageError("--json cannot be combined with --csv")
     plan = _plan(options)
     with missions_view(quiet=quiet) as view:
         comparison = run(plan, out, Options(jobs=options["jobs"] or 0), view)
@@ -107,7 +107,8 @@ def _plan(options: dict[str, Any]) -> ComparePlan:
     if options["inject"] is not None:
         targets = names_in(options["inject"])
         if not targets:
-            raise ConfigError("name at least one, or none", key="inject")
+            problem = f"must name at least one target, or be none, got {options['inject']!r}"
+            raise ConfigError(problem, key="inject")
         chosen["inject"] = () if targets == ("none",) else targets
     if options["detectors"] is not None:
         chosen["detectors"] = names_in(options["detectors"])

@@ -41,7 +41,7 @@ def detect() -> None:
 @click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
-    """List the detectors with model files, stacks, thresholds and origin."""
+    """List the detectors with the model file, stack, threshold and origin of each."""
     from mavfi_cli.detect.base import listing
 
     rows = listing(models)
@@ -118,7 +118,7 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
     from mavfi_cli.studies.evaluate import evaluate as run
 
     if as_json and as_csv:
-        raise click.UsageError("--json and --csv exclude each other")
+        raise click.UsageError("--json cannot be combined with --csv")
     plan = _plan(options)
     with missions_view(quiet=quiet) as view:
         evaluation, pairs = run(plan, out, Options(jobs=options["jobs"] or 0), view)

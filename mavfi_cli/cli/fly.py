@@ -70,7 +70,7 @@ def _place(_ctx: Any, _param: Any, value: str | None) -> tuple[float, float, flo
     try:
         x, y, z = (float(part) for part in value.split(","))
     except ValueError:
-        raise click.BadParameter(f"{value!r} is not three numbers like 30,40,5") from None
+        raise click.BadParameter(f"must be three numbers such as 30,40,5, got {value!r}") from None
     return x, y, z
 
 
@@ -91,7 +91,7 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_mission("--planner", type=PLANNER, default="rrtstar",
           help="Planner: rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
 @_mission("--platform", type=PLATFORM, default="x86", metavar="NAME|FILE|measured:FACTOR",
-          help="Computer whose latencies the kernels have; `mavfi platforms` lists them. "
+          help="Computer whose kernel latencies apply; `mavfi platforms` lists them. "
                "`measured` takes the kernel times of this host times FACTOR and needs "
                "--realtime.")  # fmt: skip
 @_mission("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
@@ -113,14 +113,14 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @_mission("--eyes", is_flag=True,
-          help="Start depth camera and referee of --world beside the autopilot on --link. The "
-               "body is that of --vehicle.")  # fmt: skip
+          help="Start a depth camera and a referee of --world beside the autopilot on --link, "
+               "with the body of --vehicle.")  # fmt: skip
 @_mission("--origin", metavar="X,Y,Z", callback=_place,
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
 @_mission("--autopilot", type=AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",
-          help="Autopilot of the simulated vehicle. px4 and ardupilot are started and ended with "
-               "the mission.")  # fmt: skip
+          help="Autopilot of the simulated vehicle. px4 and ardupilot start and stop with the "
+               "mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
           help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @_mission("--key-file", metavar="FILE", type=click.Path(dir_okay=False),
@@ -129,11 +129,11 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
           help="Time without a new state or depth frame after which --link counts as lost, s. It "
                "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
-          help="Land and disarm at the goal  [with --link, otherwise not].")  # fmt: skip
+          help="Land and disarm at the goal  [only with --link].")  # fmt: skip
 @_fault("--inject", type=TARGET, metavar="STAGE|STATE|GROUP",
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
-             "process.NODE (the node's process is killed).")  # fmt: skip
+             "process.NODE (kills the node's process).")  # fmt: skip
 @_fault("--at", default="random",
         metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
@@ -150,7 +150,8 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_fault("--effect", default="flip", type=EFFECT,
         help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
 @_fault("--persistence", default="transient", type=PERSISTENCE,
-        help="Persistence: transient (once), stuck-at (held), intermittent (again).")  # fmt: skip
+        help="Persistence: transient (once), stuck-at (held) or intermittent "
+             "(repeated).")  # fmt: skip
 @_fault("--duration", "duration_s", type=ABOVE_ZERO,
         help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0,
@@ -241,16 +242,16 @@ def fly(
 
 
 def _hint(run: Run) -> list[str]:
-    """Name a fault that moves a waypoint far, after one in a state that changed hardly anything."""
+    """Suggest a fault that moves a waypoint far, if the flown one hardly changed its state."""
     fault, config = run.record.fault, run.record.config
-    changes = [each for strike in fault.get("strikes", []) for each in strike["changes"]]
+    changes = [change for strike in fault.get("strikes", []) for change in strike["changes"]]
     small = (
-        abs(each["after"] - each["before"]) <= _SMALL * max(1.0, abs(each["before"]))
-        for each in changes
+        abs(change["after"] - change["before"]) <= _SMALL * max(1.0, abs(change["before"]))
+        for change in changes
     )
     if run.record.outcome != "success" or config["detector"] or not (changes and all(small)):
         return []
-    if "config" in given_options():  # its faults would change the one that is named
+    if "config" in given_options():  # its fault settings would alter the suggested one
         return []
     line = ["mavfi", "fly"]
     for name, value in given_options().items():
@@ -265,11 +266,11 @@ def _hint(run: Run) -> list[str]:
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
-    """The mission of the file, with the options in place.
+    """The mission of the file, with the options applied.
 
     Raises:
         ConfigError: the file or an option is not valid.
-        UsageError: options do not fit together, or a key within one is not valid.
+        UsageError: options contradict each other, or a key within one is not valid.
     """
     from mavfi_cli.core.config import load_toml
     from mavfi_cli.spec.mission import MissionConfig
@@ -333,11 +334,11 @@ def _faults(
         return None, None
     own, other = (_SOURCE, _INSTRUCTION) if source else (_INSTRUCTION, _SOURCE)
     refuse_given(other, f"needs --level {'instruction' if source else 'source'}")
-    asked = {name: given[name] for name in (_EITHER | own) & set(given)}
-    if "fault_seed" in asked:
-        asked["seed"] = asked.pop("fault_seed")
+    values = {name: given[name] for name in (_EITHER | own) & set(given)}
+    if "fault_seed" in values:
+        values["seed"] = values.pop("fault_seed")
     kind: Any = FaultConfig if source else InstructionConfig
-    fault: Any = replace(prior or kind(target=target), target=target, **asked)
+    fault: Any = replace(prior or kind(target=target), target=target, **values)
     if source:
         fault.check()
         return fault, None
@@ -353,7 +354,7 @@ def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig |
     if name is None or name == "none":
         refuse_given(_DETECTOR, "needs --detector NAME")
         return None
-    asked = {option: given[option] for option in _DETECTOR & set(given)}
+    values = {option: given[option] for option in _DETECTOR & set(given)}
     if base.detector is None or base.detector.name != name:
-        return DetectorConfig(name=name, **asked)
-    return replace(base.detector, **asked)
+        return DetectorConfig(name=name, **values)
+    return replace(base.detector, **values)

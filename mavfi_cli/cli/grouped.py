@@ -20,7 +20,7 @@ class GroupedOption(click.Option):
 
 
 class GroupedCommand(click.Command):
-    """A command whose errors name options, and whose help shows them by group."""
+    """A command whose errors name the option at fault and whose help groups the options."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Call the command. An invalid value is a usage error that names the option."""
@@ -36,7 +36,7 @@ class GroupedCommand(click.Command):
         """Write one section per group, in the order of declaration."""
         sections: dict[str, list[tuple[str, str]]] = {}
         params = self.get_params(ctx)
-        rest = "Output" if any(isinstance(each, GroupedOption) for each in params) else "Options"
+        rest = "Output" if any(isinstance(param, GroupedOption) for param in params) else "Options"
         for param in params:
             record = None if isinstance(param, click.Argument) else param.get_help_record(ctx)
             if record is not None:
@@ -63,23 +63,23 @@ class GroupOfCommands(click.Group):
 
 
 def _blamed(error: MavfiError) -> tuple[str, str]:
-    """The option or argument whose value an error is about, and the problem; both may be empty."""
+    """The option or argument that caused an error, and the problem; both may be empty."""
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
-    if isinstance(error, PlaceError):  # names the world, whose name is right
+    if isinstance(error, PlaceError):  # it names the world, which is not at fault
         return "", ""
     for name, value in given_options().items() if error.exit_code == 2 else ():
         texts = value if isinstance(value, tuple) else (value,)
-        names = (
-            each for text in texts if isinstance(text, str) for each in (text, *names_in(text))
+        words = (
+            word for text in texts if isinstance(text, str) for word in (text, *names_in(text))
         )
-        if any(repr(each) in str(error) for each in names):
+        if any(repr(word) in str(error) for word in words):
             return spelling(name), str(error)
     return "", ""
 
 
 def given_options() -> dict[str, Any]:
-    """The options that the user gave to the current command, by the names of its parameters."""
+    """The options that the user gave to the current command, by parameter name."""
     context = click.get_current_context()
     return {
         name: value
@@ -89,7 +89,7 @@ def given_options() -> dict[str, Any]:
 
 
 def spelling(name: str) -> str:
-    """The option of a parameter of the current command, such as `--v-max`; else the name."""
+    """Return a parameter's option of the current command, such as `--v-max`; else the name."""
     for param in click.get_current_context().command.params:
         if param.name == name or f"--{name}" in param.opts:
             return param.opts[0]
@@ -97,12 +97,12 @@ def spelling(name: str) -> str:
 
 
 def refuse_given(names: Collection[str], why: str) -> None:
-    """Reject options that would have no effect: `why` goes after the option."""
+    """Reject options that would have no effect. `why` follows the option in the message."""
     for name in given_options():
         if name in names:
             raise click.UsageError(f"{spelling(name)} {why}")
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names in a list that is separated by commas."""
+    """The names in a comma-separated list."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

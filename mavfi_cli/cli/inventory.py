@@ -1,4 +1,4 @@
-"""`mavfi doctor`, `platforms`, `stacks`, `states`: what this machine can do, and what to choose."""
+"""`mavfi doctor`, `platforms`, `stacks`, `states`: what this machine supports, and what exists."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _title(chosen: PlatformProfile | Stack) -> str:
 
 # Doctor -------------------------------------------------------------------------------------------
 
-_FOUND = 29  # column of a check's finding
+_FINDING = 29  # column of a check's finding
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
 
 
@@ -40,7 +40,7 @@ _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("r
 def doctor(as_json: bool) -> None:
     """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
 
-    Exits with code 1 if mavfi cannot fly here. Limitations do not count.
+    Exits with code 1 if mavfi cannot fly here. Limitations do not change the exit code.
     """
     from mavfi_cli.mission.machine import FAILED, check_machine
 
@@ -49,11 +49,11 @@ def doctor(as_json: bool) -> None:
         checks.append(check)
         if not as_json:
             colour, mark = _MARKS[check.verdict]
-            first, *rest = textwrap.wrap(check.finding, WIDTH - _FOUND) or [""]
+            first, *rest = textwrap.wrap(check.finding, WIDTH - _FINDING) or [""]
             click.secho(f"{mark:<8}", fg=colour, nl=False)
             echo(f"{check.name:<20} {first}")
             for line in [*rest, *([f"-> {check.remedy}"] if check.remedy else [])]:
-                echo(f"{'':<{_FOUND}}{line}")
+                echo(f"{'':<{_FINDING}}{line}")
     if as_json:
         _print_json(checks)
     if any(check.verdict == FAILED for check in checks):
@@ -67,13 +67,13 @@ _MORE_PLATFORMS = """\
 measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for `mavfi fly \
 --realtime` only
 
-`mavfi platforms NAME` shows every kernel; docs/how-to/platform.md says how to add one."""
+`mavfi platforms NAME` shows every kernel; docs/how-to/platform.md explains how to add one."""
 _MEASURED = """\
 {cores} cores, stays on the ground
 Every invocation of {kernels} is
-measured on this host, and its output takes effect {factor:g} times as much later.
-result.json has the medians. Such a flight does not repeat: `mavfi fly --realtime`
-only, neither in campaigns nor with `mavfi replay`."""
+measured on this host, and its output takes effect {factor:g} times that duration later.
+result.json has the medians. Such a flight does not repeat, so only
+`mavfi fly --realtime` accepts this platform."""
 
 
 @click.command(cls=GroupedCommand)
@@ -172,14 +172,14 @@ def stacks(names: tuple[str, ...], as_json: bool) -> None:
     """
     from mavfi_cli.spec.stack import STACKS, load_stack
 
-    found = [load_stack(name) for name in names or STACKS.names]
+    loaded = [load_stack(name) for name in names or STACKS.names]
     if as_json:
-        _print_json(found)
+        _print_json(loaded)
     elif not names:
-        echo_lines(f"{stack.name:<19}{stack.description}" for stack in found)
+        echo_lines(f"{stack.name:<19}{stack.description}" for stack in loaded)
         echo(_MORE_STACKS)
     else:
-        echo_lines(_explained(found[0]) if len(found) == 1 else _compared(found))
+        echo_lines(_explained(loaded[0]) if len(loaded) == 1 else _compared(loaded))
 
 
 def _explained(stack: Stack) -> Iterator[str]:
@@ -189,36 +189,38 @@ def _explained(stack: Stack) -> Iterator[str]:
     for group, keys in _GROUPS.items():
         yield group
         for key in keys:
-            head = f"  {key:<{_KEY}}{_told(getattr(stack, key)):<{_VALUE}}"
+            head = f"  {key:<{_KEY}}{_format_value(getattr(stack, key)):<{_VALUE}}"
             source = textwrap.wrap(stack.sources.get(key, "not given"), WIDTH - start)
-            yield head + source.pop(0) if len(head) == start else head  # else its source is below
+            yield (
+                head + source.pop(0) if len(head) == start else head
+            )  # a long value has its source below
             yield from (" " * start + line for line in source)
 
 
-def _compared(found: Sequence[Stack]) -> Iterator[str]:
+def _compared(stacks: Sequence[Stack]) -> Iterator[str]:
     """The keys in which stacks differ, one column per stack."""
-    for number, stack in enumerate(found, start=1):
+    for number, stack in enumerate(stacks, start=1):
         yield from textwrap.wrap(f"{number}  {_title(stack)}", WIDTH, subsequent_indent="   ",
                                  break_long_words=True)  # fmt: skip
     keys = [key for keys in _GROUPS.values() for key in keys
-            if len({getattr(stack, key) for stack in found}) > 1]  # fmt: skip
+            if len({getattr(stack, key) for stack in stacks}) > 1]  # fmt: skip
     yield ""
     if not keys:
         yield "no key differs"
         return
-    width = max(8, (WIDTH - _KEY) // len(found))
-    rows = [("", [[str(number)] for number in range(1, len(found) + 1)])]
+    width = max(8, (WIDTH - _KEY) // len(stacks))
+    rows = [("", [[str(number)] for number in range(1, len(stacks) + 1)])]
     rows += [
-        (key, [textwrap.wrap(_told(getattr(stack, key)), width - 2) for stack in found])
+        (key, [textwrap.wrap(_format_value(getattr(stack, key)), width - 2) for stack in stacks])
         for key in keys
     ]
     for key, cells in rows:  # several lines if a value is wider than its column
         for line in range(max(map(len, cells))):
-            told = [f"{cell[line] if line < len(cell) else '':<{width}}" for cell in cells]
-            yield f"{'' if line else key:<{_KEY}}{''.join(told)}".rstrip()
+            columns = [f"{cell[line] if line < len(cell) else '':<{width}}" for cell in cells]
+            yield f"{'' if line else key:<{_KEY}}{''.join(columns)}".rstrip()
 
 
-def _told(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

@@ -72,12 +72,12 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_native("--ignore-lines", multiple=True, metavar="REGEX",
          help="Do not compare lines that contain a match. May be repeated.")  # fmt: skip
 @_native("--folder", type=click.Path(exists=True, file_okay=False, path_type=Path),
-         help="Folder of which each run gets a copy to work in  [an empty folder].")  # fmt: skip
+         help="Folder that each run works in a copy of  [an empty folder].")  # fmt: skip
 @_native("--env", multiple=True, metavar="NAME=VALUE",
          help="Environment variable of the program. May be repeated.")  # fmt: skip
 @_native("--memory", default=2.0, show_default=True, metavar="GB",
          type=ABOVE_ZERO,
-         help="Limit on the memory of the program.")  # fmt: skip
+         help="Memory limit of the program.")  # fmt: skip
 @_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
 @_native("--function", help="Attack only code that executes during calls of this function.")
 @_fault("--sampling", default="instruction-uniform", show_default=True, type=SAMPLING,
@@ -101,7 +101,7 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_runs("--jobs", default=1, show_default=True, type=JOBS,
        help="Number of parallel runs. It does not change the results.")  # fmt: skip
 @_runs("--tolerance", default=0.0, type=Number(0.0, 1.0e6),
-       help="Relative error still counted as benign.")  # fmt: skip
+       help="Largest relative error that counts as benign.")  # fmt: skip
 @_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
        help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
             "--runs limits the runs of each. For runs of a program, give the options of the "
@@ -119,11 +119,11 @@ def kernels(**options: Any) -> None:
     """
     if options["compat"] is not None:
         chosen = ("sampling", "site", "role", "field", "bits")
-        refuse_given(chosen, "goes without --compat, which chooses it by its own rule")
+        refuse_given(chosen, "cannot be combined with --compat, which sets it")
     if options["replay"] is not None:
         shared = ("replay", "kernel", "runs", "program", "tolerance", "memory", *_OF_PROGRAM)
         others = [name for name in options if name not in shared]
-        refuse_given(others, "goes without --replay: a record says how it was drawn")
+        refuse_given(others, "cannot be combined with --replay, which takes it from the record")
         if options["program"] is None:
             refuse_given(("tolerance", "memory", *_OF_PROGRAM), "needs --program")
         program = None if options["program"] is None else _program(options)
@@ -131,7 +131,7 @@ def kernels(**options: Any) -> None:
         if not _replay_folder(options["replay"], options["kernel"], limit, program):
             raise click.exceptions.Exit(1)
     elif options["program"] is not None:
-        refuse_given(("kernel", "world", "world_seed"), "goes without --program")
+        refuse_given(("kernel", "world", "world_seed"), "cannot be combined with --program")
         _attack(options)
     else:
         refuse_given(("memory", *_OF_PROGRAM), "needs --program")
@@ -239,7 +239,7 @@ def _program(options: dict[str, Any]) -> ProgramTarget:
 def _variable(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not name or not equals:
-        raise ConfigError(f"{text!r} is not NAME=VALUE", key="env")
+        raise ConfigError(f"must be NAME=VALUE, got {text!r}", key="env")
     return name, value
 
 

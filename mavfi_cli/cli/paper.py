@@ -24,18 +24,18 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @click.argument("names", metavar="[ITEM...]", nargs=-1, type=ITEM)
 @_what("--scale", type=Number(0.0, 1.0, min_open=True), default=1.0,
        show_default=True,
-       help="Fraction of the paper's number of missions. A folder may grow to a larger "
-            "one.")  # fmt: skip
+       help="Fraction of the paper's number of missions. A folder can be extended "
+            "to a larger fraction.")  # fmt: skip
 @_what("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
 @_execution("--jobs", type=JOBS,
             help="Number of parallel missions  [one per core].")  # fmt: skip
 @_output("--out", type=OUT, default=Path("reproduction"),
-         show_default=True, help="Folder in which each stack has a folder.")  # fmt: skip
+         show_default=True, help="Parent of one folder per stack.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the tables and their folder as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
-    """Fly the experiments of the paper, and print the results beside the paper's.
+    """Fly the experiments of the paper, and print our results beside the paper's.
 
     ITEM is fig6 fig7 fig8 fig9 fig11 fig12 fig13 fig14 fig15 fig16 table3 table4 table5; all of
     them by default. Missions that items share are flown once. The same command resumes after an
@@ -49,7 +49,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     from mavfi_cli.paper.status import tables
     from mavfi_cli.spec.stack import load_stack
 
-    load_stack(options["stack"])  # before what takes long
+    load_stack(options["stack"])  # fail before the flights
     plan = FlightsPlan(
         items=items_named(names), stack=options["stack"], scale=options["scale"], out=options["out"]
     )
@@ -61,9 +61,9 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
             lambda forecast: view.on_note(forecast.told),
         )
     if as_json:
-        told = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
+        summary = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
                 "items": [asdict(table) for table in tables(plan)]}  # fmt: skip
-        echo(json.dumps(plain(told), indent=2, default=str))
+        echo(json.dumps(plain(summary), indent=2, default=str))
         return
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
@@ -82,18 +82,18 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
               help="Bit flips per hour that reach the injection sites, for the table of "
                    "failures per flight hour.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True,
-              help="Print the file, its missions, and how many claims have which verdict, as "
+              help="Print the file, its number of missions and the count of each verdict as "
                    "JSON.")  # fmt: skip
 def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool) -> None:
     """Write one HTML file: the paper's claims, tables and figures beside flown missions.
 
-    DIR is the folder of a campaign or of `mavfi kernels`, a folder of such folders, as `mavfi
-    reproduce` makes it, or an exported .parquet file. The page needs no network. It opens on a
+    DIR is the folder of a campaign or of `mavfi kernels`, a folder of such folders, which `mavfi
+    reproduce` makes, or an exported .parquet file. The page needs no network. It opens on a
     phone, and prints to PDF. Needs: pip install 'mavfi[report]'.
     """
     from mavfi_cli.report.page import render, require_page
 
-    require_page(output)  # before what takes long
+    require_page(output)  # fail before the slow part
     from mavfi_cli.cli.progress import steps_view
     from mavfi_cli.core.files import write_text
     from mavfi_cli.paper.document import document

@@ -41,9 +41,9 @@ class Name(click.ParamType[str]):
     """A name that the shell completes. The program itself rejects unknown names.
 
     Args:
-        names: All names, as MODULE:ATTRIBUTE, or from the options that precede on the command line.
+        names: Sources of names: MODULE:ATTRIBUTE, or a function of the options given so far.
         several: Names are separated by commas.
-        files: A path may replace the name.
+        files: A path is accepted in place of a name.
     """
 
     name = "text"
@@ -54,25 +54,25 @@ class Name(click.ParamType[str]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the names that begin as typed, or have the shell complete a path."""
+        """Return the names that start with the typed text, or let the shell complete a path."""
         typed, comma, begun = incomplete.rpartition(",") if self._several else ("", "", incomplete)
-        known = (_loaded(each) if isinstance(each, str) else each(ctx) for each in self._names)
-        found = [
+        known = (_loaded(own) if isinstance(own, str) else own(ctx) for own in self._names)
+        matches = [
             CompletionItem(f"{typed}{comma}{name}")
             for name in dict.fromkeys(itertools.chain.from_iterable(known))
             if name.startswith(begun) and name not in typed.split(",")
         ]
-        return found or ([CompletionItem(incomplete, type="file")] if self._files else [])
+        return matches or ([CompletionItem(incomplete, type="file")] if self._files else [])
 
 
 def _loaded(place: str) -> Iterable[str]:
     """Names from MODULE:ATTRIBUTE: an enumeration, shipped files, plug-ins, or a container."""
     module, _, attribute = place.partition(":")
-    found: Any = getattr(importlib.import_module(module), attribute)
-    if isinstance(found, EnumType):
-        members: Any = found
+    container: Any = getattr(importlib.import_module(module), attribute)
+    if isinstance(container, EnumType):
+        members: Any = container
         return [str(member.value) for member in members]
-    return list(getattr(found, "names", found))
+    return list(getattr(container, "names", container))
 
 
 def _worlds(_ctx: click.Context) -> Iterable[str]:
@@ -129,7 +129,7 @@ CAMPAIGN = Name(
 
 # Files --------------------------------------------------------------------------------------------
 
-_MOST = 1000  # entries of a folder that completion looks at
+_MOST = 1000  # entries of a folder that completion reads
 
 
 class RunPath(click.Path):
@@ -141,9 +141,9 @@ class RunPath(click.Path):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the run folders whose paths begin as typed, also one level below."""
-        found = [CompletionItem(str(path)) for path in sorted(_runs(incomplete))]
-        return found or super().shell_complete(ctx, param, incomplete)
+        """Return the run folders, down to one level below, whose paths start with the text."""
+        matches = [CompletionItem(str(path)) for path in sorted(_runs(incomplete))]
+        return matches or super().shell_complete(ctx, param, incomplete)
 
 
 def _runs(begun: str) -> Iterator[Path]:
@@ -153,7 +153,7 @@ def _runs(begun: str) -> Iterator[Path]:
     for path in _folders(parent):
         if not path.name.startswith(stem) or (path.name.startswith(".") and not stem):
             continue
-        yield from (each for each in (path, *_folders(path)) if (each / RESULT).is_file())
+        yield from (folder for folder in (path, *_folders(path)) if (folder / RESULT).is_file())
 
 
 def _folders(parent: Path) -> list[Path]:

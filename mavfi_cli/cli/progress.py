@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mavfi_cli.spec.mission import MissionConfig
 
 PLAIN_EVERY_S, _REDRAW_S = 10.0, 0.05
-_TOLD = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
+_NOTED = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
 _MOST_SETTINGS = 6  # more settings have no rates here; `campaign status` shows all
 _Part = str | tuple[str, str]  # text, or text and its style on a terminal
 
@@ -58,14 +58,14 @@ class _LiveLine(_Lines):
         from rich.text import Text
 
         now_s = time.monotonic()
-        if now_s >= self._next_s or last:  # to draw takes longer than some of what is told
+        if now_s >= self._next_s or last:  # drawing takes longer than some updates
             self._next_s = now_s + _REDRAW_S
             self._live.update(Text(cleaned(text)), refresh=True)
 
 
 @contextmanager
 def _screen(first_s: float) -> Iterator[_Lines]:
-    """The lines that suit stderr; plain progress begins after `first_s`."""
+    """Choose live or plain progress for stderr. Plain progress begins after `first_s`."""
     if not sys.stderr.isatty():
         yield _Lines(first_s)
         return
@@ -97,7 +97,7 @@ class _FlightView(Watcher):
         if self._title:  # not earlier: a mission that cannot begin prints one line only
             self._screen.note((self._title, "bold"))
             self._title = ""
-        if event.kind in _TOLD:
+        if event.kind in _NOTED:
             self._screen.note((f"{event.stamp_s:7.2f} s", "dim"), "  ", printable(event.text))
 
 
@@ -106,25 +106,25 @@ class _MissionsView(Spectator):
         self._screen = screen
 
     def on_progress(self, progress: Progress) -> None:
-        """One line: missions, rate, remaining time, success rates so far."""
+        """Show missions, rate, remaining time and success rates so far in one line."""
         parts = [f"{progress.over}/{progress.total} missions", f"{progress.running} flying"]
         if progress.eta_s is not None:
             parts.append(f"{progress.rate_per_h:.0f} an hour")
             if progress.over < progress.total:
                 parts.append(f"{duration(progress.eta_s)} to go")
         if progress.success_rate is not None:
-            told = f"{100.0 * progress.success_rate:.1f} % success"
+            success = f"{100.0 * progress.success_rate:.1f} % success"
             if 2 <= len(progress.outcomes) <= _MOST_SETTINGS:
                 rates = progress.success_rates.items()
-                told += f" ({', '.join(f'{name} {100.0 * rate:.1f}' for name, rate in rates)})"
-            parts.append(told)
+                success += f" ({', '.join(f'{name} {100.0 * rate:.1f}' for name, rate in rates)})"
+            parts.append(success)
         if progress.again:
             parts.append(f"{progress.again} begun again")
         last = progress.over == progress.total
         self._screen.update(", ".join(parts), progress.elapsed_s, last=last)
 
     def on_end(self, progress: Progress) -> None:
-        """The time that the missions took; nothing if none was flown."""
+        """Show the time that the missions took; nothing if none was flown."""
         if flown := progress.over - progress.before:
             line = f"{flown} missions in {duration(progress.elapsed_s)}"
             line += f", {progress.rate_per_h:.0f} an hour"
@@ -147,7 +147,7 @@ class _RunsView:
         self._begun_s, self._kernel = time.monotonic(), ""
 
     def show(self, kernel: str, done: int) -> None:
-        """Tell the number of completed runs of a kernel."""
+        """Show the number of completed runs of a kernel."""
         if kernel != self._kernel:
             self._kernel = kernel
             self.note(f"{kernel}: golden run and profile")
@@ -159,11 +159,11 @@ class _RunsView:
         self._screen.update(text, elapsed_s, last=over == total)
 
     def stage(self, what: str) -> None:
-        """Tell the step before the first run of a kernel."""
+        """Show a step that precedes the first run of a kernel."""
         self._screen.update(f"{self._kernel}: {what}", self._elapsed_s())
 
     def note(self, text: str) -> None:
-        """Tell something at once."""
+        """Print a note at once."""
         self._screen.note(text)
 
     def _elapsed_s(self) -> float:
@@ -172,14 +172,14 @@ class _RunsView:
 
 @contextmanager
 def runs_view(kernels: Sequence[str], runs: int) -> Iterator[_RunsView]:
-    """The view of runs of isolated kernels for stderr."""
+    """Show the runs of isolated kernels on stderr."""
     with _screen(PLAIN_EVERY_S) as screen:
         yield _RunsView(screen, kernels, runs)
 
 
 @contextmanager
 def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
-    """The watcher of one mission for stderr."""
+    """Show the progress of one mission on stderr."""
     if quiet:
         yield Watcher()
         return
@@ -191,7 +191,7 @@ def progress_view(config: MissionConfig, *, quiet: bool) -> Iterator[Watcher]:
 
 @contextmanager
 def missions_view(*, quiet: bool) -> Iterator[Spectator]:
-    """The spectator of many missions for stderr."""
+    """Show the progress of many missions on stderr."""
     if quiet:
         yield Spectator()
         return

@@ -15,7 +15,7 @@ from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
 
-_TELL_ACTIVATION = ("events", "fault")  # sections that also name the reader of the flip
+_ACTIVATION_SECTIONS = ("events", "fault")  # sections that also name the reader of the flip
 
 
 @click.command(cls=GroupedCommand)
@@ -35,7 +35,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     from mavfi_cli.report.summary import difference_lines, event_lines, folder_lines, summary_lines
 
     if as_json and (pair or events):
-        raise click.UsageError("--json prints the record alone: leave out --pair and --events")
+        raise click.UsageError("--json cannot be combined with --pair or --events")
     recorded = load_run(run)
     if pair and not recorded.record.fault:
         raise click.UsageError("--pair needs a run with a fault")
@@ -57,7 +57,7 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
         if golden is not None:
             lines += difference_lines(recorded, golden)
         elif recorded.record.fault:
-            lines.append("Effect      unknown; `mavfi show --pair` flies the golden pair to tell")
+            lines.append("Effect      unknown; `mavfi show --pair` flies the golden run to find it")
         if events:
             lines += ["", "Events", *event_lines(recorded.result)]
     echo_lines([*lines, *folder_lines(recorded, picture)])
@@ -66,17 +66,17 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
 @click.command(cls=GroupedCommand)
 @click.argument("run", type=RunPath())
 @click.option("--mission", "number", type=NUMBER, metavar="NUMBER",
-              help="RUN is a campaign's folder or exported .parquet: repeat its mission of this "
-                   "number.")  # fmt: skip
+              help="Repeat this mission of RUN, the folder or exported .parquet file of a "
+                   "campaign.")  # fmt: skip
 @click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
 @click.option("--out", type=OUT, default=Path("runs"),
               show_default=True, help="Parent of the new run folder.")  # fmt: skip
 @click.option("--firmware", metavar="PATH",
-              help="SITL binary that RUN names. It is executed only if it is this one, or that of "
-                   "PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
+              help="SITL binary to trust. The binary that RUN names runs only if it is this one "
+                   "or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
 @click.option("--gdb", is_flag=True,
               help="Instruction level: stop the node at the injected instruction and wait for a "
-                   "debugger. The activation is then neither followed nor compared.")  # fmt: skip
+                   "debugger. The activation is then neither tracked nor compared.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
 def replay(
     run: Path, number: int | None, out: Path, firmware: str | None, as_json: bool, **how: bool
@@ -99,7 +99,7 @@ def replay(
     if number is None:
         comparison, lines = _repeat_run(run, out, gdb=how["gdb"], **options)
     elif how["gdb"]:
-        raise click.UsageError("--gdb needs a run folder, which --mission does not")
+        raise click.UsageError("--gdb needs a run folder and cannot be combined with --mission")
     else:
         comparison, lines = _repeat_mission(run, number, out, **options)
     echo_lines(json.dumps(comparison, indent=2).split("\n") if as_json else lines)
@@ -126,8 +126,8 @@ def _repeat_run(
     config = run.mission(**flown)
     what = "again" if with_fault else "without its fault"
     note(f"flying {config.world}, seed {config.seed}, {what}")
-    again = fly_again(run, out, **flown, for_debugger=_say_where if gdb else None)
-    ignored = _TELL_ACTIVATION if gdb else ()
+    again = fly_again(run, out, **flown, for_debugger=_announce_stop if gdb else None)
+    ignored = _ACTIVATION_SECTIONS if gdb else ()
     differing = [name for name in run.differing_sections(again) if name not in ignored]
     identical = not differing and (file_digest(run.folder.trace) == file_digest(again.folder.trace))
     parting = run.first_difference(again, truth=True)
@@ -178,20 +178,20 @@ def _repeat_mission(
         "differing_measures": changed,
     }
     same = "identical in every measure"
-    told = f"DIFFERENT in {', '.join(changed)}" if changed else same
-    return comparison, [outcome_line(again.result), told, f"Run folder  {again.folder.path}"]
+    verdict = f"DIFFERENT in {', '.join(changed)}" if changed else same
+    return comparison, [outcome_line(again.result), verdict, f"Run folder  {again.folder.path}"]
 
 
 def _warn_of_builds(versions: Mapping[str, str]) -> None:
-    """Name the programs that are others than those of a record; {} if it does not say."""
+    """Warn of programs whose versions differ from those of a record; {} if these are unknown."""
     from mavfi_cli.core.installed import installed_versions, version_differences
 
     for text in version_differences(versions, installed_versions()) if versions else ():
         note(f"warning: another build: {text}")
 
 
-def _say_where(pid: int) -> None:
+def _announce_stop(pid: int) -> None:
     note(
-        f"the node waits at the injected instruction, the fault in place: gdb -p {pid}  "
-        f"(or let it go on: kill -CONT {pid})"
+        f"the node is stopped at the injected instruction, with the fault in place: gdb -p {pid}  "
+        f"(or continue it: kill -CONT {pid})"
     )

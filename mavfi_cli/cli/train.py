@@ -44,8 +44,8 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 @click.option("--firmware", metavar="PATH",
               help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
 @click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
-              help="Fit to the error-free flights in this folder of run folders, of any "
-                   "autopilot, instead of flying.")  # fmt: skip
+              help="Do not fly; fit to the error-free flights among the run folders in this "
+                   "folder. Any autopilot may have flown them.")  # fmt: skip
 @click.option("--kind", "kinds", multiple=True, type=DETECTOR,
               help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
 @click.option("--n-sigma", type=ABOVE_ZERO, help="Threshold of the Gaussian model  [its default].")
@@ -74,7 +74,7 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     if autopilot == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     if flown is not None:
-        refuse_given(_FLYING, "means nothing with --flown")
+        refuse_given(_FLYING, "has no effect with --flown")
     named = ("flights", "first_seed", "seed", "n_sigma", "flown")
     plan = TrainingPlan(
         worlds=options["worlds"] or TRAINING_WORLDS,

@@ -42,23 +42,23 @@ def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> No
     if as_json and save is None:
         raise click.UsageError("--json needs --save FILE")
     if layout is not None and (save is None or save.suffix.lower() != ".mcap"):
-        raise click.UsageError("--layout goes with --save FILE.mcap")
+        raise click.UsageError("--layout needs --save FILE.mcap")
     viewers.require_viewer(save)
     recorded = load_run(run)
     golden = _golden(recorded) if recorded.record.fault else None
     named = {"golden": golden, "faulty": recorded} if golden else {"flight": recorded}
     flights = [
-        ViewedFlight(name=name, run=each, recorder=_again(each)) for name, each in named.items()
+        ViewedFlight(name=name, run=flown, recorder=_again(flown)) for name, flown in named.items()
     ]
     with reading(recorded.folder.path):
         viewers.save(flights, save)
     if as_json:
-        told = [
-            {"name": each.name, "run": str(each.run.folder.path),
-             "outcome": each.run.record.outcome, "frames": each.recorder is not None}
-            for each in flights
+        summary = [
+            {"name": flight.name, "run": str(flight.run.folder.path),
+             "outcome": flight.run.record.outcome, "frames": flight.recorder is not None}
+            for flight in flights
         ]  # fmt: skip
-        echo(json.dumps({"file": str(save), "flights": told}, indent=2))
+        echo(json.dumps({"file": str(save), "flights": summary}, indent=2))
     elif save is not None:
         echo(str(save))
     if layout is not None:
@@ -76,7 +76,7 @@ def _golden(run: Run) -> Run | None:
     try:
         return paired_golden(run, note)
     except RecordError as error:
-        note(f"without the golden flight: {error}")
+        note(f"the golden flight is not shown: {error}")
         return None
 
 
@@ -89,9 +89,9 @@ def _again(run: Run) -> Recorder | None:
         note(f"flying again: {config.world}, seed {config.seed}")
         recorder, same = watch_again(run)
     except RecordError as error:
-        note(f"without depth frames, cloud and map: {error}; `mavfi fly --record` keeps them")
+        note(f"no depth frames, clouds and maps: {error}; `mavfi fly --record` keeps them")
         return None
     if not same:
-        note(f"warning: {run.folder.path}: the repetition differs: depth frames, cloud and map "
+        note(f"warning: {run.folder.path}: the repetition differs: depth frames, clouds and maps "
               "are those of the repetition")  # fmt: skip
     return recorder

@@ -94,7 +94,7 @@ def vpm(
 ) -> None:
     """Compare no protection, DMR, TMR, and detection and recovery.
 
-    The quantities are safe velocity, flight time and energy.
+    The report contains the safe velocity, flight time and energy of each.
 
     In the F-1 visual performance model a vehicle flies as fast as it can stop within its sensing
     range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
@@ -105,16 +105,18 @@ def vpm(
     from mavfi_cli.vpm.report import report
 
     if as_json and as_csv:
-        raise click.UsageError("--json and --csv exclude each other")
+        raise click.UsageError("--json cannot be combined with --csv")
     if not fly:
         refuse_given(_FLYING, "needs --fly")
         given = given_options()
         if "platform" not in given:
-            refuse_given(["chain"], "needs --platform: it is how its latencies add up")
+            refuse_given(["chain"], "needs --platform, whose latencies it combines")
         if "response" in given:
-            refuse_given(["chain"], "or --response, not both: either is the response time")
+            refuse_given(
+                ["chain"], "cannot be combined with --response, which sets the response time"
+            )
     if options["models"] is not None and options["train"]:
-        raise click.UsageError("--models and --train exclude each other")
+        raise click.UsageError("--models cannot be combined with --train")
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
     require_named("vehicle", [vehicle.name for vehicle in chosen])
     choices = _choices(options)
@@ -135,10 +137,10 @@ def vpm(
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
-    """Overhead in per cent and its source for each detector; the last option counts.
+    """Overhead in per cent and its source for each detector; the last option of one wins.
 
     Args:
-        platform: the modelled one; flights on others are ignored. None: all are used.
+        platform: name of the modelled platform; flights on others are ignored. None uses all.
 
     Raises:
         click.UsageError: the text is neither DETECTOR=PERCENT nor a path.

@@ -47,7 +47,7 @@ _TITLES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignReport:
-    """All that `mavfi campaign status` reports of a campaign.
+    """Everything that `mavfi campaign status` reports about a campaign.
 
     Attributes:
         stopped: settings that the stopping rule has ended early.
@@ -81,26 +81,26 @@ class CampaignReport:
             by: labels by which settings are grouped; empty means all.
             confidence: of all intervals.
             quality, overhead, failures: parts to add.
-            kernels, upsets: as `analysis.failures.failures` takes them.
+            kernels, upsets: arguments of `analysis.failures.setting_failures`.
 
         Raises:
             UnknownName: no setting has such a label.
-            MavfiError: as `flight_overheads` and `failures`.
+            MavfiError: an error of `flight_overheads` or `setting_failures`.
         """
-        spec, found = stored_spec(ledger), groups(ledger, by)
+        spec, settings = stored_spec(ledger), groups(ledger, by)
         return cls(
-            summary=summarise(ledger, found, confidence),
+            summary=summarise(ledger, settings, confidence),
             stopped=stopped(ledger),
             fixed_world=None if spec is None else spec.fixed_world,
-            quality=qualities(found, confidence) if quality else None,
-            overhead=flight_overheads(ledger, found, confidence) if overhead else None,
-            failures=setting_failures(ledger, found, kernels, upsets, confidence)
+            quality=qualities(settings, confidence) if quality else None,
+            overhead=flight_overheads(ledger, settings, confidence) if overhead else None,
+            failures=setting_failures(ledger, settings, kernels, upsets, confidence)
             if failures
             else None,
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the keys of `--json`: those of the summary, and of the parts that there are."""
+        """Return the content of `--json`: the summary and the requested parts."""
         parts = {name: part for name, part in asdict(self).items() if part is not None}
         return {**parts.pop("summary"), **parts}
 
@@ -120,7 +120,10 @@ def state_lines(ledger: Ledger) -> list[str]:
     """Name the fixed world and the settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
     world = [] if spec is None or spec.fixed_world is None else [spec.fixed_world.describe()]
-    return [*world, *(f"known well enough, so not flown on: {name}" for name in stopped(ledger))]
+    return [
+        *world,
+        *(f"stopped early, because known well enough: {name}" for name in stopped(ledger)),
+    ]
 
 
 # Settings and comparisons ---------------------------------------------------------------------
@@ -139,7 +142,7 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
         *settings.lines(["mean time", "mean distance", "mean energy", "mean replans"], means),
     ]
     if not summary.faults and any(setting.faulty for setting in summary.cells):
-        lines += ["", "nothing to compare: no golden flight of a mission with a fault is there"]
+        lines += ["", "nothing to compare: no mission with a fault has a golden flight"]
     for title, comparisons in (
         ("against the golden flights of the same missions:", summary.faults),
         ("against the same faults without protection:", summary.protection),
@@ -292,9 +295,9 @@ def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
 
 def failure_lines(failures: Sequence[SettingFailures]) -> list[str]:
     """Return a paragraph for each setting."""
-    lines = ["", "injected faults that fail missions which succeed without:"]
+    lines = ["", "injected faults that fail missions whose golden flights succeed:"]
     if not failures:
-        lines.append("  none: no setting has struck missions and golden flights of them")
+        lines.append("  none: no setting has injected faults and golden flights of their missions")
     for row in failures:
         lines += [f"  {row.name}", *(f"    {part}" for part in _failure_parts(row))]
     return lines
@@ -320,7 +323,7 @@ def _failure_parts(row: SettingFailures) -> list[str]:
 
 
 def flights_file(table: pa.Table, path: Path) -> bytes:
-    """The content of a .parquet or .csv file with an exported table; that of `-` is CSV.
+    """Return an exported table as the content of a .parquet or .csv file; as CSV for `-`.
 
     Raises:
         ConfigError: the file has another suffix.
@@ -333,17 +336,18 @@ def flights_file(table: pa.Table, path: Path) -> bytes:
     elif path.suffix == ".csv" or path == Path("-"):
         csv.write_csv(_flat(table), content)
     else:
-        problem = "the name must end in .parquet or .csv, or - for CSV on stdout"
+        problem = f"must end in .parquet or .csv, or be - for CSV on stdout, got {path.name!r}"
         raise ConfigError(problem, path=path)
     return content.getvalue()
 
 
 def _flat(table: pa.Table) -> pa.Table:
-    """A table without lists, which CSV does not have: they become JSON."""
+    """A table whose lists, which CSV lacks, are JSON text."""
     for place, field in enumerate(table.schema):
         if pa.types.is_list(field.type):
             texts = [
-                None if each is None else json.dumps(each) for each in table[place].to_pylist()
+                None if values is None else json.dumps(values)
+                for values in table[place].to_pylist()
             ]
             table = table.set_column(place, field.name, pa.array(texts, pa.string()))
     return table

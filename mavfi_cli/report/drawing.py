@@ -60,14 +60,14 @@ def detector_colours(names: Sequence[str]) -> dict[str, str]:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure that finds room for its labels by itself."""
+    """Return an empty figure whose layout makes room for its labels."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -> None:
-    """Leave out the frame's upper and right line; draw a grid of an axis, or of `both`."""
+    """Hide the upper and right lines of the frame; draw a grid along an axis or along `both`."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
         axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.6)  # type: ignore[arg-type]
@@ -77,13 +77,13 @@ def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -
 
 
 def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
-    """Draw the legend of a figure above it; of all its labels unless others are given."""
+    """Draw the legend above a figure, by default for all its labels."""
     shape = {"loc": "outside upper center", "ncols": 4, "frameon": False, "fontsize": 8}
     figure.legend(*what, **{**shape, **look})
 
 
 def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **look: Any) -> None:
-    """Draw an interval round a value, if it has one."""
+    """Draw the interval around a value, if it has one."""
     if math.isfinite(value) and not any(map(math.isnan, ends)):
         low, high = (abs(end - value) for end in ends)
         shape = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 3.0}
@@ -91,7 +91,7 @@ def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **loo
 
 
 def note_at(axes: Axes, text: str, place: tuple[float, float], up: float, **look: Any) -> None:
-    """Write a text so many points above a place."""
+    """Write a text at a place, raised by `up` points."""
     shape = {"ha": "center", "fontsize": 8.5, "color": INK}
     offset = {"xytext": (0, up), "textcoords": "offset points"}
     axes.annotate(text, place, **{**shape, **offset, **look})
@@ -101,7 +101,7 @@ def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure as SVG, PDF or PNG, atomically. Equal figures give equal bytes.
 
     Raises:
-        RecordError: Its name has none of the suffixes PICTURES, or it could not be written.
+        RecordError: The suffix is not one of PICTURES, or the file could not be written.
     """
     require_output(path, PICTURES)
     data = _drawn(figure, path.suffix.lower()[1:])
@@ -118,7 +118,7 @@ def _drawn(figure: Figure, form: str) -> bytes:
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
-        text.set_text(cleaned(text.get_text()))  # of a record of anybody's
+        text.set_text(cleaned(text.get_text()))  # it may come from a foreign record
     with mpl.rc_context(
         {"svg.hashsalt": "mavfi", "svg.fonttype": "none", "pdf.fonttype": 42}  # text stays text
     ):

@@ -32,7 +32,7 @@ class SettingColumns:
 
     @classmethod
     def of(cls, settings: Sequence[Labels]) -> SettingColumns:
-        """The columns of settings, from their labels. They differ without the common ones.
+        """Choose the columns that distinguish settings without their common labels.
 
         A single setting has no columns, because its name is enough.
         """
@@ -42,7 +42,7 @@ class SettingColumns:
         common: dict[str, Label] = {}
         for key in reversed(keys):
             values = {label_value(labels[key]): labels[key] for labels in settings if key in labels}
-            left = [each for each in keys if each not in common and each != key]
+            left = [other for other in keys if other not in common and other != key]
             apart = {tuple(_cells(labels, left)) for labels in settings}
             if len(values) == 1 and len(apart) == len(settings):
                 (common[key],) = values.values()
@@ -55,20 +55,20 @@ class SettingColumns:
 
     @property
     def notes(self) -> list[str]:
-        """The line of common labels above a table; no line if there are none."""
+        """The line above a table that lists the common labels; no line if there are none."""
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
 
     def lines(self, head: Sequence[str], rows: Iterable[SettingRow]) -> list[str]:
         """One line per setting, in several tables if the screen is too narrow.
 
         Args:
-            head: head of the cells.
+            head: headings of the cells.
         """
         table = [[*self.cells(row.labels, row.name), *row.cells] for row in rows]
         return Table([[*self.heads, *head], *table], labels=len(self.heads)).lines(WIDTH)
 
     def cells(self, labels: Labels, name: str) -> list[str]:
-        """The cells of a setting's labels; the first empty one has the rest of its name."""
+        """The cells of a setting's labels; the first empty one gets the rest of its name."""
         if not self.keys:
             return [name]
         cells = _cells(labels, self.keys)

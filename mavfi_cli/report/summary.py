@@ -90,15 +90,15 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
     flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
-    asked, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
+    wanted, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
     why = ", ".join(f"{reason} {n}x" for reason, n in flight.plan_failures.items())
     return [
         f"Flight      {_number(qof['flight_time_s'], 's')}, "
         f"{_number(qof['distance_m'], 'm')} flown, "
         f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
-        f"Plans       {asked} requested: {flown} flown{f' ({again} replans)' if again else ''}, "
-        f"{failed} failed{f' ({why})' if why else ''}, {asked - flown - failed} not used",
+        f"Plans       {wanted} requested: {flown} flown{f' ({again} replans)' if again else ''}, "
+        f"{failed} failed{f' ({why})' if why else ''}, {wanted - flown - failed} not used",
         f"Obstacles   {counters['collisions_foreseen']} collisions predicted, "
         f"{counters['slowdowns']} slowdowns, {counters['stops']} stops",
     ]
@@ -120,7 +120,8 @@ def _measured_lines(measured: Section) -> list[str]:
     if not measured:
         return []
     medians = ", ".join(
-        f"{name} {1e3 * each['host_median_s']:.2f} ms" for name, each in measured["kernels"].items()
+        f"{name} {1e3 * times['host_median_s']:.2f} ms"
+        for name, times in measured["kernels"].items()
     )
     return [f"Measured    {medians} (medians on this host), x {measured['factor']:g} in the flight"]
 
@@ -171,7 +172,7 @@ def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str
 
 
 def folder_lines(run: Run, picture: Path | None) -> list[str]:
-    """Return the run folder, and what to look at in it."""
+    """Return the run folder, and the traceback and the picture if there are any."""
     inside = "" if picture != run.folder.picture else f"  (see {run.folder.picture.name})"
     return [
         "",
@@ -182,9 +183,9 @@ def folder_lines(run: Run, picture: Path | None) -> list[str]:
 
 
 def run_html(run: Run) -> str:
-    """Return summary and picture as HTML, without markup from the record, which may be foreign.
+    """Return summary and picture as HTML, with escaped text, because the record may be foreign.
 
-    The picture is drawn from the record, as an image of its own: a browser runs no script in it.
+    The picture is drawn from the record as a separate image, in which a browser runs no script.
     """
     from mavfi_cli.report.drawing import svg
     from mavfi_cli.report.top_view import draw_top_view
@@ -238,10 +239,10 @@ def _activation(fault: Section) -> str:
     if reader is not None:
         return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
     return {
-        "withheld": "withheld by the detector's gate before anybody read it",
-        "overwritten": "overwritten before anybody read it",
-        "not_read": "never read: the mission ended before",
-        "unchanged": "changed nothing: the value was that already",
+        "withheld": "withheld by the detector's gate before any node read it",
+        "overwritten": "overwritten before any node read it",
+        "not_read": "never read before the mission ended",
+        "unchanged": "changed nothing: the state already had that value",
     }[fault["activation"]["activation"]]
 
 
@@ -277,7 +278,7 @@ def _place(fault: Section) -> str:
 
 def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
     place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
-    bits = ", ".join(map(str, change["bits"])) or "none: the value was that already"
+    bits = ", ".join(map(str, change["bits"])) or "none: the state already had that value"
     plural = "s" if len(change["bits"]) > 1 else ""
     return (
         f"            at {stamp_s:.2f} s: {change['state']}{place} "
@@ -310,7 +311,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
         f"{' instead of '.join(told_apart(*sides))}",
         f"            at most {run.largest_deviation_m(golden):.2f} m from the golden vehicle",
     ]
-    our_s, their_s = (each.quality_of_flight["flight_time_s"] for each in (ours, theirs))
+    our_s, their_s = (record.quality_of_flight["flight_time_s"] for record in (ours, theirs))
     if our_s and their_s:
         change = 100.0 * (our_s / their_s - 1.0)
         lines.append(

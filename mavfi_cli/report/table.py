@@ -1,4 +1,4 @@
-"""One table as text, Markdown, LaTeX, CSV or HTML, and the formats of the numbers in its cells."""
+"""A table as text, Markdown, LaTeX, CSV or HTML, and formats for the numbers in its cells."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Table:
         prose: whether the last column is wrapped at the width.
         name: label of a LaTeX table.
         title: caption.
-        notes: a line each.
+        notes: lines below the table.
     """
 
     rows: Sequence[Sequence[str]]
@@ -151,9 +151,9 @@ class Table:
         return [self.labels is None or place < self.labels for place in range(columns)]
 
     def _wrapped(self, width: int) -> list[list[str]]:
-        """The rows with further ones for the prose that does not fit beside the other columns."""
+        """The rows, with further ones for prose that does not fit beside the other columns."""
         cells = self._padded()
-        room = width - sum(each + _GAP for each in _widths(cells)[:-1])
+        room = width - sum(column + _GAP for column in _widths(cells)[:-1])
         rows = []
         for *row, prose in cells:
             first, *rest = textwrap.wrap(prose, max(room, _LEAST_ROOM)) or [""]
@@ -162,7 +162,7 @@ class Table:
 
     def _pages(self, widths: Sequence[int], kept: int, width: int) -> Iterator[tuple[int, int]]:
         """Yield the first column of each page and the column after its last."""
-        own = sum(each + _GAP for each in widths[:kept])
+        own = sum(column + _GAP for column in widths[:kept])
         first, end, used = kept, kept, own
         for columns in self.parts or [1] * (len(widths) - kept):
             needed = sum(widths[end : end + columns]) + _GAP * (columns - 1)
@@ -219,7 +219,7 @@ _PLACES = (("table", 252.0), ("table*", 516.0))
 
 
 def _latex_place(widths: Sequence[int]) -> tuple[str, str, float]:
-    """The narrowest float and the largest size that hold the table, and the gap; else the last."""
+    """The narrowest float and largest size that hold the table, and the gap; else the last."""
     for place, width_pt in _PLACES:
         for size, character_pt, gap_pt in _SIZES:
             if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
@@ -280,7 +280,7 @@ def spread(
 
 
 def _parts(estimate: Share | Interval | Row, name: str) -> tuple[Any, Any, Any]:
-    """Value, low and high of an estimate, also of one that was read from JSON."""
+    """Value, low and high of an estimate, which may come from JSON."""
     part = estimate.get if isinstance(estimate, Mapping) else partial(getattr, estimate)
     return part(name), part("low"), part("high")
 

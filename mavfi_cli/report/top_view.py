@@ -1,4 +1,4 @@
-"""Pictures of flights: one from above with its height, or all of one mission (paper, Fig. 13)."""
+"""Pictures of flights: one flight with its height, or all flights of a mission (Fig. 13)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _COLUMNS = 3
 _TITLE = 66  # characters in a line of a title
 _MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # offset from the position, points
 _BESIDE = 11.0  # points between marks at the same position
-_PLANS = 6  # the newest plans, which one can tell apart
+_PLANS = 6  # plans that one can still distinguish; the newest are drawn
 _FROM_ABOVE, _OVER_TIME = [1, 2], [0, 3]  # what of stamp, x, y, z an axes shows
 
 
@@ -64,14 +64,14 @@ def draw_top_view(run: Run) -> Figure:
     flight, (path, speeds_mps) = run.record, _path_of(run)
     _draw_obstacles(axes, flight.world, path[:, 1:])
     _draw_plans(axes, flight.plans)
-    for each, columns in ((axes, _FROM_ABOVE), (beside, _OVER_TIME)):
-        lines = _draw_path(each, path, speeds_mps, columns, flight.config["v_max_mps"])
-        if lines is not None and each is axes:
+    for view, columns in ((axes, _FROM_ABOVE), (beside, _OVER_TIME)):
+        lines = _draw_path(view, path, speeds_mps, columns, flight.config["v_max_mps"])
+        if lines is not None and view is axes:
             _explain_speed(figure, axes, lines)
-        _draw_start(each, path, columns)
-        _draw_end(each, flight, path, columns)
+        _draw_start(view, path, columns)
+        _draw_end(view, flight, path, columns)
         for kind in _MARKS:
-            _draw_marks(each, flight.events, kind, columns)
+            _draw_marks(view, flight.events, kind, columns)
     _draw_goal(axes, flight)
     _frame(axes, flight.world, path[:, 1:])
     _frame_heights(beside, flight, path)
@@ -114,14 +114,14 @@ def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray)
 
 
 def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
-    shown = [plan for plan in plans if len(plan["points_enu_m"])]
-    told = "planned" if len(shown) <= _PLANS else f"planned (newest {_PLANS} of {len(shown)})"
-    newest = shown[-_PLANS:]
+    drawn = [plan for plan in plans if len(plan["points_enu_m"])]
+    label = "planned" if len(drawn) <= _PLANS else f"planned (newest {_PLANS} of {len(drawn)})"
+    newest = drawn[-_PLANS:]
     for number, plan in enumerate(newest, 1):
         points = np.array(plan["points_enu_m"], dtype=float)
         axes.plot(
             points[:, 0], points[:, 1], color=PLAN, linewidth=0.9, linestyle=(0, (4, 3)), zorder=2,
-            alpha=0.25 + 0.75 * number / len(newest), label=told if plan is newest[-1] else None,
+            alpha=0.25 + 0.75 * number / len(newest), label=label if plan is newest[-1] else None,
         )  # fmt: skip
 
 
@@ -132,12 +132,17 @@ def _draw_path(
     from matplotlib.collections import LineCollection
 
     step = max(1, len(path) // 400)
-    points, shown = path[::step, columns], speeds_mps[::step]
+    points, colours = path[::step, columns], speeds_mps[::step]
     if len(points) < 2:
         return None
     segments = np.stack([points[:-1], points[1:]], axis=1)
     lines = LineCollection(
-        list(segments), array=shown[1:], cmap="viridis", linewidths=2.2, zorder=4, capstyle="round"
+        list(segments),
+        array=colours[1:],
+        cmap="viridis",
+        linewidths=2.2,
+        zorder=4,
+        capstyle="round",
     )
     lines.set_clim(0.0, v_max_mps)
     axes.add_collection(lines)
@@ -183,12 +188,12 @@ def _draw_start(axes: Axes, path: np.ndarray, columns: list[int] = _FROM_ABOVE) 
 def _mark(
     axes: Axes, places: np.ndarray, columns: list[int], label: str, marker: str, **look: Any
 ) -> np.ndarray:
-    """Mark places (n, 4), and return what the axes shows of them, (n, 2)."""
-    shown: np.ndarray = places[:, columns]
+    """Mark places (n, 4), and return their coordinates on the axes, (n, 2)."""
+    projected: np.ndarray = places[:, columns]
     if len(places):
         style = {"edgecolors": "white", "linewidths": 0.8, "marker": marker, **look}
-        axes.scatter(*shown.T, label=label if columns is _FROM_ABOVE else None, **style)
-    return shown
+        axes.scatter(*projected.T, label=label if columns is _FROM_ABOVE else None, **style)
+    return projected
 
 
 def _draw_marks(
@@ -199,12 +204,12 @@ def _draw_marks(
     **style: Any,
 ) -> np.ndarray:
     """Mark events of a kind and return their places (n, 2). `style` overrides the mark."""
-    found = [
+    stamped = [
         (e["stamp_s"], *e["position_enu_m"])
         for e in events
         if e["kind"] == kind and e["position_enu_m"]
     ]
-    places = np.array(found, dtype=float).reshape(-1, 4)
+    places = np.array(stamped, dtype=float).reshape(-1, 4)
     label, marker, look = _MARKS[kind]
     return _mark(axes, places, columns, label, marker, **{**_EVENT, **look, **style})
 
@@ -266,15 +271,15 @@ def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
 
 def _treatment(flight: FlightRecord) -> list[str]:
     """Return the fault and the detector of a flight; nothing if it has neither."""
-    told = []
+    parts = []
     if fault := flight.fault:
         what = _struck(fault)
         missed = " (not injected)" if fault["state"] == "not_injected" else ""
-        told.append(f"fault: {what}{missed}")
+        parts.append(f"fault: {what}{missed}")
     if detection := flight.detection:
         count = detection["alarm_count"]
-        told.append(f"detector: {detection['detector']}, {count or 'no'} alarm{'s'[count == 1 :]}")
-    return textwrap.wrap("; ".join(told), _TITLE)
+        parts.append(f"detector: {detection['detector']}, {count or 'no'} alarm{'s'[count == 1 :]}")
+    return textwrap.wrap("; ".join(parts), _TITLE)
 
 
 def _struck(fault: Mapping[str, Any]) -> str:
@@ -319,7 +324,7 @@ class Trajectories:
         """Draw a top view per panel, in metres, east to the right and north up.
 
         Args:
-            across: At most so many panels side by side.
+            across: Maximum number of panels side by side.
         """
         columns = min(across, len(self.panels))
         rows = -(-len(self.panels) // columns)
@@ -332,8 +337,8 @@ class Trajectories:
             axes = grid.flat[number]
             _draw_panel(figure, axes, flights, number, colours)
             if title:
-                told = textwrap.fill(f"fault: {title}", _TITLE)
-                axes.set_title(told, fontsize=9.5, loc="left")
+                caption = textwrap.fill(f"fault: {title}", _TITLE)
+                axes.set_title(caption, fontsize=9.5, loc="left")
         for axes in grid.flat[len(self.panels) :]:
             axes.set_axis_off()
         _explain_marks(figure)
@@ -426,9 +431,9 @@ def _explain_marks(figure: Figure) -> None:
         handles=list(marks.values()), labels=list(marks), loc="outside lower center", ncols=8,
         frameon=False, fontsize=8, handletextpad=0.3, columnspacing=0.9,
     )  # fmt: skip
-    for shown, label in zip(legend.legend_handles, marks, strict=True):
-        if label in _MARKED and shown is not None:  # the legend entry covers all colours
-            shown.set(facecolor="white", edgecolor=INK)
+    for entry, label in zip(legend.legend_handles, marks, strict=True):
+        if label in _MARKED and entry is not None:  # the legend entry covers all colours
+            entry.set(facecolor="white", edgecolor=INK)
 
 
 def _golden_s(flights: _Flights) -> float | None:

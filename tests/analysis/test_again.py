@@ -84,7 +84,7 @@ def test_what_differs_is_named_and_ends_with_1(export, mavfi, tmp_path):
 
 def test_no_such_mission(folder, export, tmp_path):
     for place in (folder, export):
-        with pytest.raises(ConfigError, match="no mission 7"):
+        with pytest.raises(ConfigError, match="no flown mission 7; the list has missions 0 to 1"):
             mission(place, 7)
     with pytest.raises(RecordError):
         mission(tmp_path, 0)

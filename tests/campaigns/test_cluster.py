@@ -287,7 +287,7 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port,
     run = mavfi("campaign", "run", spec, "--cluster", address, "--quiet", cwd=tmp_path)
     assert (run.returncode, run.stdout) == (1, "")
     warning, line = run.stderr.splitlines()
-    assert warning.startswith(f"warning: {address} has no TLS: any user who can connect to it")
+    assert warning.startswith(f"warning: {address} has no TLS: anyone who can connect to it")
     assert line.startswith(f"error: no scheduler at {address}: ")
 
 

@@ -323,9 +323,9 @@ def test_set_names_the_nearest_factor(refused):
 def test_plan_answers_how_many_missions_a_question_takes(mavfi):
     done = mavfi("campaign", "plan", "--margin", "0.05", "--difference", "0.1")
     assert done.stdout.splitlines() == [
-        "381 missions a setting: Wilson interval of +-0.05 at a rate of 0.5, 95 % confidence",
-        "155 pairs: a difference of 0.1 found with 80 % power, 95 % confidence, where 20 % of the "
-        "pairs end differently (--discordant 0.2)",
+        "381 missions per setting: Wilson interval of +-0.05 at a rate of 0.5, 95 % confidence",
+        "155 pairs: a difference of 0.1 detected with 80 % power, 95 % confidence, where 20 % of "
+        "the pairs end differently (--discordant 0.2)",
     ]
 
 

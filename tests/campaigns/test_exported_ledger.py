@@ -56,8 +56,12 @@ def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        (("replay", EXPORT), 2, "is a campaign: add --mission NUMBER (0 to 639)"),
-        (("replay", EXPORT, "--mission", "640"), 1, "has no mission 640 that has flown (0 to 639)"),
+        (("replay", EXPORT), 2, "is a campaign: add --mission NUMBER (missions 0 to 639)"),
+        (
+            ("replay", EXPORT, "--mission", "640"),
+            1,
+            "has no flown mission 640; the list has missions 0 to 639",
+        ),
         (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "of which all run folders were"),
         (("campaign", "draw", EXPORT, "--pair", "3", "--output", "a.svg"), 1, "no run folder of"),
         (("campaign", "status", EXPORT, "--overhead"), 1, "name the campaign's folder"),
@@ -123,7 +127,7 @@ def test_an_export_without_pairs_is_reported_with_a_note(mavfi, tmp_path, change
     pq.write_table(table, path)
     run = mavfi("campaign", "status", path, "--full")
     assert run.returncode == 0, run.stderr
-    assert "nothing to compare: no golden flight of a mission with a fault is there" in run.stdout
+    assert "nothing to compare: no mission with a fault has a golden flight" in run.stdout
     assert json.loads(mavfi("campaign", "status", path, "--json").stdout)["faults"] == []
     assert "nothing to compare" not in mavfi("campaign", "status", EXPORT, "--full").stdout
 

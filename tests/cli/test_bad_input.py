@@ -98,7 +98,7 @@ def test_a_number_out_of_its_range_names_the_option(refused, arguments, said):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--goal", "1,2"), "Invalid value for '--goal': '1,2' is not three numbers"),
+        (("--goal", "1,2"), "Invalid value for '--goal': must be three numbers"),
         (("--wrold", "x"), "no such option '--wrold'; did you mean '--world'?"),
         (("--xyz",), "no such option '--xyz'\n"),
     ],

@@ -72,7 +72,7 @@ def test_a_flight_that_does_not_repeat_is_shown_without_what_its_nodes_received(
     (run / "result.json").write_text(json.dumps(result))
     done = mavfi("view", run, "--save", tmp_path / "foreign.mcap")
     assert done.returncode == 0
-    assert done.stderr.startswith("without depth frames, cloud and map: ")
+    assert done.stderr.startswith("no depth frames, clouds and maps: ")
     assert "does not repeat; `mavfi fly --record` keeps them" in done.stderr
     told = topics(tmp_path / "foreign.mcap")
     assert "/flight/states" in told

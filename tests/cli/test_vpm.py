@@ -171,7 +171,7 @@ def test_usage(command_line, arguments):
     ("arguments", "said"),
     [
         ((), "--chain needs --platform"),
-        (("--platform", "tx2", "--response", "0.2"), "--chain or --response, not both"),
+        (("--platform", "tx2", "--response", "0.2"), "--chain cannot be combined with --response"),
     ],
 )
 def test_a_chain_of_no_latencies_is_refused(command_line, arguments, said):

@@ -145,7 +145,7 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
         (["--platform", "mine.toml"], "error: mine.toml: no such file (in setting=golden "),
         (["--detector", "gda"], "error: --detector: unknown detector 'gda'; did you mean 'gad'? "),
         (["--detector", ","], "error: --detector: name at least one\n"),
-        (["--inject", ""], "error: --inject: name at least one, or none\n"),
+        (["--inject", ""], "error: --inject: must name at least one target, or be none, got ''\n"),
         (["--inject", "plannin"],
          "error: --inject: unknown stage, state or group 'plannin'; did you mean 'planning'? "),
         (["--world", "sparze"], "error: --world: unknown world 'sparze'; did you mean 'sparse'? "),
@@ -165,4 +165,4 @@ def test_bad_input_is_one_line_and_leaves_nothing(mavfi, tmp_path, arguments, to
 def test_two_formats_at_once_are_a_usage_error(mavfi, tmp_path):
     run = mavfi("compare", "--json", "--csv", cwd=tmp_path)
     assert run.returncode == 2
-    assert "--json and --csv exclude each other" in run.stderr
+    assert "--json cannot be combined with --csv" in run.stderr

@@ -132,4 +132,4 @@ def test_a_folder_without_flights_of_the_stack_is_told(mavfi, flown):
 
 def test_what_would_be_flown_means_nothing_with_flown(mavfi, flown):
     done = mavfi("train", "--flown", flown, "--flights", "30")
-    assert (done.returncode, done.stderr) == (2, "error: --flights means nothing with --flown\n")
+    assert (done.returncode, done.stderr) == (2, "error: --flights has no effect with --flown\n")
