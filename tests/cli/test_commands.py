@@ -117,7 +117,7 @@ def test_show_events_and_json(command_line, troubled_flight):
 def test_show_json_is_the_record_alone(command_line, short_flight):
     code, out, err = command_line("show", short_flight.path, "--json", "--pair")
     assert (code, out) == (2, "")
-    assert "leave out --pair and --events" in err
+    assert "cannot be combined with --pair or --events" in err
 
 
 @pytest.mark.parametrize("options", [(), ("--without-fault",)])

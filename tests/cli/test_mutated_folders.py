@@ -47,7 +47,7 @@ CAMPAIGN = [
     "report DIR -o page.html",
     "replay DIR --mission 1",
 ]
-NOTES = ("note: ", "warning: ", "flying ", "without ")  # lines that are no errors
+NOTES = ("note: ", "warning: ", "flying ", "no depth ")  # lines that are no errors
 ESCAPE = "\x1b]0;theirs\x07\r\x85\u2028"
 VALUES = (
     None, True, -1, 0, 3, 2**70, 1e308, -1e308, 1e-320, float("nan"), float("inf"), "", "theirs",
