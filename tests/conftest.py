@@ -16,6 +16,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from missions import POSTS, SHORT
 
 from mavfi_cli import cli
@@ -29,6 +30,8 @@ from sitl.camera.component import COMPONENT_ID, Camera
 
 for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
     sys.path.insert(0, str(Path(__file__).parent / _folder))
+settings.register_profile("no clock", deadline=None)  # no test asserts speed by the clock
+settings.load_profile("no clock")
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
 
 

@@ -71,8 +71,9 @@ class Balance:
 
     Attributes:
         pairs: faults that were flown without and with the detector.
-        before: ills without it, such as lost missions.
-        undone, caused: ills that only the flight without it has, and that only that with it has.
+        before: harmed missions without the detector.
+        undone: missions that are harmed only without it.
+        caused: missions that are harmed only with it.
         p_value: of McNemar's exact test.
     """
 
@@ -85,14 +86,14 @@ class Balance:
 
 @dataclass(frozen=True, slots=True)
 class Flights:
-    """Missions that flew, a row each, in the columns that items and claims read.
+    """Flown missions, one per row, with the columns that items and claims read.
 
-    Beside those of an export, which are empty if it lacks them:
-        fault: the fault that was asked for, as text; equal faults have equal texts.
+    The columns of an export; a column that the export lacks is empty. Further columns:
+        fault: the configured fault as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
         at: when a source-level fault strikes; empty without one.
-        as_paper: whether all but stack, detector's model and that moment is as in the paper:
-            vehicle, speed, sensors, one flip of drawn bits, and 13 watched states.
+        as_paper: whether vehicle, speed, sensors, the single flip of drawn bits and the 13 watched
+            states are those of the paper. Stack, detector model and `at` may differ.
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
         ended: whether the fault ended a node, by a crash or a hang.
@@ -199,7 +200,7 @@ class Flights:
         """What a detector undoes and what it causes on the same faults.
 
         Args:
-            column: of truth values that stand for an ill, such as `harmed` or `lost`.
+            column: `harmed` or `lost`: what counts as harm.
         """
         seen = self.protected(detector, protect, **values)
         pairs = zip(seen[f"bare_{column}"], seen[column], strict=True)
@@ -254,7 +255,7 @@ class Flights:
 
     @property
     def increases(self) -> FloatArray:
-        """Flight times beyond those of the own golden flights, in per cent, where both succeed."""
+        """Increase of the flight time over the golden flight's, in per cent, where both succeed."""
         return PERCENT * (self.ratios - 1.0)
 
     @property

@@ -1,6 +1,6 @@
 """A user's program as a target: starts, profiles and judges its runs.
 
-A program that is not short is profiled by exact execution counts.
+Long programs are profiled by exact execution counts.
 """
 
 from __future__ import annotations

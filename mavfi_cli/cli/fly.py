@@ -293,7 +293,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
     link = given.get("link", base.link)
     land = given.pop("land", base.land or (link is not None and base.link is None))
     if link is not None and not given.get("eyes", base.eyes):
-        refuse_given(OF_THE_WORLD, "has no meaning with --link unless --eyes is given")
+        refuse_given(OF_THE_WORLD, "has no effect with --link unless --eyes is given")
     if given.get("autopilot", base.autopilot) == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     own = {field.name for field in fields(base)} - {"fault", "instruction", "detector"}

@@ -172,9 +172,9 @@ class Model:
         """Return the reason why a detector cannot use the model; empty if it can."""
         names = [state.name for state in EXTENDED]
         if self.mavfi != version("mavfi"):
-            return f"made for mavfi {self.mavfi!r}, this is {version('mavfi')!r}"
+            return f"must be made for mavfi {version('mavfi')!r}, got {self.mavfi!r}"
         if self.detector != detector:
-            return f"made for detector {self.detector!r}, this is {detector!r}"
+            return f"must be made for detector {detector!r}, got {self.detector!r}"
         if self.states != STATES_DIGEST:
             return "made for another table of states; train it again"
         if self.preprocess_digest != self.preprocess.digest():

@@ -72,7 +72,7 @@ class BitType:
         for bit in bits:
             if not 0 <= bit < self.width:
                 raise FaultSpecError(
-                    f"bit of {self.name} must be within 0 and {self.width - 1}, got {bit}"
+                    f"bit of {self.name} must be between 0 and {self.width - 1}, got {bit}"
                 )
             mask |= 1 << bit
         return mask

@@ -141,7 +141,7 @@ class NoInjector:
         return trajectory
 
     def strike(self, moment: Moment) -> None:
-        """Strike a memory or a process if the fault is due, once per control tick."""
+        """Inject a fault into memory or a process if it is due. Called once per control tick."""
 
 
 class Injector(NoInjector):

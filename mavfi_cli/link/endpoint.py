@@ -189,5 +189,5 @@ class SenderSlot(Generic[Sender]):
         return True
 
     def challenge(self, sender: Sender) -> None:
-        """Note that a sender claims a place that is taken."""
+        """Record that a second sender uses the address of a known one."""
         self._challenger = sender

@@ -151,7 +151,7 @@ class FlightsPlan:
 
     @classmethod
     def stored(cls, ledger: Ledger) -> FlightsPlan | None:
-        """The plan with which a reproduction was begun, of all items; None of another campaign."""
+        """The plan of a reproduction, with all items; None if the ledger is of another campaign."""
         text = ledger.meta(_META)
         if text is None:
             return None

@@ -92,7 +92,7 @@ class KernelSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """All that was found.
+    """The campaigns and the summaries of kernels that were read.
 
     Attributes:
         problems: what could not be read, is incomplete, or does not fit, a sentence each.

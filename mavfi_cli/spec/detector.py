@@ -56,7 +56,9 @@ class DetectorConfig:
         ):
             raise ConfigError(f"must be above 0, got {self.threshold:g}", key="threshold")
         if not 1 <= self.alarms_max <= 1000:
-            raise ConfigError(f"must be within 1 and 1000, got {self.alarms_max}", key="alarms_max")
+            raise ConfigError(
+                f"must be between 1 and 1000, got {self.alarms_max}", key="alarms_max"
+            )
         if self.watch not in WATCHES:
             raise UnknownName("watch", self.watch, WATCHES)
 

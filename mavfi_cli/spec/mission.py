@@ -142,7 +142,7 @@ class MissionConfig:
         for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise ConfigError(f"must be within {low:g} and {high:g}, got {value:g}", key=name)
+                raise ConfigError(f"must be between {low:g} and {high:g}, got {value:g}", key=name)
         for name in ("start", "goal", "origin"):
             place = getattr(self, name) or ()
             if not all(map(math.isfinite, place)):
@@ -165,7 +165,7 @@ class MissionConfig:
         for name, (low, end, span) in _WHOLE.items():
             number = getattr(self, name)
             if number is not None and not low <= number < end:
-                raise ConfigError(f"must be within {span}, got {number}", key=name)
+                raise ConfigError(f"must be between {span}, got {number}", key=name)
 
     def _check_link(self) -> None:
         if self.link is None:
@@ -185,7 +185,7 @@ class MissionConfig:
         plain = MissionConfig(goal=self.goal)
         for name in OF_THE_WORLD:
             if getattr(self, name) != getattr(plain, name):
-                raise ConfigError("has no meaning with --link unless --eyes is given", key=name)
+                raise ConfigError("has no effect with --link unless --eyes is given", key=name)
 
     def _check_platform(self) -> None:
         if PlatformProfile.factor_of(self.platform) is None:

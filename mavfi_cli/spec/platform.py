@@ -82,7 +82,7 @@ class PlatformProfile:
             factor = math.nan
         if not low <= factor <= high:
             raise ConfigError(
-                f"the factor of {MEASURED}:FACTOR must be a number within {low:g} and {high:g}, "
+                f"the factor of {MEASURED}:FACTOR must be a number between {low:g} and {high:g}, "
                 f"got {text!r}",
                 key="platform",
             )
@@ -139,7 +139,7 @@ def _check_latency(latency_s: float, spread: float) -> None:
     if latency_s > _LONGEST_S:
         raise ValueError(f"latency_s must be at most {_LONGEST_S:g}, got {latency_s:g}")
     if not 0.0 <= spread <= 2.0:
-        raise ValueError(f"spread must be within 0 and 2, got {spread:g}")
+        raise ValueError(f"spread must be between 0 and 2, got {spread:g}")
 
 
 def _check_scale(scale: float | None) -> None:

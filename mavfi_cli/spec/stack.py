@@ -115,7 +115,7 @@ class Stack:
         for key, (low, high) in _LIMITS.items():
             value = getattr(self, key)
             if not (math.isfinite(value) and low <= value <= high):
-                raise ValueError(f"{key}: must be within {low:g} and {high:g}, got {value:g}")
+                raise ValueError(f"{key}: must be between {low:g} and {high:g}, got {value:g}")
         self._check_processes()
         if self.planner_radius_m < self.check_radius_m:
             raise ValueError(

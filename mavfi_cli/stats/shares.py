@@ -28,7 +28,7 @@ class Interval:
     count: int
 
     def minus(self, other: Interval) -> Interval:
-        """The difference of two independent effects: their distances added in squares (MOVER)."""
+        """The difference of two independent effects: distances added in quadrature (MOVER)."""
         value = self.value - other.value
         below = math.hypot(self.value - self.low, other.high - other.value)
         above = math.hypot(self.high - self.value, other.value - other.low)
@@ -63,7 +63,7 @@ class Share:
         """The difference of two independent rates, with the hybrid score interval.
 
         R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the
-        two Wilson intervals, added in squares. NaN if one has no observations.
+        two Wilson intervals, added in quadrature. NaN if one has no observations.
         """
         if not (self.total and other.total):
             return NO_INTERVAL
@@ -138,7 +138,7 @@ def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
     """`share`, `low` and `high` of a whole from its parts, each weighted by its true size.
 
-    The interval adds the distances to the ends of the parts' Wilson intervals in squares (MOVER,
+    The interval adds the distances to the ends of the parts' Wilson intervals in quadrature (MOVER,
     G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The result is NaN if a
     part that is not empty was never sampled.
     """
@@ -171,7 +171,7 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
             f"must be at least {_LEAST:g} and below 0.5, got {margin:g}", key="margin"
         )
     if not 0.0 <= expected <= 1.0:
-        raise ConfigError(f"must be within 0 and 1, got {expected:g}", key="expected")
+        raise ConfigError(f"must be between 0 and 1, got {expected:g}", key="expected")
     z2 = z_of(confidence) ** 2
     a, b, c = 0.25 - margin**2, expected * (1.0 - expected) - 2.0 * margin**2, -(margin**2)
     u = (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)

@@ -227,7 +227,7 @@ class RedundancyPlan:
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
     def missions_of(self, plans: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """The list mission by mission, so that pairs are complete if it is cut off."""
+        """Planned missions ordered by seed, so that an interrupted campaign has complete pairs."""
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
             PlannedMission(

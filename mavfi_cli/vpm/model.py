@@ -76,7 +76,7 @@ class ModelVehicle:
                 limit = f"at least {SMALLEST:g}" if least else f"at most {LARGEST:g}"
                 raise ValueError(f"{key}: must be {limit}, got {value:g}")
         if not 0.0 <= self.tilt_deg < 90.0:
-            raise ValueError(f"tilt_deg: must be within 0 and 90, got {self.tilt_deg:g}")
+            raise ValueError(f"tilt_deg: must be between 0 and 90, got {self.tilt_deg:g}")
         free = self.calibration.parameter if self.calibration else ""
         if free and getattr(self, free) is not None:
             raise ValueError(f"{free}: has a value, so it cannot be calibrated")
@@ -191,7 +191,7 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme
             raise UnknownName("detector", name, DETECTORS)
         if not 0.0 <= percent <= LARGEST:
             raise ConfigError(
-                f"{name} must be within 0 and {LARGEST:g} %, got {percent:g} %", key="overhead"
+                f"{name} must be between 0 and {LARGEST:g} %, got {percent:g} %", key="overhead"
             )
         schemes[name] = replace(schemes[name], overhead=percent / 100.0, source=source)
     return schemes

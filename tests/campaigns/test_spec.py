@@ -216,7 +216,7 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
     ("text", "problem"),
     [
         ("seed = ['a']", r"seed"),
-        ("seed = [-1]", r"seed: must be within 0 and 2\^31"),
+        ("seed = [-1]", r"seed: must be between 0 and 2\^31"),
         ("bits = [1]", r"bits: requires a stage or a site"),
         ("level = 'source'", r"level: requires a stage or a site"),
         ("stage = 'control'\nsite = 'command_yaw'", r"a stage or a site for the fault, not both"),
@@ -234,7 +234,7 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
             "stage = 'control'\nat = 'tick=600'\ntime_limit_s = [30.0, 11.0]",
             r"at tick=600: must be within the mission's time limit of 11 s, got 12 s \(in ",
         ),
-        ("v_max_mps = [99.0]", r"v_max_mps: must be within"),
+        ("v_max_mps = [99.0]", r"v_max_mps: must be between"),
         ("threshold = 2.0", r"threshold: requires a detector"),
         ("detector = 'gad'\nprotect = ['contrl']", r"did you mean 'control'"),
     ],

@@ -111,9 +111,9 @@ def test_a_file_holds_a_whole_mission_and_options_replace_what_it_says(command_l
     ("text", "options", "code", "said"),
     [
         ("wrold = 3\n", (), 1, "mission.toml:1: wrold: unknown key; did you mean 'world'?"),
-        ("v_max_mps = 0\n", (), 1, "v_max_mps: must be within 0.1 and 12, got 0"),
+        ("v_max_mps = 0\n", (), 1, "v_max_mps: must be between 0.1 and 12, got 0"),
         ("[fault]\nbits = 2\n", (), 1, "mission.toml"),
-        ("", ("--v-max=0",), 2, "error: --v-max: must be within 0.1 and 12, got 0"),
+        ("", ("--v-max=0",), 2, "error: --v-max: must be between 0.1 and 12, got 0"),
         ("", ("--inject=planning", "--at=8"), 2, "as in time=8 (s)"),
     ],
 )

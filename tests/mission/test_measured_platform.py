@@ -24,7 +24,7 @@ def test_the_profile():
 
 @pytest.mark.parametrize("text", ["", "x", "nan", "inf", "0", "-1", "0.001", "1001", "1:2"])
 def test_a_factor_that_is_none(text):
-    with pytest.raises(ConfigError, match=r"within 0\.01 and 1000, got") as error:
+    with pytest.raises(ConfigError, match=r"between 0\.01 and 1000, got") as error:
         load_platform(f"measured:{text}")
     assert "\n" not in str(error.value)
 
@@ -37,7 +37,7 @@ def test_a_slip_of_the_name():
 def test_it_is_refused_where_it_would_have_to_repeat():
     with pytest.raises(ConfigError, match="measured:2 needs --realtime"):
         MissionConfig(platform="measured:2")
-    with pytest.raises(ConfigError, match="leave out isolate"):
+    with pytest.raises(ConfigError, match="cannot be combined with isolate"):
         MissionConfig(platform="measured:2", realtime=True, isolate=("planner",))
     assert MissionConfig(platform="measured:2", realtime=True).platform == "measured:2"
 

@@ -48,7 +48,7 @@ def test_a_file_of_one_s_own(platform_of):
         ("latency_s = 0.02", "latency_s = -0.02", r"mine\.toml:6: kernels\.octomap: .*at least 0"),
         ("latency_s = 0.02", "latency_s = nan", "finite"),
         ("latency_s = 0.02", 'latency_s = "fast"', r"mine\.toml:7: kernels\.octomap\.latency_s"),
-        ("spread = 0.5", "spread = 2.5", "spread must be within 0 and 2"),
+        ("spread = 0.5", "spread = 2.5", "spread must be between 0 and 2"),
         ("cores = 2", "cores = 2\npower_w = -1.0", r"mine\.toml.*power_w: must be at least 0"),
         ("cores = 2", "cores = 2\nmass_kg = -1.0", r"mine\.toml.*mass_kg: must be at least 0"),
         ("cores = 2", "cores = 2\npower_w = 1e9", r"mine\.toml.*power_w: must be at most"),

@@ -191,7 +191,7 @@ def test_an_overhead_of_one_s_own():
     with pytest.raises(UnknownName, match="did you mean 'gad'"):
         schemes_with({"gda": (1.0, "--overhead")})
     for percent in (-1.0, math.nan, math.inf, 1e308):
-        with pytest.raises(ConfigError, match=r"must be within 0 and 1e\+06 %, got"):
+        with pytest.raises(ConfigError, match=r"must be between 0 and 1e\+06 %, got"):
             schemes_with({"aad": (percent, "--overhead")})
 
 

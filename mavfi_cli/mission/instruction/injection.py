@@ -88,7 +88,7 @@ class _Entries:
 
     def __post_init__(self) -> None:
         if any(later < earlier for earlier, later in pairwise((0, *self.counts))):
-            raise ValueError("counts that fall")
+            raise ValueError("counts must not decrease")
 
 
 def _plan_fault(
