@@ -41,7 +41,7 @@ def refused(done):
 
 
 def test_one_that_prints_100_mb(attack):
-    assert "prints more than 64 MB, the most that is compared" in refused(attack("prints"))
+    assert "prints more than 64 MB" in refused(attack("prints"))
 
 
 def test_one_that_needs_more_memory_than_it_gets(attack):
@@ -55,7 +55,7 @@ def test_one_that_needs_more_memory_than_it_gets(attack):
 def test_one_that_writes_outside_its_folder_is_attacked_with_a_warning(attack, tmp_path):
     done = attack(f"writes {tmp_path}/mine")
     assert done.exit_code == 0, done.output
-    assert f"warning: guest writes outside its folder: {tmp_path}/mine; runs share" in done.stderr
+    assert f"warning: guest writes outside its folder: {tmp_path}/mine" in done.stderr
     assert (tmp_path / "mine").read_text() == "x"
 
 
@@ -119,7 +119,7 @@ def test_a_statically_linked_program_works(attack, native_program, length):
 
 def test_one_that_needs_a_terminal(attack):
     text = refused(attack("asks"))
-    assert "without a fault (no terminal here): it may want a terminal" in text
+    assert "without a fault (no terminal here)" in text
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_threads_and_children_are_refused_by_name(attack, native_program, args, 
     options = ("--ignore-lines", "[0-9]")
     text = refused(attack(args, *options, program=native_program(program)))
     assert what in text
-    assert "which is not followed" in text
+    assert "does not follow" in text
 
 
 @pytest.mark.parametrize("what", ["waits", "pipes"])

@@ -275,7 +275,7 @@ def test_keys_that_others_can_read_or_that_are_missing_are_refused(name, tmp_pat
 def test_an_address_and_its_keys_go_together(mavfi, options, tmp_path):
     run = mavfi("campaign", "run", "fig8", *options, cwd=tmp_path)
     assert run.returncode == 2
-    assert run.stderr.startswith("error: --cluster: an address with tls:// needs --cluster-key")
+    assert run.stderr.startswith("error: --cluster: a tls:// address requires --cluster-key")
     assert list(tmp_path.iterdir()) == []
 
 

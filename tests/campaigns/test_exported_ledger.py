@@ -62,7 +62,7 @@ def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
             1,
             "has no flown mission 640; the list has missions 0 to 639",
         ),
-        (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "of which all run folders were"),
+        (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "no pair has all its run folders"),
         (("campaign", "draw", EXPORT, "--pair", "3", "--output", "a.svg"), 1, "no run folder of"),
         (("campaign", "status", EXPORT, "--overhead"), 1, "name the campaign's folder"),
         (("campaign", "run", EXPORT), 1, "an export has no list of missions to fly"),

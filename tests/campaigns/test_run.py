@@ -197,7 +197,7 @@ def test_a_limit_that_ends_all_missions_or_none_is_refused(campaign, limit_s):
 
 
 def test_no_mission_at_all_ends_the_campaign(campaign):
-    with pytest.raises(CampaignStopped, match=r"no mission can be flown; .* start is blocked"):
+    with pytest.raises(CampaignStopped, match=r"no mission could begin; .* start is blocked"):
         campaign.run(planned(*["blocked"] * 100))
 
 

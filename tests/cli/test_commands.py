@@ -242,7 +242,7 @@ def test_doctor(command_line):
     assert checks["Vehicle"]["verdict"] == "ok"
     needed = [each for each in importlib.metadata.requires("mavfi") if "extra ==" not in each]
     for each in needed:
-        assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["found"]
+        assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["finding"]
     for check in checks.values():
         assert check["verdict"] == "ok" or check["remedy"]
 
@@ -250,8 +250,8 @@ def test_doctor(command_line):
 def test_doctor_exits_with_1_where_flying_would_not_work(command_line, monkeypatch):
     from mavfi_cli.mission import machine
 
-    found = "missing: ompl, " + ", ".join(f"library-{number} 1.0" for number in range(20))
-    broken = machine.Check(name="Libraries", verdict=machine.FAILED, found=found, remedy="pip")
+    finding = "missing: ompl, " + ", ".join(f"library-{number} 1.0" for number in range(20))
+    broken = machine.Check(name="Libraries", verdict=machine.FAILED, finding=finding, remedy="pip")
     monkeypatch.setattr(machine, "check_machine", lambda: iter([broken]))
     code, out, _ = command_line("doctor")
     assert code == 1

@@ -179,7 +179,7 @@ def test_a_replay_under_a_debugger_is_compared_without_what_it_cannot_follow(
         waited.append(pid)
         os.kill(pid, signal.SIGCONT)
 
-    monkeypatch.setattr("mavfi_cli.cli.runs._say_where", go_on)
+    monkeypatch.setattr("mavfi_cli.cli.runs._announce_stop", go_on)
     line = [str(attacked.path), "--gdb", "--json", "--out", str(tmp_path)]
     shown = CliRunner().invoke(replay, line)
     assert len(waited) == 1
@@ -240,7 +240,7 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     told = json.loads(without_perf("doctor", "--json").stdout)
     (counting,) = [check for check in told if check["name"] == "counted breakpoints"]
     assert counting["verdict"] == "limited"
-    assert "by debug registers" in counting["found"]
+    assert "by debug registers" in counting["finding"]
 
     config = load_run(attacked.path).result["config"]
     place = [f"--{n}={','.join(map(str, config[n]))}" for n in ("start", "goal")]

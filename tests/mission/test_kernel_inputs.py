@@ -64,5 +64,5 @@ def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
 
 def test_a_flight_without_a_detour_has_no_planning_problems(monkeypatch):
     monkeypatch.setattr("mavfi_cli.mission.kernel_inputs._FLIGHTS", 2)
-    with pytest.raises(TargetError, match="too few plans around an obstacle"):
+    with pytest.raises(TargetError, match="too few plans around obstacles"):
         record_inputs(MissionConfig(world="farm", seed=1, stack="hardened"))
