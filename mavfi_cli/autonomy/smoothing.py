@@ -148,7 +148,7 @@ class _Polyline:
         self.lengths = np.linalg.norm(steps, axis=1)  # (n - 1,)
         self.directions = steps / self.lengths[:, None]  # (n - 1, 3)
         rises = self.directions[:, 2]
-        with np.errstate(divide="ignore"):  # a level segment has no vertical limit
+        with np.errstate(divide="ignore", over="ignore"):  # a level segment has no limit
             vertical = np.where(rises < 0.0, params.descent_max_mps, params.climb_max_mps)
             caps = vertical / np.abs(rises)
         # (n - 1,) highest speed along each segment, m/s
