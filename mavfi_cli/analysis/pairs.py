@@ -22,7 +22,7 @@ from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.stats.paired import McNemar
-from mavfi_cli.stats.shares import Share, wilson
+from mavfi_cli.stats.shares import Share, design_effect, wilson
 
 STAGES = tuple(stage.value for stage in Stage)
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
@@ -243,10 +243,17 @@ class Flights:
 
     # Numbers
 
-    def share(self, column: str = "lost", *, value: bool = True) -> Share:
-        """The share in which a column has a value, among those in which it is not empty."""
-        values = self.table[column].drop_null()
-        return wilson(pc.sum(pc.equal(values, value)).as_py() or 0, len(values))
+    def share(self, column: str = "lost", *, value: bool = True, clustered: bool = False) -> Share:
+        """The share in which a column has a value, among those in which it is not empty.
+
+        Args:
+            clustered: whether the interval has the design effect of missions of one seed.
+        """
+        there = Flights(self.table.filter(pc.is_valid(self.table[column])))
+        hits = [cell is value for cell in there[column]]
+        clusters = [(world, (world, seed)) for world, seed in there.seeds]
+        effect = design_effect(hits, clusters) if clustered else 1.0
+        return wilson(sum(hits), len(hits), design_effect=effect)
 
     @property
     def ratios(self) -> FloatArray:

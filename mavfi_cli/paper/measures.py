@@ -24,7 +24,7 @@ from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.verdicts import Finding
 from mavfi_cli.stats.bootstrap import interval
 from mavfi_cli.stats.paired import net_share, paired_difference
-from mavfi_cli.stats.shares import Interval, Share, design_effect, wilson
+from mavfi_cli.stats.shares import Interval, Share
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
@@ -34,15 +34,8 @@ _FEWEST = 5  # kernels of a rank correlation, and hits of a share of hits
 _DETECTORS = ("gad", "aad")
 
 
-def share(flights: Flights, column: str = "lost", *, value: bool = True) -> Share:
-    """The share in which a column has a value, among those in which it is not empty.
-
-    Missions of one seed are a cluster.
-    """
-    there = flights.where(each is not None for each in flights[column])
-    hits = [each is value for each in there[column]]
-    clusters = [(world, (world, seed)) for world, seed in there.seeds]
-    return wilson(sum(hits), len(hits), design_effect=design_effect(hits, clusters))
+def _clustered(flights: Flights, column: str = "lost", *, value: bool = True) -> Share:
+    return flights.share(column, value=value, clustered=True)
 
 
 def _of_share(found: Share, what: str, why: str = NOT_FLOWN.why) -> Finding:
@@ -79,7 +72,9 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
 
 def _golden_success(flights: Flights, **where: Any) -> Finding:
     """Success of the golden flights."""
-    return _of_share(share(flights.golden.chosen(**where), value=False), "golden flights succeed")
+    return _of_share(
+        _clustered(flights.golden.chosen(**where), value=False), "golden flights succeed"
+    )
 
 
 def _delta_range(flights: Flights, state: str, why: str) -> Finding:
@@ -128,14 +123,14 @@ def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
 
 def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
-    shares = [share(flights.struck(**where), "harmed") for where in groups.values()]
+    shares = [_clustered(flights.struck(**where), "harmed") for where in groups.values()]
     counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"harmful: {'; '.join(counts)}")
 
 
 def _harmful(flights: Flights, **where: Any) -> Finding:
     """Share of harmful faults."""
-    return _of_share(share(flights.struck(**where), "harmed"), "harmful")
+    return _of_share(_clustered(flights.struck(**where), "harmed"), "harmful")
 
 
 def _loss_difference(
@@ -146,7 +141,7 @@ def _loss_difference(
     Args:
         counts: a format of two texts.
     """
-    shares = [share(flights.struck(**where, **each)) for each in (first, second)]
+    shares = [_clustered(flights.struck(**where, **each)) for each in (first, second)]
     return _difference(shares, f"lost: {counts.format(*(each.counts for each in shares))}")
 
 
@@ -156,7 +151,7 @@ def _longer(flights: Flights, **where: Any) -> Finding:
     ratios = timed.ratios
     if not len(ratios):
         return NOT_FLOWN
-    found = share(timed, "harmed")
+    found = _clustered(timed, "harmed")
     most = 100.0 * (ratios.max() - 1.0)
     return _of_share(found, f"over {100 * (LONGER - 1):.0f} % longer; longest {most:+.1f} %")
 
@@ -164,7 +159,7 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of longer flights that succeed in the first of two groups minus that in the second."""
     timed = [flights.struck(**where).timed for where in groups.values()]
-    shares = [share(those, "harmed") for those in timed]
+    shares = [_clustered(those, "harmed") for those in timed]
     counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
     return _difference(shares, f"over 10 % longer: {'; '.join(counts)}")
 
@@ -260,7 +255,7 @@ def _density_gap(flights: Flights, detector: str, dense: str, free: str, **where
         seen = flights.protected(detector, world=world, **where)
         if not len(seen):
             return NOT_FLOWN
-        gaps.append(share(seen, "harmed"))
+        gaps.append(_clustered(seen, "harmed"))
     return _difference(gaps, f"harmed with the detector: {dense} {gaps[0].counts}, "
                              f"{free} {gaps[1].counts}")  # fmt: skip
 
@@ -369,7 +364,7 @@ def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
     posterior distribution under Jeffreys' prior.
     """
     flown = {
-        name: share(those, "harmed")
+        name: _clustered(those, "harmed")
         for (name,), those in flights.struck(**where).by("struck_kernel").items()
         if name in kernels
     }
