@@ -18,8 +18,7 @@ from pathlib import Path
 
 import iced_x86 as iced
 
-from mavfi_cli.fi.tracer.decode import _named, decode, engine
-from mavfi_cli.fi.tracer.registers import FLAG_BITS
+from mavfi_cli.fi.tracer.decode import FLAG_BITS, _named, decode, engine
 from mavfi_cli.fi.tracer.vectors import low
 
 FOLDER = Path(__file__).parents[1] / "tests" / "fi" / "tracer"

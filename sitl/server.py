@@ -19,9 +19,9 @@ from mavfi_cli.core.compiled import in_cache
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.terminal import echo, exit_code, note
 from mavfi_cli.core.types import FlightTruth
-from mavfi_cli.link.codec import Codec, Signing, dialect, signing_from_file
+from mavfi_cli.link.codec import Codec, Signing, dialect
 from mavfi_cli.link.endpoint import parse_endpoint
-from mavfi_cli.link.transport import Transport, memory_pair, open_transport
+from mavfi_cli.link.transport import Transport, memory_pair, open_transport, signing_from_file
 from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA

@@ -1,7 +1,7 @@
 """Missions and worlds that many tests fly, as Python, as a command line and as TOML."""
 
+from mavfi_cli.core.types import KERNELS
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import KERNELS
 
 # Some 20 simulated seconds, take-off included; less than a second of work.
 SHORT = MissionConfig(

@@ -328,7 +328,8 @@ def register_corruption(register, bit, role=None):
 
 def all_registers():
     """Every full register of this processor that can be flipped."""
-    from mavfi_cli.fi.tracer.registers import GENERAL, widest_vector
+    from mavfi_cli.fi.tracer.decode import GENERAL
+    from mavfi_cli.fi.tracer.registers import widest_vector
 
     widest = widest_vector()
     names = [*GENERAL, "rflags", "rip", *(f"st{number}" for number in range(8))]

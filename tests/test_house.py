@@ -15,7 +15,7 @@ SOURCES = {
     for package in ("mavfi_cli", "sitl")
     for path in sorted((ROOT / package).rglob("*.py"))
 }
-LONGEST_CHAIN = 17  # modules, each of which imports the next, wherever the import stands
+LONGEST_CHAIN = 14  # modules, each of which imports the next, wherever the import stands
 MOST_FILES = 260
 MOST_NAMES = 885  # public classes and functions at the top level; a row of results is a class
 # Functions that nothing in the product calls by name, with the reason to keep them.

@@ -6,8 +6,6 @@ Every injected fault counts if the golden flight of its mission succeeds, even i
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,41 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical
-from mavfi_cli.core.errors import ConfigError, RecordError, lack_of
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer, rate
-
-KERNELS = "kernels.json"
-
-
-def kernel_summary(path: Path) -> Mapping[str, Any]:
-    """Read a summary of `mavfi kernels`; RecordError if the file is missing or is no summary."""
-    try:
-        summary: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        summary["plan"]["rule"], summary["plan"]["compat"], summary["plan"]["model"]
-        for kernel in summary["kernels"]:
-            sdc = kernel["outcomes"]["sdc"]
-            kernel["kernel"], sdc["count"], sdc["of"]
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack_of(error)})") from None
-    return summary
-
-
-def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
-    """The share of an outcome in a kernel of a summary, with the interval of the summary.
-
-    It is wider than that of independent runs, because runs on one input are correlated.
-    """
-    entry = kernel["outcomes"][outcome]
-    low, high = entry["wilson95"]
-    share = math.nan if entry["share"] is None else entry["share"]
-    return Share(count=entry["count"], total=entry["of"], share=share, low=low, high=high)
-
 
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mavfi_cli.campaigns.ledger import METADATA, Ledger, stored_export, stored_provenance
 from mavfi_cli.campaigns.missions import (
     COUNTED,
+    Labels,
     MissionResult,
     PlannedMission,
     ResultState,
@@ -58,6 +59,8 @@ _TYPES = {  # of the columns that are not text, even if they hold no value
     **dict.fromkeys(
         (*QUALITY, *COSTS, "strike_s", "first_read_s", "simulated_s", "wall_s"), pa.float64()),
 }  # fmt: skip
+# Labels in which protected flights differ from unprotected ones.
+TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
 _HOST = ("machine", "cores", "started")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -131,6 +134,11 @@ def _column(values: Sequence[Any]) -> pa.Array:
     if len(kinds) > 1 and kinds != {int, float}:
         values = [None if value is None else str(value) for value in values]
     return pa.array(values, pa.float64() if kinds == {int, float} else None)
+
+
+def untreated(labels: Labels) -> str:
+    """The labels that protected and unprotected flights with the same faults share, as text."""
+    return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from mavfi_cli.analysis.summary import RESAMPLES, Group
+from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import Labels
 from mavfi_cli.core.errors import MavfiError, RecordError
@@ -23,7 +23,7 @@ from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost
 from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.shares import Interval
 
 MEASURED = "measured"  # first word of the source of a measured overhead
@@ -69,7 +69,7 @@ class FlightOverhead:
         """Average the costs of one detector over its flights; at least one."""
 
         def mean(values: Iterable[float]) -> Interval:
-            return interval([*values], confidence=confidence, resamples=RESAMPLES)
+            return interval([*values], confidence=confidence, resamples=TABLE_RESAMPLES)
 
         return cls(
             labels={**labels, "detector": costs[0].detector},

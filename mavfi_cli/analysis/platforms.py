@@ -31,11 +31,10 @@ from mavfi_cli.analysis.flights import (
     numbers,
 )
 from mavfi_cli.analysis.pairs import against_golden, paired
-from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
-from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, sign_flips, worst_case
 from mavfi_cli.stats.shares import Interval, Share, rate
 
@@ -359,8 +358,8 @@ def _measured(quantity: _Quantity, counted: pa.Table) -> MeasuredQuantity:
     values = known(numbers(flights, quantity.name))
     return MeasuredQuantity(
         unit=quantity.unit,
-        median=interval(values, median, resamples=RESAMPLES),
-        mean=interval(values, resamples=RESAMPLES),
+        median=interval(values, median, resamples=TABLE_RESAMPLES),
+        mean=interval(values, resamples=TABLE_RESAMPLES),
         largest=max(values.tolist(), default=math.nan),
     )
 
@@ -389,7 +388,7 @@ def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQ
         first, second = first.filter(both), second.filter(both)
     before, after = (numbers(table, quantity.name).tolist() for table in (first, second))
     change = changed(
-        first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=RESAMPLES
+        first["seed"].to_pylist(), before, after, ratio=quantity.ratio, resamples=TABLE_RESAMPLES
     )
     kind, unit = ("ratio", "ratio") if quantity.ratio else ("difference", quantity.unit)
     return ChangedQuantity(kind=kind, unit=unit, **asdict(change))
@@ -519,7 +518,7 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
 
 def _over(count: int, statistic: Callable[[IntArray], FloatArray]) -> Interval:
     """A statistic over missions with its interval; `statistic` takes (..., missions) indices."""
-    return interval_of_rows(count, statistic, resamples=RESAMPLES)
+    return interval_of_rows(count, statistic, resamples=TABLE_RESAMPLES)
 
 
 def _mean(values: FloatArray) -> FloatArray:

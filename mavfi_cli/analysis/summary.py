@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers
+from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, untreated
 from mavfi_cli.analysis.pairs import partners
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, label_text
@@ -23,10 +23,7 @@ from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
 from mavfi_cli.stats.shares import Interval, Share, rate
 
-RESAMPLES = TABLE_RESAMPLES
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
-# Labels in which protected flights differ from unprotected ones.
-TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
 INACTIVE = frozenset(kind.value for kind in Injected) - COUNTED
 _WHOLE = ("cell", "number")
 _WORDS = ("outcome", "injected", "pair")
@@ -226,11 +223,6 @@ class Group:
         return here[here >= 0], there[here >= 0]
 
 
-def untreated(labels: Labels) -> str:
-    """The labels that protected and unprotected flights with the same faults share, as text."""
-    return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
-
-
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     """Merge settings whose labels `by` are equal; UnknownName if no setting has such a label."""
     labels = ledger.cells()
@@ -412,7 +404,7 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
 
 
 def _interval(values: FloatArray, confidence: float) -> Interval:
-    return interval(values, confidence=confidence, resamples=RESAMPLES)
+    return interval(values, confidence=confidence, resamples=TABLE_RESAMPLES)
 
 
 def summarise(

@@ -14,9 +14,8 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.companion.pipeline import SAME_TICK_S
-from mavfi_cli.core.types import Invocation, Outcome, Reaction
+from mavfi_cli.core.types import KERNELS, Invocation, Outcome, Reaction
 from mavfi_cli.mission.run_folder import Run
-from mavfi_cli.spec.platform import KERNELS
 
 _CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict
 LEAST_S = 1.0  # least duration of a timeline

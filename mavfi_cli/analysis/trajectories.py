@@ -8,8 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavfi_cli.analysis.flights import flights, number_span
-from mavfi_cli.analysis.summary import TREATMENT, untreated
+from mavfi_cli.analysis.flights import TREATMENT, flights, number_span, untreated
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, ResultState
 from mavfi_cli.core.errors import ConfigError, RecordError

@@ -33,6 +33,7 @@ from mavfi_cli.attack.null_runs import NullRuns, Profiles, Run, make_null_runs, 
 from mavfi_cli.attack.place import Golden, Watch
 from mavfi_cli.attack.profile import TargetProfile, started
 from mavfi_cli.attack.target import AttackTarget, JudgedPlace, places_of
+from mavfi_cli.core.compiled import own_digest
 from mavfi_cli.core.errors import (
     BuildMismatch,
     ConfigError,
@@ -40,7 +41,6 @@ from mavfi_cli.core.errors import (
     RecordError,
     TargetError,
 )
-from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record

@@ -14,7 +14,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from mavfi_cli.core.files import PACKAGE
+from mavfi_cli.core.compiled import PACKAGE
 from mavfi_cli.core.option_types import Number, OutFolder
 
 # Numbers ------------------------------------------------------------------------------------------

@@ -32,9 +32,9 @@ import numpy as np
 
 from mavfi_cli.companion.node_process import NodeLost, NodeProcess
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import Invocation
+from mavfi_cli.core.types import KERNELS, Invocation
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.spec.platform import KERNELS, PlatformProfile
+from mavfi_cli.spec.platform import PlatformProfile
 
 In = TypeVar("In")
 Out = TypeVar("Out")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import inspect
 import os
 import stat
@@ -17,9 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mavfi_cli.core.files import PACKAGE, can_write, folder_digest
-
 F = TypeVar("F", bound=Callable[..., Any])
+PACKAGE = Path(__file__).parents[1]
 _BLAS = "scipy.linalg.cython_blas"
 _LEVELS = {  # what each level of x86-64 adds, as Linux names it: System V ABI, section 3.1.1
     "x86-64-v2": "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3",
@@ -116,6 +116,29 @@ def _callees(function: Any) -> list[Any]:
     return [value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")]
 
 
+# Sources ------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def folder_digest(folder: Path, *, deep: bool = False) -> str:
+    """Return the SHA-256 of names and contents of all Python sources in a folder.
+
+    `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
+    """
+    digest = hashlib.sha256()
+    paths = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
+    for path in sorted(paths):
+        digest.update(str(path.relative_to(folder)).encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def own_digest() -> str:
+    """Return the SHA-256 of all sources and settings of mavfi and of the simulated vehicle."""
+    parts = [folder_digest(folder, deep=True) for folder in (PACKAGE, PACKAGE.parent / "sitl")]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+
 # Folders of caches --------------------------------------------------------------------------------
 
 
@@ -165,3 +188,11 @@ def _folder() -> Path:
         "to choose another folder\n"
     )
     return folder
+
+
+def can_write(folder: Path) -> bool:
+    """Return True if a folder is writable, or can be made."""
+    place = folder.absolute()
+    while place != place.parent and not os.path.lexists(place):
+        place = place.parent
+    return place.is_dir() and os.access(place, os.W_OK | os.X_OK)

@@ -1,4 +1,4 @@
-"""Files: atomic writes, scratch folders, and digests of source code.
+"""Files: atomic writes, bounded reads and scratch folders.
 
 A kill leaves the old file or the new one, never a partial one. A folder of results is untrusted:
 nothing is written through a link in it, and everything read from it has bounds.
@@ -22,9 +22,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mavfi_cli.core.compiled import can_write
 from mavfi_cli.core.errors import RecordError, lack_of
 
-PACKAGE = Path(__file__).parents[1]
 _LARGEST = 1 << 32  # bytes of a table
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
@@ -252,14 +252,6 @@ def require_folder(folder: Path) -> None:
         raise RecordError(f"{folder}: not a folder that can be made or written")
 
 
-def can_write(folder: Path) -> bool:
-    """Return True if a folder is writable, or can be made."""
-    place = folder.absolute()
-    while place != place.parent and not os.path.lexists(place):
-        place = place.parent
-    return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically. A lone surrogate, which UTF-8 lacks, is escaped."""
     write_atomically(path, lambda file: file.write(text.encode(errors="backslashreplace")))
@@ -312,23 +304,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
         return None
     return value
-
-
-@cache
-def folder_digest(folder: Path, *, deep: bool = False) -> str:
-    """Return the SHA-256 of names and contents of all Python sources in a folder.
-
-    `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
-    """
-    digest = hashlib.sha256()
-    paths = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
-    for path in sorted(paths):
-        digest.update(str(path.relative_to(folder)).encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def own_digest() -> str:
-    """Return the SHA-256 of all sources and settings of mavfi and of the simulated vehicle."""
-    parts = [folder_digest(folder, deep=True) for folder in (PACKAGE, PACKAGE.parent / "sitl")]
-    return hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")  # in flow order
 
 
 class Stage(Enum):

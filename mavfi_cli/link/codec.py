@@ -15,15 +15,11 @@ import hashlib
 import hmac
 import re
 import struct
-import time
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import common as dialect
-
-from mavfi_cli.core.errors import ConfigError
 
 SIGNATURE_LENGTH = 13  # bytes: link id, timestamp, truncated digest
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC, start of signing time
@@ -111,24 +107,6 @@ class Signing:
 
     def _digest(self, data: bytes) -> bytes:
         return hashlib.sha256(self._key + data).digest()[:6]
-
-
-def signing_from_file(path: str | Path | None) -> Signing | None:
-    """Return the signing with the passphrase in a file, on this host's clock; None without a file.
-
-    White space around the passphrase does not count. Raises ConfigError if the file cannot be read
-    or is empty.
-    """
-    if path is None:
-        return None
-    try:
-        passphrase = Path(path).read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"cannot read the passphrase: {problem}", path=Path(path)) from None
-    if not passphrase:
-        raise ConfigError("holds no passphrase", path=Path(path))
-    return Signing(key_from_passphrase(passphrase), clock=time.time)
 
 
 def _timestamp(frame: bytes) -> int:

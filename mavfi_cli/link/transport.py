@@ -10,10 +10,18 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from mavfi_cli.core.errors import LinkError, LinkLost
-from mavfi_cli.link.codec import Codec, begins_with_frame, dialect, frame_length
+from mavfi_cli.core.errors import ConfigError, LinkError, LinkLost
+from mavfi_cli.link.codec import (
+    Codec,
+    Signing,
+    begins_with_frame,
+    dialect,
+    frame_length,
+    key_from_passphrase,
+)
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, parse_endpoint
 
 MAX_PEERS = 16  # of one listener
@@ -567,3 +575,21 @@ class _MemoryTransport(Transport):
         if self._peer is not None:
             self._peer._peer = None
             self._peer = None
+
+
+def signing_from_file(path: str | Path | None) -> Signing | None:
+    """Return the signing with the passphrase in a file, on this host's clock; None without a file.
+
+    White space around the passphrase does not count. Raises ConfigError if the file cannot be read
+    or is empty.
+    """
+    if path is None:
+        return None
+    try:
+        passphrase = Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"cannot read the passphrase: {problem}", path=Path(path)) from None
+    if not passphrase:
+        raise ConfigError("holds no passphrase", path=Path(path))
+    return Signing(key_from_passphrase(passphrase), clock=time.time)

@@ -29,12 +29,12 @@ from mavfi_cli.core.errors import (
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.link.codec import dialect, signing_from_file
+from mavfi_cli.link.codec import dialect
 from mavfi_cli.link.images import IMAGE_MESSAGES, ImageFrame, ImageReceiver
 from mavfi_cli.link.session import OffboardSession, Phase, SessionSettings
 from mavfi_cli.link.telemetry import AUTOPILOT, CAMERA, Telemetry
 from mavfi_cli.link.tlog import RecordedLink
-from mavfi_cli.link.transport import Transport
+from mavfi_cli.link.transport import Transport, signing_from_file
 from mavfi_cli.mission.progress import FlightLogger, Recorder, Watcher
 from mavfi_cli.mission.run_folder import Trace
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import FloatArray, Outcome, Stage
+from mavfi_cli.core.types import KERNELS, FloatArray, Outcome, Stage
 from mavfi_cli.fi import bits
-from mavfi_cli.spec.platform import KERNELS
 
 Record = Mapping[str, Any]
 QUALITY = (

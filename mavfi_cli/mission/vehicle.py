@@ -27,8 +27,7 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FlightTruth
-from mavfi_cli.link.codec import signing_from_file
-from mavfi_cli.link.transport import Transport, open_transport
+from mavfi_cli.link.transport import Transport, open_transport, signing_from_file
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
 
 _START_LIMIT_S = 120.0  # of a camera; its first start compiles

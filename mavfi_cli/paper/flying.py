@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
-from mavfi_cli.analysis.failures import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.campaigns.begin import check_kinds

@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.failures import outcome_share
 from mavfi_cli.analysis.flights import COSTS, known, numbers
+from mavfi_cli.analysis.kernels import outcome_share
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
-from mavfi_cli.analysis.summary import RESAMPLES
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.verdicts import Finding
-from mavfi_cli.stats.bootstrap import interval
+from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import net_share, paired_difference
 from mavfi_cli.stats.shares import Interval, Share
 
@@ -61,7 +60,7 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
     if not clusters:
         return NOT_FLOWN
     means = [math.fsum(those) / len(those) for those in clusters.values()]
-    found = interval(means, resamples=RESAMPLES)
+    found = interval(means, resamples=TABLE_RESAMPLES)
     number = sum(map(len, clusters.values()))
     effect = Interval(value=found.value, low=found.low, high=found.high, count=number)
     return Finding(effect=effect, counts=counts)

@@ -10,8 +10,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.failures import KERNELS, kernel_summary
 from mavfi_cli.analysis.flights import flights, provenance, read_export
+from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.failures import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.flights import flights
+from mavfi_cli.analysis.kernels import KERNELS, kernel_summary, outcome_share
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.ledger import Ledger

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavfi_cli.analysis.failures import KERNELS
+from mavfi_cli.analysis.kernels import KERNELS
 from mavfi_cli.attack.campaign import Plan, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.attack.kernels.target import KernelTarget

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import BY_NAME, Stage
+from mavfi_cli.core.types import BY_NAME, KERNELS, Stage
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.fault import (
     GROUPS,
@@ -19,7 +19,6 @@ from mavfi_cli.fi.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.spec.platform import KERNELS
 
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector

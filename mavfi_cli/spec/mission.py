@@ -13,10 +13,10 @@ import numpy as np
 from mavfi_cli.autonomy import canonical_planner
 from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import Briefing, FloatArray
+from mavfi_cli.core.types import KERNELS, Briefing, FloatArray
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
-from mavfi_cli.spec.platform import KERNELS, PlatformProfile
+from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import DEFAULT, Stack, load_stack
 
 FIRMWARE = {"px4": "PX4_SITL", "ardupilot": "ARDUCOPTER_SITL"}

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from mavfi_cli.core.config import Shipped, load_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
+from mavfi_cli.core.types import KERNELS
 
 MEASURED = "measured"
 FACTORS = (0.01, 1000.0)  # minimum and maximum factor of a measured platform
-KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 _LONGEST_S = 3600.0
 LARGEST = 1.0e6  # maximum mass or power; a larger value is probably in the wrong unit
 HARDWARE = ("mass_kg", "power_w", "heatsink_kgpw")

@@ -17,8 +17,7 @@ from typing import Any
 
 from mavfi_cli.core.config import Shipped, read_toml, structure
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.types import StackMark
-from mavfi_cli.spec.platform import KERNELS
+from mavfi_cli.core.types import KERNELS, StackMark
 
 DEFAULT = "mavbench"
 FIRST = "hardened"  # stack of records that name none

@@ -10,10 +10,18 @@ import numpy as np
 
 from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect, text_messages
-from sitl.autopilot.commander import GPS_FIX_US, Commander, FlightMode, Result, Severity
+from sitl.autopilot.commander import (
+    GPS_FIX_US,
+    Commander,
+    FlightMode,
+    Result,
+    Severity,
+    Snapshot,
+    no_setpoint,
+)
 from sitl.autopilot.flight_modes import begin, climbs
 from sitl.autopilot.parameters import TYPE_REAL32, Parameters
-from sitl.autopilot.telemetry import Link, Links, Snapshot, no_setpoint
+from sitl.autopilot.telemetry import Link, Links
 from sitl.geodesy import Origin
 from sitl.vehicle.truth import Truth
 

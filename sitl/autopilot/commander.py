@@ -1,15 +1,22 @@
-"""Modes, arming, failsafe and disarming, as in PX4's commander.
+"""Modes, arming, failsafe and disarming, as in PX4's commander, and the state of the flight.
 
 Texts, results and delays are those observed in messages of PX4 v1.17.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
+import numpy as np
+
+from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.parameters import Parameters
+from sitl.geodesy import Origin
 from sitl.vehicle.truth import Truth
 
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
@@ -303,3 +310,65 @@ class Commander:
         if remaining < self._parameters.effective(threshold):
             self._battery_warned += 1
             self.queue_text(Severity.WARNING, text)
+
+
+# State of the flight ------------------------------------------------------------------------------
+
+# Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,); NaN
+# means not controlled.
+Setpoint = Vector
+
+
+def no_setpoint() -> Setpoint:
+    """Return a setpoint that controls nothing."""
+    return np.full(11, math.nan)
+
+
+@dataclass(slots=True, kw_only=True)
+class Snapshot:
+    """State behind guidance and telemetry. The autopilot updates it at every tick."""
+
+    commander: Commander
+    parameters: Parameters
+    origin: Origin
+    truth: Truth
+    home_ned_m: Vector  # (3,)
+    stamp_us: int = 0
+    setpoint: Setpoint = field(default_factory=no_setpoint)
+    motors_on: bool = False
+    offboard: Setpoint = field(default_factory=no_setpoint)  # newest one of the companion
+    sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
+    takeoff_down_m: float = math.nan  # of the next TAKEOFF; NaN is MIS_TAKEOFF_ALT above home
+    hold: tuple[Vector, float] | None = None  # NED position (3,) and yaw of the next LOITER
+    elapsed_s: float = 0.0  # since the tick before
+    consumed_mah: float = 0.0
+
+    @property
+    def spooled_up(self) -> bool:
+        """True once an armed vehicle's motors turn fast enough to take off."""
+        return self.commander.armed_for_s >= self.parameters.effective("COM_SPOOLUP_TIME")
+
+    @property
+    def boot_ms(self) -> int:
+        """Boot clock, ms, with 32-bit wrap-around."""
+        return self.stamp_us // 1000 & 0xFFFFFFFF
+
+    @property
+    def heading_deg(self) -> float:
+        """Heading from north, 0 to 360 degrees."""
+        return math.degrees(self.truth.euler_rad[2]) % 360.0
+
+    def geodetic_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
+        """Return latitude and longitude of a local point, 1e-7 degrees."""
+        latitude, longitude = self.origin.geodetic(north_m, east_m)
+        return round(latitude * 1e7), round(longitude * 1e7)
+
+    def amsl_m(self, down_m: float) -> float:
+        """Return the altitude above sea level of a local height, m."""
+        return self.origin.altitude_amsl_m - down_m
+
+    @property
+    def thrust(self) -> float:
+        """Mean motor command; added one by one, as `sum` rounds otherwise from Python 3.12 on."""
+        commands = self.truth.motor_commands.tolist()
+        return float(functools.reduce(operator.add, commands)) / len(commands)

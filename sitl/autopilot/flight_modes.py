@@ -12,9 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from mavfi_cli.core.frames import Vector, dot, norm
-from sitl.autopilot.commander import FlightMode, Severity
+from sitl.autopilot.commander import FlightMode, Setpoint, Severity, Snapshot
 from sitl.autopilot.parameters import Parameters
-from sitl.autopilot.telemetry import Setpoint, Snapshot
 from sitl.vehicle.truth import Truth
 
 _POSITION_GAIN_PER_S = 0.95  # MPC_XY_P of PX4

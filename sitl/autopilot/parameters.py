@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import struct
+import tomllib
 import zlib
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mavfi_cli.core.config import read_toml
 from mavfi_cli.link.codec import dialect
 
 TYPE_INT32: int = dialect.MAV_PARAM_TYPE_INT32
@@ -49,7 +49,7 @@ class _Parameter(NamedTuple):
 @cache
 def _parameter_table(system_id: int) -> tuple[_Parameter, ...]:
     """Return all parameters in index order, which is alphabetical."""
-    tables, _ = read_toml(_TABLES)
+    tables = tomllib.loads(_TABLES.read_text(encoding="utf-8"))
     rows = [
         *(_Parameter(name, *values) for name, values in tables["acting"].items()),
         *(_Parameter(name, default) for name, default in tables["present"].items()),

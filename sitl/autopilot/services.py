@@ -12,9 +12,16 @@ import numpy as np
 
 from mavfi_cli.link.codec import dialect
 from sitl.autopilot.autopilot import COMPONENT, Autopilot
-from sitl.autopilot.commander import GPS_FIX_US, FlightMode, Result, Severity
+from sitl.autopilot.commander import (
+    GPS_FIX_US,
+    FlightMode,
+    Result,
+    Setpoint,
+    Severity,
+    no_setpoint,
+)
 from sitl.autopilot.parameters import HASH_NAME
-from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, Link, Setpoint, int32, no_setpoint
+from sitl.autopilot.telemetry import BUILDERS, DESCRIPTIONS, Link, int32
 from sitl.geodesy import Origin
 
 _FORCE_MAGIC = 21196

@@ -6,12 +6,10 @@ request only.
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -19,78 +17,16 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.config import read_toml
-from mavfi_cli.core.frames import Vector
 from mavfi_cli.link.codec import AvailableModes, ComponentMetadata, ProtocolVersion, dialect
-from sitl.autopilot.commander import Commander, FlightMode
-from sitl.autopilot.parameters import Parameters
-from sitl.geodesy import Origin, standard_pressure_pa
+from sitl.autopilot.commander import FlightMode, Snapshot
+from sitl.geodesy import standard_pressure_pa
 from sitl.vehicle.profile import GRAVITY_MPS2
-from sitl.vehicle.truth import Truth
 
 TICK_US = 20_000  # period of the control loop
 STEPS_A_TICK = 5
 STEP_US = TICK_US // STEPS_A_TICK  # step of the physics, the shortest interval of any stream
 _OUTBOX = 500  # messages that wait for a client; the oldest are dropped first
 _UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repeatable
-
-# Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,); NaN
-# means not controlled.
-Setpoint = Vector
-
-
-def no_setpoint() -> Setpoint:
-    """Return a setpoint that controls nothing."""
-    return np.full(11, math.nan)
-
-
-@dataclass(slots=True, kw_only=True)
-class Snapshot:
-    """State behind guidance and telemetry. The autopilot updates it at every tick."""
-
-    commander: Commander
-    parameters: Parameters
-    origin: Origin
-    truth: Truth
-    home_ned_m: Vector  # (3,)
-    stamp_us: int = 0
-    setpoint: Setpoint = field(default_factory=no_setpoint)
-    motors_on: bool = False
-    offboard: Setpoint = field(default_factory=no_setpoint)  # newest one of the companion
-    sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
-    takeoff_down_m: float = math.nan  # of the next TAKEOFF; NaN is MIS_TAKEOFF_ALT above home
-    hold: tuple[Vector, float] | None = None  # NED position (3,) and yaw of the next LOITER
-    elapsed_s: float = 0.0  # since the tick before
-    consumed_mah: float = 0.0
-
-    @property
-    def spooled_up(self) -> bool:
-        """True once an armed vehicle's motors turn fast enough to take off."""
-        return self.commander.armed_for_s >= self.parameters.effective("COM_SPOOLUP_TIME")
-
-    @property
-    def boot_ms(self) -> int:
-        """Boot clock, ms, with 32-bit wrap-around."""
-        return self.stamp_us // 1000 & 0xFFFFFFFF
-
-    @property
-    def heading_deg(self) -> float:
-        """Heading from north, 0 to 360 degrees."""
-        return math.degrees(self.truth.euler_rad[2]) % 360.0
-
-    def geodetic_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
-        """Return latitude and longitude of a local point, 1e-7 degrees."""
-        latitude, longitude = self.origin.geodetic(north_m, east_m)
-        return round(latitude * 1e7), round(longitude * 1e7)
-
-    def amsl_m(self, down_m: float) -> float:
-        """Return the altitude above sea level of a local height, m."""
-        return self.origin.altitude_amsl_m - down_m
-
-    @property
-    def thrust(self) -> float:
-        """Mean motor command; added one by one, as `sum` rounds otherwise from Python 3.12 on."""
-        commands = self.truth.motor_commands.tolist()
-        return float(functools.reduce(operator.add, commands)) / len(commands)
 
 
 def _clip(value: float, low: int, high: int) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.core.option_types import OutFolder
 from mavfi_cli.core.terminal import exit_code, note
-from mavfi_cli.link.codec import signing_from_file
+from mavfi_cli.link.transport import signing_from_file
 from sitl.camera.component import Camera
 from sitl.camera.station import PoseTracker, Station, Witness
 from sitl.command_line import (

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.core import compiled
-from mavfi_cli.core.files import PACKAGE
+from mavfi_cli.core.compiled import PACKAGE
 
 VARIABLES = ("NUMBA_CACHE_DIR", "MPLCONFIGDIR")
 

@@ -9,11 +9,11 @@ from unittest import mock
 import pyarrow as pa
 import pytest
 
+from mavfi_cli.core.compiled import folder_digest
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import (
     ScratchFolder,
     file_digest,
-    folder_digest,
     inflate,
     open_own,
     own_folder,

@@ -8,7 +8,8 @@ import pytest
 from missions import SOUND_PLATFORM
 
 from mavfi_cli.companion.executor import LatencyModel
-from mavfi_cli.spec.platform import KERNELS, load_platform
+from mavfi_cli.core.types import KERNELS
+from mavfi_cli.spec.platform import load_platform
 
 
 def draws(model, kernel, count=4000):

@@ -7,11 +7,12 @@ import pytest
 
 from mavfi_cli.companion.executor import Executor, LatencyModel, Node
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
+from mavfi_cli.core.types import KERNELS
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.spec.platform import KERNELS, load_platform
+from mavfi_cli.spec.platform import load_platform
 
 
 def test_the_profile():

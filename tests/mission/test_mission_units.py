@@ -19,6 +19,7 @@ from mavfi_cli.core.files import (
     write_text,
 )
 from mavfi_cli.core.types import (
+    KERNELS,
     STATES,
     CollisionReport,
     Command,
@@ -31,7 +32,6 @@ from mavfi_cli.mission.run import response_times
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.vehicle import read_briefing
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, MARGIN_M, OF_THE_WORLD, MissionConfig
-from mavfi_cli.spec.platform import KERNELS
 
 # Configuration -------------------------------------------------------------------------------
 

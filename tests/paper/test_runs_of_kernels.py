@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mavfi_cli.analysis.failures import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.campaigns.progress import Spectator, duration

@@ -4,7 +4,8 @@ import pytest
 from missions import SOUND_PLATFORM
 
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
-from mavfi_cli.spec.platform import KERNELS, PLATFORMS, load_platform
+from mavfi_cli.core.types import KERNELS
+from mavfi_cli.spec.platform import PLATFORMS, load_platform
 
 
 @pytest.mark.parametrize("name", PLATFORMS.names)

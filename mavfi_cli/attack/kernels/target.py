@@ -27,8 +27,8 @@ from mavfi_cli.attack.place import Golden, Watch, digest
 from mavfi_cli.attack.profile import TargetProfile, profile_run
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import RunLimits, RunOutcome, RunVerdict, judged
+from mavfi_cli.core.compiled import own_digest
 from mavfi_cli.core.errors import FaultError, TargetError
-from mavfi_cli.core.files import own_digest
 from mavfi_cli.core.processes import receive
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee

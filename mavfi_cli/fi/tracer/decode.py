@@ -21,7 +21,6 @@ from typing import Any
 import capstone
 from capstone import x86
 
-from mavfi_cli.fi.tracer.registers import FLAG_BITS, GENERAL
 from mavfi_cli.fi.tracer.vectors import (
     ALL,
     VECTOR,
@@ -34,6 +33,11 @@ engine: Any = capstone.Cs(capstone.CS_ARCH_X86, capstone.CS_MODE_64)
 engine.detail = True
 BRANCHES = {x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_IRET}
 _FULL = low(64)
+GENERAL = (
+    "rax", "rbx", "rcx", "rdx", "rsi", "rdi", "rbp", "rsp", "r8", "r9", "r10", "r11", "r12", "r13",
+    "r14", "r15",
+)  # fmt: skip
+FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

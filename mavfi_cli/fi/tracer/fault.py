@@ -20,9 +20,9 @@ from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.tracer.counted import CountedStop
-from mavfi_cli.fi.tracer.decode import Instruction, RegisterUse
+from mavfi_cli.fi.tracer.decode import FLAG_BITS, Instruction, RegisterUse
 from mavfi_cli.fi.tracer.image import Location
-from mavfi_cli.fi.tracer.registers import FLAG_BITS, FLAGS, VECTOR_BITS, width_of
+from mavfi_cli.fi.tracer.registers import FLAGS, VECTOR_BITS, width_of
 
 
 class Site(Enum):

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mavfi_cli.fi.tracer import linux
+from mavfi_cli.fi.tracer.decode import FLAG_BITS
 
 # void f(uint32_t leaf /*edi*/, uint32_t subleaf /*esi*/, uint32_t *out /*rdx*/)
 _CODE = bytes.fromhex(
@@ -61,9 +62,6 @@ _USER_REGS = (
     "fs_base gs_base ds es fs gs"
 )
 _SLOT = {name: index for index, name in enumerate(_USER_REGS.split())}
-_GENERAL = "rax rbx rcx rdx rsi rdi rbp rsp r8 r9 r10 r11 r12 r13 r14 r15"
-GENERAL = tuple(_GENERAL.split())
-FLAG_BITS = {"cf": 0, "pf": 2, "af": 4, "zf": 6, "sf": 7, "df": 10, "of": 11}
 _VECTOR = re.compile(r"(xmm|ymm|zmm)(\d+)$")
 _X87 = re.compile(r"(st|mm|k)(\d)$")
 FLAGS = sum(1 << bit for bit in FLAG_BITS.values())  # flags that instructions read and write

@@ -6,7 +6,8 @@ import hashlib
 import json
 from pathlib import Path
 
-from mavfi_cli.core.files import file_digest, own_digest
+from mavfi_cli.core.compiled import own_digest
+from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.spec.mission import MissionConfig
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from probe import NAMES, WINDOW, decoded, random_state, relocated, with_immediate
 
-from mavfi_cli.fi.tracer.registers import FLAG_BITS, FLAGS
+from mavfi_cli.fi.tracer.decode import FLAG_BITS
+from mavfi_cli.fi.tracer.registers import FLAGS
 
 STATES, AT_LEAST, ATTEMPTS = 400, 4, 4000
 _EVERY = (1 << 512) - 1

@@ -29,7 +29,7 @@ def flip_every_bit(tracee, name, width, others, step=1):
 
 
 def test_every_bit_of_every_general_register(start):
-    from mavfi_cli.fi.tracer.registers import GENERAL
+    from mavfi_cli.fi.tracer.decode import GENERAL
 
     tracee = start("counting")
     for name in GENERAL:
