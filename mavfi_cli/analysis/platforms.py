@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,6 +144,13 @@ class ChangedQuantity(Interval):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class _SuccessChange(McNemar):
+    """Successes on two platforms, and the difference of the rates; NaN without pairs."""
+
+    difference: float = field()  # no property as in the base class, so that `asdict` has it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RatioRow:
     """A platform over the reference platform, mission by mission."""
 
@@ -152,8 +159,7 @@ class RatioRow:
     reference: str
     pairs: int
     both_succeed: int
-    success: McNemar
-    success_difference: float
+    success: _SuccessChange
     quantities: dict[str, ChangedQuantity]
 
 
@@ -375,8 +381,7 @@ def _ratio(
         reference=reference,
         pairs=test.pairs,
         both_succeed=test.both,
-        success=test,
-        success_difference=test.difference,
+        success=_SuccessChange(**asdict(test), difference=test.difference),
         quantities={quantity.name: _changed(quantity, *pairs) for quantity in QUANTITIES},
     )
 

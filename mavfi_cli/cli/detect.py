@@ -27,6 +27,7 @@ from mavfi_cli.cli.parameters import (
 from mavfi_cli.core.terminal import echo, echo_lines
 
 if TYPE_CHECKING:
+    from mavfi_cli.detect.base import DetectorListing
     from mavfi_cli.studies.evaluate import EvaluationPlan
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -46,13 +47,20 @@ def list_(models: Path | None, as_json: bool) -> None:
 
     rows = listing(models)
     if as_json:
-        echo(json.dumps([asdict(row) for row in rows], indent=2))
+        echo(json.dumps([_entry(row) for row in rows], indent=2))
         return
     for row in rows:
         threshold = "-" if row.threshold is None else f"{row.threshold:.6g}"
         stack = f"{row.stack}: " if row.stack else ""
         echo(f"{row.name:<9} threshold {threshold:<9} {stack}{row.model or 'no model file'}")
         echo(f"{'':<9} {row.description}")
+
+
+def _entry(row: DetectorListing) -> dict[str, Any]:
+    """The entry of a detector in `--json`, where its description is `told`."""
+    entry = asdict(row)
+    entry["told"] = entry.pop("description")
+    return entry
 
 
 _missions = partial(click.option, cls=GroupedOption, group="Missions")

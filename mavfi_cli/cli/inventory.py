@@ -55,7 +55,12 @@ def doctor(as_json: bool) -> None:
             for line in [*rest, *([f"-> {check.remedy}"] if check.remedy else [])]:
                 echo(f"{'':<{_FINDING}}{line}")
     if as_json:
-        _print_json(checks)
+        rows = [
+            {"name": check.name, "verdict": check.verdict, "found": check.finding,
+             "remedy": check.remedy}
+            for check in checks
+        ]  # fmt: skip
+        echo(json.dumps(rows, indent=2))
     if any(check.verdict == FAILED for check in checks):
         raise click.exceptions.Exit(1)
 

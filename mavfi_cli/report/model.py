@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -44,14 +44,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Groups of fields, which a scheme that does not fly lacks. Columns of the first have no prefix.
-_GROUPS = ("performance", "ratios", "flown")
-_LACKED = (*_GROUPS, "over_none", "over_aad")
+# Ratios of flights in vpm.json and flights.csv: scheme below, ending of the keys, fields.
+_OVER: Sequence[tuple[str, str, Sequence[str]]] = (
+    ("over_none", "", ("velocity_ratio", "flight_time_ratio", "energy_ratio")),
+    ("over_aad", "_over_aad", ("flight_time_ratio",)),
+)
 
 
 def model_json(model: ModelReport, flights: FlightsReport | None = None) -> Any:
     """The model, and its flights as `flights` if there are any, as plain values."""
-    return plain(asdict(model) | ({} if flights is None else {"flights": asdict(flights)}))
+    parts = {} if flights is None else {"flights": _with_rows(flights)}
+    return plain(_with_rows(model) | parts)
 
 
 def model_csv(model: ModelReport | FlightsReport) -> str:
@@ -61,21 +64,74 @@ def model_csv(model: ModelReport | FlightsReport) -> str:
     """
     distance = {"distance_m": model.distance_m} if isinstance(model, ModelReport) else {}
     return Table.of_records(
-        {"vehicle": vehicle.vehicle, "board": vehicle.board, **distance} | dict(_flat(asdict(row)))
+        {"vehicle": vehicle.vehicle, "board": vehicle.board, **distance}
+        | {
+            name: "; ".join(cell) if isinstance(cell, tuple) else cell
+            for name, cell in _cells_of(row).items()
+            if name != "outcomes"
+        }
         for vehicle in model.vehicles
         for row in vehicle.schemes
     ).csv()
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Name and value of each cell; the name of a nested one begins with that of its group."""
-    for name, value in values.items():
-        if name == "outcomes" or (value is None and name in _LACKED):
-            continue
-        if isinstance(value, Mapping):
-            yield from _flat(value, prefix if name in _GROUPS else f"{prefix}{name}_")
-        else:
-            yield prefix + name, "; ".join(value) if isinstance(value, tuple) else value
+def _with_rows(report: ModelReport | FlightsReport) -> dict[str, Any]:
+    vehicles = [
+        asdict(vehicle) | {"schemes": [_cells_of(row) for row in vehicle.schemes]}
+        for vehicle in report.vehicles
+    ]
+    return asdict(report) | {"vehicles": vehicles}
+
+
+def _cells_of(row: SchemeResult | FlownScheme) -> dict[str, Any]:
+    """The cells of a scheme by the names of their columns; lists are tuples."""
+    return _model_cells(row) if isinstance(row, SchemeResult) else _flown_cells(row)
+
+
+def _model_cells(row: SchemeResult) -> dict[str, Any]:
+    cells = asdict(row)
+    problem = cells.pop("problem")
+    for group, kind in (("performance", Performance), ("ratios", Ratios)):
+        cells |= cells.pop(group) or dict.fromkeys(part.name for part in fields(kind))
+    return {**cells, "problem": problem}
+
+
+def _flown_cells(row: FlownScheme) -> dict[str, Any]:
+    common = ("scheme", "title", "boards", "overhead_percent", "mass_kg", "problem")
+    cells: dict[str, Any] = {name: getattr(row, name) for name in common}
+    if (own := row.flown) is None:
+        return {**cells, "errors": (), "cut": ()}
+    planned = ("errors", "cut", "v_max_mps", "a_max_mps2", "braking_velocity_mps")
+    cells |= {name: getattr(own, name) for name in planned}
+    cells |= {"missions": own.success.total, "outcomes": own.outcomes}
+    for end, share in (("", "share"), ("_low", "low"), ("_high", "high")):
+        cells[f"success{end}_percent"] = 100.0 * getattr(own.success, share)
+    for part in fields(own):
+        value = getattr(own, part.name)
+        if isinstance(value, ModelAndFlights):
+            cells |= _number_with_ends(part.name, value)
+        elif isinstance(value, float) and part.name not in planned:
+            cells[f"flight_{part.name}"] = value
+    for over, ending, names in _OVER:
+        if (ratios := getattr(row, over)) is not None:
+            for name in names:
+                quantity, _, unit = name.rpartition("_")
+                cells |= _number_with_ends(f"{quantity}{ending}_{unit}", getattr(ratios, name))
+                cells[f"pairs{ending}"] = ratios.pairs
+    return cells
+
+
+def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
+    """The cells of a number whose name ends in its unit."""
+    quantity, _, unit = name.rpartition("_")
+    compared = name if unit == "ratio" else quantity
+    return {
+        f"model_{name}": number.model,
+        f"flight_{name}": number.flights.value,
+        f"flight_{quantity}_low_{unit}": number.flights.low,
+        f"flight_{quantity}_high_{unit}": number.flights.high,
+        f"{compared}_difference_percent": number.difference_percent,
+    }
 
 
 # Text: the model ----------------------------------------------------------------------------------

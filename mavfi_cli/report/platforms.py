@@ -184,7 +184,7 @@ def _ratio_cells(row: RatioRow) -> list[str]:
         spread(own["flight_time_s"], 3),
         spread(own["energy_regression_j"], 2),
         spread(own["response_median_s"], 2),
-        number(row.success_difference, "+.1f", 100.0, f" ({chance})"),
+        number(row.success.difference, "+.1f", 100.0, f" ({chance})"),
     ]
 
 
@@ -243,7 +243,7 @@ _OVER, _COST = "flight time over own golden", "cost of a fault"
 # number without its own.
 _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
     "settings": (("success", "share", "1", "success", ""),),
-    "ratios": (("success", "difference", "1", "success_difference", "pairs"),),
+    "ratios": (("success", "difference", "1", "success.difference", "pairs"),),
     "costs": (
         ("lost by faults", "flights", "count", "lost", "compared"),
         (_COST, "mean", "s", "cost_s.mean", ""),

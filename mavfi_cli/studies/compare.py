@@ -39,7 +39,7 @@ FAULTY = "FI"  # names of settings, as in the presets
 _SHORT = {"gad": "G", "aad": "A"}  # short names of detectors in names of settings
 STAGES = tuple(stage.value for stage in Stage)
 MOST = 100_000  # missions
-SCHEMA = 3  # of compare.json; version 2 had the difference of success in `success`
+SCHEMA = 2  # of compare.json
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

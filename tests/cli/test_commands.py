@@ -242,7 +242,7 @@ def test_doctor(command_line):
     assert checks["Vehicle"]["verdict"] == "ok"
     needed = [each for each in importlib.metadata.requires("mavfi") if "extra ==" not in each]
     for each in needed:
-        assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["finding"]
+        assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["found"]
     for check in checks.values():
         assert check["verdict"] == "ok" or check["remedy"]
 

@@ -103,9 +103,8 @@ COMMANDS = {
     # memory of a run, and with the code of x86-64-v3.
     # Renewed when the summary got the null runs; all else is equal.
     "kernels": ("7d1fc4ea7f2c0829", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
-    # Renewed when `difference` became `success_difference` (schema 3); all else is equal.
     "compare": (
-        "4c6261a169806646",
+        "eac34e35e3c1cd54",
         [
             *("compare", "--platform", "x86", "--platform", "tx2", "--world", "farm"),
             *("--inject", "waypoint_position", "--field", "exponent", "--detector", "none,gad"),
@@ -122,11 +121,9 @@ COMMANDS = {
         ],
     ),
     # Renewed when its curve got its throughputs from libm: those of numpy depend on the processor.
-    # Renewed when the numbers of a scheme got the groups `performance` and `ratios`.
-    "vpm": ("227a90ffefcc10d1", ["vpm", "--vehicle", "spark", "--json"]),
-    # Renewed when the columns got the names of the groups in `vpm.json`; all numbers are equal.
+    "vpm": ("42b0c90aea6f35bb", ["vpm", "--vehicle", "spark", "--json"]),
     "vpm --fly": (
-        "528f649b2c2b22f5",
+        "347da80654dec6fe",
         [
             *("vpm", "--vehicle", "spark", "--fly", "--world", "farm", "--missions", "1"),
             *("--quiet", "--csv"),

@@ -8,9 +8,9 @@ import xml.etree.ElementTree as ET
 import pytest
 from test_vpm import COUNTS, SVG, UNITS, numbers
 
-COUNTED = {*COUNTS, "missions_each", "first_seed", "flights", "alarms", "success", "collision",
-           "timeout", "no_path", "pairs", "replans", "count", "total", "share"}  # fmt: skip
-OF_PARENT = {"model", "flights", "value", "low", "high"}  # in the unit of what holds them
+COUNTED = {*COUNTS, "missions_each", "first_seed", "missions", "flights", "alarms", "success",
+           "collision", "timeout", "no_path", "pairs", "pairs_over_aad", "flight_replans",
+           "flight_alarms"}  # fmt: skip
 WORLD = """name = "lawn"
 bounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]
 start_enu_m = [0.0, 0.0, 0.0]
@@ -39,12 +39,11 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     rows = {row["scheme"]: row for row in told["flights"]["vehicles"][0]["schemes"]}
     assert list(rows) == ["none", "dmr", "tmr", "gad", "aad"]
     for row in rows.values():
-        own = row["flown"]
-        assert own["outcomes"] == {"success": 1}
-        assert own["top_velocity_mps"]["flights"]["value"] <= 1.05 * own["v_max_mps"]
-    times = [flown(rows[name], "flight_time_s") for name in ("none", "dmr", "tmr")]
+        assert row["outcomes"] == {"success": 1}
+        assert row["flight_top_velocity_mps"] <= 1.05 * row["v_max_mps"]
+    times = [rows[name]["flight_flight_time_s"] for name in ("none", "dmr", "tmr")]
     assert times == sorted(times)
-    energies = [flown(rows[name], "energy_j") for name in ("none", "dmr", "tmr")]
+    energies = [rows[name]["flight_energy_j"] for name in ("none", "dmr", "tmr")]
     assert energies == sorted(energies)
     _flown_as_planned(told, rows)
     _like_beside_like(rows)
@@ -59,16 +58,11 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     assert "not scaled to the platform" in out
 
 
-def flown(row, name):
-    return row["flown"][name]["flights"]["value"]
-
-
 def _like_beside_like(rows):
     """The model beside a flight has the overhead with which it was flown, not the measured one."""
     assert rows["gad"]["overhead_percent"] == pytest.approx(2.2223)
     for row in rows.values():
-        own = row["flown"]
-        assert own["velocity_mps"]["model"] == pytest.approx(own["v_max_mps"])
+        assert row["model_velocity_mps"] == pytest.approx(row["v_max_mps"])
 
 
 def _flown_as_planned(told, rows):
@@ -76,7 +70,7 @@ def _flown_as_planned(told, rows):
     model = {row["scheme"]: row for row in told["vehicles"][0]["schemes"]}
     for name, row in rows.items():
         assert row["mass_kg"] == model[name]["mass_kg"]
-    shaft = [rows[name]["flown"]["hover_shaft_w"] for name in ("none", "tmr")]
+    shaft = [rows[name]["flight_hover_shaft_w"] for name in ("none", "tmr")]
     masses = [rows[name]["mass_kg"] for name in ("none", "tmr")]
     assert shaft[1] / shaft[0] == pytest.approx((masses[1] / masses[0]) ** 1.5)
     used = {each["detector"]: each["measured_percent"] for each in told["flights"]["overheads"]}
@@ -87,26 +81,15 @@ def _flown_as_planned(told, rows):
 
 
 def _units(told):
-    keys = set(numbers(_units_of_parents(told["flights"])))
-    assert "velocity_mps" in keys
+    keys = set(numbers(told["flights"]))
+    assert "flight_velocity_mps" in keys
     assert [key for key in keys if key not in COUNTED and not key.endswith(UNITS)] == []
-
-
-def _units_of_parents(value, key=""):
-    """The same, in which a number beside another has the name of what holds them."""
-    if isinstance(value, list):
-        return [_units_of_parents(item, key) for item in value]
-    if not isinstance(value, dict):
-        return value
-    inner = OF_PARENT if {"difference_percent", "value", "share"} & value.keys() else ()
-    named = [(key if name in inner else name, item) for name, item in value.items()]
-    return [{name: _units_of_parents(item, name)} for name, item in named]
 
 
 def _files(folder, rows):
     text = list(csv.DictReader((folder / "flights.csv").read_text().splitlines()))
     assert [row["scheme"] for row in text] == list(rows)
-    assert float(text[2]["flight_time_s_flights_value"]) == flown(rows["tmr"], "flight_time_s")
+    assert float(text[2]["flight_flight_time_s"]) == rows["tmr"]["flight_flight_time_s"]
     words = " ".join(
         text.text or "" for text in ET.parse(folder / "flights.svg").getroot().iter(f"{SVG}text")
     )

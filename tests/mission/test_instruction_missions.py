@@ -240,7 +240,7 @@ def test_debug_registers_count_where_the_kernel_may_not(without_perf, attacked, 
     told = json.loads(without_perf("doctor", "--json").stdout)
     (counting,) = [check for check in told if check["name"] == "counted breakpoints"]
     assert counting["verdict"] == "limited"
-    assert "by debug registers" in counting["finding"]
+    assert "by debug registers" in counting["found"]
 
     config = load_run(attacked.path).result["config"]
     place = [f"--{n}={','.join(map(str, config[n]))}" for n in ("start", "goal")]
