@@ -65,7 +65,7 @@ def in_loop() -> None:
 
     def timed(name: str) -> float:
         """The same for a new gate, after a first one that must stay silent."""
-        first, gate = (Gate(DetectorConfig(name=name).built("hardened")) for _ in range(2))
+        first, gate = (Gate(DetectorConfig(name=name).build("hardened")) for _ in range(2))
         assert not any(first.judge_tick(trajectory, i // WAYPOINT_TICKS, c) for i, c in
                        enumerate(commands)), "this flight is error-free"  # fmt: skip
         return loop(gate.judge_tick)
@@ -74,7 +74,7 @@ def in_loop() -> None:
     print(f"{'detector':10} {'a check, us':>12} {'with waypoint':>15} {'share of 50 Hz':>15}"
           f" {'a report, us':>13}")  # fmt: skip
     for name in base.PLUG_INS.names:
-        gate = Gate(DetectorConfig(name=name).built("hardened"))
+        gate = Gate(DetectorConfig(name=name).build("hardened"))
         each = min(timed(name) for _ in range(7)) - empty
         fresh = []
         for i in range(100):

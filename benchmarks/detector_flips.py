@@ -97,7 +97,7 @@ def found(held: list[Run], count: int = 3000) -> None:
     kept: dict[str, np.ndarray] = {}
     for name in base.PLUG_INS.names:
         seen = []
-        detector = DetectorConfig(name=name).built(STACK)
+        detector = DetectorConfig(name=name).build(STACK)
         for strike in struck:
             judged = replay(strike.columns, detector)
             seen.append(
@@ -112,7 +112,7 @@ def found(held: list[Run], count: int = 3000) -> None:
         alarms = sum(
             j.alarm is not None
             for run in held
-            for j in replay(run.columns, DetectorConfig(name=name).built(STACK))
+            for j in replay(run.columns, DetectorConfig(name=name).build(STACK))
         )
         print(f" {name}: {alarms} ({alarms / hours:.1f}/h)", end="")
     keys = [(strike.state, strike.field, strike.material) for strike in struck]

@@ -43,7 +43,7 @@ from mavfi_cli.link.codec import Codec, dialect, frame_length
 from mavfi_cli.link.images import IMAGE_MESSAGES
 
 _Sender = tuple[int, int]
-_HANDLED = {*telemetry._HANDLERS, *session._HEARD, *IMAGE_MESSAGES}
+_HANDLED = {*telemetry._HANDLERS, *session._HANDLED, *IMAGE_MESSAGES}
 _OWN = [(1, 1), (1, 1), (1, 100)]
 _OTHERS = [(1, 101), (1, 190), (1, 0), (7, 1), (7, 100), (255, 190), (0, 1)]
 _HEARTBEAT = dialect.MAVLINK_MSG_ID_HEARTBEAT

@@ -46,9 +46,9 @@ class Peer(ABC):
     def take(self, data: bytes) -> Sequence[object]:
         """Handle received bytes. Return the valid messages among them."""
 
-    def forward(self, *, frame: bytes, of: Peer) -> bool:
+    def forward(self, *, frame: bytes, sender: Peer) -> bool:
         """Send a frame of another peer unchanged. Return False for the peer's own."""
-        if of is self:
+        if sender is self:
             return False
         self.transport.send(frame)
         return True
@@ -96,7 +96,7 @@ class Peers(Generic[P]):
         try:
             listener = open_listener(
                 url, signed=signing is not None, allow_unsigned=self._allow_unsigned,
-                admits=begins_with_frame if signing is None else signing.vouches,
+                admits=begins_with_frame if signing is None else signing.authenticates,
             )  # fmt: skip
         except BaseException:
             self.close()

@@ -342,7 +342,7 @@ class _Realtime:
     def _forward(self, until_s: float) -> None:
         for sender in self._clients:
             while sender.texts and time.monotonic() < until_s:
-                forward = partial(Client.forward, frame=sender.texts.popleft(), of=sender)
+                forward = partial(Client.forward, frame=sender.texts.popleft(), sender=sender)
                 self._clients.send_in_turn(forward, until_s)
 
 

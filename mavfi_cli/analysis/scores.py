@@ -123,7 +123,7 @@ def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack:
     columns, plans, strikes = seen
     if not columns:  # it ended before the first tick
         return 0.0
-    path, fresh = detector.model_path(stack), detector.built(stack)
+    path, fresh = detector.model_path(stack), detector.build(stack)
     from_s = -math.inf if struck_s is None else struck_s - 1e-9
     highest = 0.0
     judgements = replay(

@@ -195,7 +195,7 @@ def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[Panel]:
     for faulty in struck.values():
         (config,) = ledger.configs([faulty[0].number])
         fault = config.fault or config.instruction
-        panels.append(_panel("" if fault is None else fault.words(), golden + faulty))
+        panels.append(_panel("" if fault is None else fault.describe(), golden + faulty))
     return panels or [_panel("", golden)]
 
 

@@ -82,7 +82,7 @@ def golden_run(place: JudgedPlace) -> Golden:
     """
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
     for again in runs[1:]:
-        if unlike := place.unlike(runs[0], again):
+        if unlike := place.describe_difference(runs[0], again):
             problem = f"fault-free runs differ, so no outcome can be judged: {unlike}"
             raise TargetError(place.name, problem)
     slowest = max(run.cpu_s for run in runs), max(run.wall_s for run in runs)

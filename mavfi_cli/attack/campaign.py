@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Which faults are drawn; `runs` is the number of runs of each target."""
+    """The faults to draw for a campaign. `runs` is the number of runs of each target."""
 
     runs: int
     seed: int
@@ -76,7 +76,7 @@ class Plan:
             "windows": self.windows,
             "null": self.null,
             "model": self.strategy().model.to_json(),
-            **target.known(),
+            **target.settings(),
         }
 
 
@@ -167,10 +167,10 @@ def _attack(
     golden_s = time.monotonic()
     stream = {"kernel": target.stream[0]} if target.stream else {}
     context = stream | place.context()
-    bench = _Bench(plan=plan, target=target, golden=goldens)
-    workers.take(bench, place)
+    setup = _TargetSetup(plan=plan, target=target, golden=goldens)
+    workers.take(setup, place)
     stage("null runs")
-    profiles, null_runs = make_null_runs(target.name, profiles, bench.draw, workers.null(bench))
+    profiles, null_runs = make_null_runs(target.name, profiles, setup.draw, workers.null(setup))
     for method in null_runs.unused:
         notice(
             f"{target.name} reads its own code as data: its output changes even without a flip "
@@ -185,7 +185,7 @@ def _attack(
         prepare_s=time.perf_counter() - begun,
     )
     stage(f"drawing {plan.runs} faults")
-    planned = _draw(plan, bench, prepared)
+    planned = _draw(plan, setup, prepared)
     done: dict[int, FaultRecord] = {}
     if journal is not None:
         done = journal.runs_of(planned)
@@ -196,12 +196,12 @@ def _attack(
         if index not in done
     ]
     for first in range(0, len(tasks), _RECHECKED):
-        for index, result in workers.run(bench, tasks[first : first + _RECHECKED]):
+        for index, result in workers.run(setup, tasks[first : first + _RECHECKED]):
             done[index] = result.completed(planned[index])
             if journal is not None:
                 journal.append(done[index])
             progress(target.name, len(done))
-        require_golden_again(target.name, null_runs, workers.null(bench), golden_s)
+        require_golden_again(target.name, null_runs, workers.null(setup), golden_s)
     records = tuple(done[index] for index in sorted(done))
     return replace(prepared, records=records, wall_s=time.perf_counter() - begun)
 
@@ -218,7 +218,7 @@ def _prepare(
         golden = tuple(golden_run(part) for part in places_of(place))
         for text in dict.fromkeys(text for run in golden for text in run.notices):
             notice(text)
-        rng = _Bench(plan=plan, target=target, golden=golden).generator("profile")
+        rng = _TargetSetup(plan=plan, target=target, golden=golden).generator("profile")
         profiles: Profiles = (None,) * len(golden)
         if plan.strategy().rule is Rule.INSTRUCTION:
             stage("profile")
@@ -244,12 +244,12 @@ def _report_steps(stage: Callable[[str], None]) -> Watch:
     return watch
 
 
-def _draw(plan: Plan, bench: _Bench, prepared: TargetRuns) -> list[FaultRecord]:
+def _draw(plan: Plan, setup: _TargetSetup, prepared: TargetRuns) -> list[FaultRecord]:
     """Make the records of all faults before they run; a time rule draws its fault at the stop."""
     chosen, records = plan.strategy(), list[FaultRecord]()
     for index in range(plan.runs):
         number = prepared.input_of(index)
-        profile, fault = prepared.profiles[number], bench.draw(prepared.profiles, index)
+        profile, fault = prepared.profiles[number], setup.draw(prepared.profiles, index)
         what = {"run": index, "seed": plan.seed, "sampling": chosen.name, **prepared.context}
         if len(prepared.goldens) > 1:
             what["input"] = number
@@ -308,8 +308,8 @@ def _give_up_processor() -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Bench:
-    """A target and its golden runs, as plain values that a worker process can receive."""
+class _TargetSetup:
+    """A plan, a target and its golden runs, as plain values that a worker process can receive."""
 
     plan: Plan
     target: AttackTarget
@@ -335,10 +335,10 @@ class _Bench:
 _opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the one target of this process
 
 
-def _keep_open(bench: _Bench, place: JudgedPlace) -> tuple[Attacker, ...]:
+def _keep_open(setup: _TargetSetup, place: JudgedPlace) -> tuple[Attacker, ...]:
     """Keep a place open for later chunks, and close the previous one."""
     _close()
-    return _opened.setdefault(bench.target.stream, bench.attackers(place))
+    return _opened.setdefault(setup.target.stream, setup.attackers(place))
 
 
 def _close() -> None:
@@ -346,7 +346,7 @@ def _close() -> None:
         _opened.popitem()[1][0].place.close()
 
 
-def _work_in_pool(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
+def _work_in_pool(job: tuple[_TargetSetup, Sequence[Task]]) -> list[tuple[int, RunResult]]:
     try:
         return _work(job)
     except SystemExit:  # the pool would pass it to the client and start the next chunk
@@ -354,16 +354,16 @@ def _work_in_pool(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResu
         os._exit(_TERMINATED)
 
 
-def _work(job: tuple[_Bench, Sequence[Task]]) -> list[tuple[int, RunResult]]:
-    bench, tasks = job
-    attackers = _opened.get(bench.target.stream) or _keep_open(bench, bench.target.open())
+def _work(job: tuple[_TargetSetup, Sequence[Task]]) -> list[tuple[int, RunResult]]:
+    setup, tasks = job
+    attackers = _opened.get(setup.target.stream) or _keep_open(setup, setup.target.open())
     results = []
     for index, fault in tasks:
         attacker = attackers[index % len(attackers)]
         if fault is not None:
             results.append((index, attacker.run(fault)))
         else:
-            plan, rng = bench.plan, bench.generator(index)
+            plan, rng = setup.plan, setup.generator(index)
             results.append((index, attacker.run_timed(plan.strategy(), rng, null=plan.null)))
     return results
 
@@ -405,17 +405,17 @@ class _AttackWorkers:
             self._pool.shutdown(cancel_futures=True)
         _give_up_processor()
 
-    def take(self, bench: _Bench, place: JudgedPlace) -> None:
+    def take(self, setup: _TargetSetup, place: JudgedPlace) -> None:
         """Keep a place for runs in this process, or close it if worker processes do the runs."""
         if self._pool is None:
-            _keep_open(bench, place)
+            _keep_open(setup, place)
         else:
             place.close()
             _give_up_processor()
 
-    def null(self, bench: _Bench) -> Run:
+    def null(self, setup: _TargetSetup) -> Run:
         """Return a function that runs tasks without their flips."""
-        without = replace(bench, plan=replace(bench.plan, null=True))
+        without = replace(setup, plan=replace(setup.plan, null=True))
 
         def run(tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
             faults = [(n, fault and replace(fault, corruption=None)) for n, fault in tasks]
@@ -423,7 +423,7 @@ class _AttackWorkers:
 
         return run
 
-    def run(self, bench: _Bench, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
+    def run(self, setup: _TargetSetup, tasks: Sequence[Task]) -> Iterator[tuple[int, RunResult]]:
         """Run the tasks; yield their results in order.
 
         Raises:
@@ -433,16 +433,16 @@ class _AttackWorkers:
         if self._pool is None:
             for task in tasks:
                 with one_processor():
-                    results = _work((bench, [task]))
+                    results = _work((setup, [task]))
                 yield from results
             return
         try:
-            pickle.dumps(bench)
+            pickle.dumps(setup)
         except Exception as error:  # the target may raise anything
             problem = f"cannot be sent to a worker process: {error}"
-            raise TargetError(bench.target.name, problem) from None
+            raise TargetError(setup.target.name, problem) from None
         size = max(1, min(_CHUNK, len(tasks) // (4 * self._jobs)))
-        jobs = [(bench, tasks[at : at + size]) for at in range(0, len(tasks), size)]
+        jobs = [(setup, tasks[at : at + size]) for at in range(0, len(tasks), size)]
         try:
             for results in self._pool.map(_work_in_pool, jobs):
                 yield from results
@@ -489,8 +489,9 @@ def replay_runs(
     """
     plan, repeated = read_plan(folder), False
     for target in _targets(plan, folder, kernels, program):
-        of_it = [e for e in read_runs(folder) if (e.get("kernel"),) == (target.stream or (None,))]
-        records = [entry for entry in of_it if entry["trigger"]]
+        name = (target.stream or (None,))[0]
+        entries = [entry for entry in read_runs(folder) if entry.get("kernel") == name]
+        records = [entry for entry in entries if entry["trigger"]]
         if not records:
             continue
         repeated = True
@@ -525,7 +526,7 @@ def _targets(
                 "trust it, repeat --program and its other options",
                 path=folder,
             )
-        known = {"stdin": None, "files": None, **program.known()}
+        known = {"stdin": None, "files": None, **program.settings()}
         if differs := [name for name, value in known.items() if plan.get(name) != value]:
             problem = f"holds runs of another program; it differs in {differs}"
             raise ConfigError(problem, path=folder)

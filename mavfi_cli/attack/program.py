@@ -38,7 +38,7 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.sampling import WindowTooLong
-from mavfi_cli.fi.tracer.spawn import Program, Watched, run_to_entry, spawn, watch
+from mavfi_cli.fi.tracer.spawn import ObservedRun, Program, run_to_entry, spawn, watch
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
 
 
@@ -70,7 +70,7 @@ def _require_attackable(path: Path) -> None:
 
 _SHORT = 100_000  # instructions that are stepped rather than counted
 _STEP_LIMIT_S = 1e-3  # for one stepped instruction, about forty times what it takes
-_WATCHING = 20.0  # largest slowdown of a run whose system calls are watched
+_WATCHING = 20.0  # largest slowdown of a run whose system calls are observed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ class ProgramTarget:
             entries["stdin"] = str(self.command.stdin)
         return entries
 
-    def known(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Return everything that determines the results."""
         entries = self.context() | {
             "comparison": self.comparison.to_json(),
@@ -146,7 +146,7 @@ class _Workplace:
         _require_attackable(Path(target.command.argv[0]))
         self.target, self.name, self.limits = target, target.name, target.limits
         self._golden: Golden | None = None
-        self._watched: Watched | None = None
+        self._observed: ObservedRun | None = None
         self._scratch = ScratchFolder("kernels")
         self.close, scratch = self._scratch.close, self._scratch.path
         self._stdout, self._stderr = scratch / "stdout", scratch / "stderr"
@@ -200,10 +200,10 @@ class _Workplace:
             UnknownName: no such object or function.
             TargetError: the function is never called, or the counts do not match a native run.
         """
-        if (watched := self._watch()).company:
+        if (observed := self._observe()).started:
             raise TargetError(
                 self.name,
-                f"{watched.company}, which the tracer does not follow: nothing there can be "
+                f"{observed.started}, which the tracer does not follow: nothing there can be "
                 "counted or hit; attack a program with one thread (--env OMP_NUM_THREADS=1 may "
                 "limit it to one)",
             )
@@ -255,7 +255,7 @@ class _Workplace:
             unlike = f"it is killed by {signal_name(ended.signal)}"
         else:
             again = replace(golden, output=_joined(self._parts()), exit_code=ended.exit_code or 0)
-            unlike = self.unlike(golden, again)
+            unlike = self.describe_difference(golden, again)
         if unlike:
             problem = f"behaves differently when {how}, so it cannot be profiled: {unlike}"
             raise TargetError(self.name, problem)
@@ -268,15 +268,15 @@ class _Workplace:
         golden_s = self.limits.golden_s if self._golden is None else self._golden.wall_s
         return _WATCHING * golden_s + self.limits.wall_grace_s
 
-    def _watch(self) -> Watched:
+    def _observe(self) -> ObservedRun:
         """Watch the program's system calls in one fault-free run."""
-        if self._watched is None:
+        if self._observed is None:
             tracee = self.start()
             try:
-                self._watched = watch(tracee, wall_s=min(self._watching_s, self.limits.golden_s))
+                self._observed = watch(tracee, wall_s=min(self._watching_s, self.limits.golden_s))
             finally:
                 tracee.kill()
-        return self._watched
+        return self._observed
 
     def fault_free(self) -> Golden:
         """Run once without a fault, timed from the entry point.
@@ -331,15 +331,15 @@ class _Workplace:
         how = f"ends with exit code {ended.exit_code} without a fault"
         if ended.signal is not None:
             how = f"is killed by {signal_name(ended.signal)} without a fault"
-        how, silent = how + self._last_words(), self._stdout.stat().st_size == 0
-        watched, limit_bytes = self._watch(), self._command.memory_bytes
-        if watched.lacked_memory and limit_bytes is not None:
+        how, silent = how + self._last_error(), self._stdout.stat().st_size == 0
+        observed, limit_bytes = self._observe(), self._command.memory_bytes
+        if observed.lacked_memory and limit_bytes is not None:
             return f"{how}: it needs more than {limit_bytes / (1 << 30):g} GB; --memory allows more"
-        if watched.terminal and silent:
+        if observed.terminal and silent:
             return f"{how}: it may need input (--stdin), or a terminal, which campaigns lack"
         return how if ended.signal is not None else ""
 
-    def _last_words(self) -> str:
+    def _last_error(self) -> str:
         lines = self._stderr.read_text(errors="replace").strip().splitlines()
         return f" ({lines[-1][:200]})" if lines else ""
 
@@ -347,9 +347,9 @@ class _Workplace:
         if exit_code:
             yield (
                 f"{self.name} ends with exit code {exit_code} without a fault"
-                f"{self._last_words()}; a run that ends in the same way is benign"
+                f"{self._last_error()}; a run that ends in the same way is benign"
             )
-        written = [Path(path) for path in self._watch().written]
+        written = [Path(path) for path in self._observe().written]
         outside = [path for path in written if not path.is_relative_to(self._folder.tree)]
         if outside:
             yield (
@@ -368,7 +368,7 @@ class _Workplace:
                 f"changes nothing else is benign; --compare file:{ignored[0]} compares it"
             )
 
-    def unlike(self, golden: Golden, again: Golden) -> str:
+    def describe_difference(self, golden: Golden, again: Golden) -> str:
         """Describe how two fault-free runs differ; empty if they are equal."""
         if again.exit_code != golden.exit_code:
             return f"their exit codes are {golden.exit_code} and {again.exit_code}"

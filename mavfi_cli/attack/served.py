@@ -105,10 +105,10 @@ class ServedProcess:
             send(self.connection, message)
             answer: tuple[Any, int] = receive(self.connection)
         except (OSError, EOFError):
-            raise TargetError(name, f"does not start: {self.last_words()}") from None
+            raise TargetError(name, f"does not start: {self.last_error()}") from None
         return answer
 
-    def last_words(self) -> str:
+    def last_error(self) -> str:
         """The last line that the program wrote to its standard error."""
         lines = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "its process ended"

@@ -82,7 +82,7 @@ class JudgedPlace(AttackPlace, Protocol):
             TargetError: the run fails.
         """
 
-    def unlike(self, golden: Golden, again: Golden) -> str:
+    def describe_difference(self, golden: Golden, again: Golden) -> str:
         """Describe how two fault-free runs differ; empty if they are equal."""
 
     def judge(self, golden: Golden, ended: Ended | None) -> RunVerdict:
@@ -106,7 +106,7 @@ class AttackTarget(Protocol):
     def stream(self) -> tuple[str, ...]:
         """Name of its random stream; empty if it is the only target of a campaign."""
 
-    def known(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Return what determines its results; the same for all targets of a campaign."""
 
     def open(self) -> JudgedPlace:

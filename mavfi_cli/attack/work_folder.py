@@ -177,9 +177,11 @@ class _Copier:
             self._require_room()
             shutil.copy2(source, target)
         elif not stat.S_ISDIR(about.st_mode):
-            raise TargetError(self._name, f"gets no copy of {source}: it is not a file or folder")
+            raise TargetError(
+                self._name, f"{source} cannot be copied: it is neither a file nor a folder"
+            )
         elif real in above or len(above) > _DEEPEST:
-            raise TargetError(self._name, f"gets no copy of {source}: it is a cycle or too deep")
+            raise TargetError(self._name, f"{source} cannot be copied: it is a cycle or too deep")
         else:
             self._require_room()
             target.mkdir(exist_ok=True)

@@ -327,7 +327,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
         mission_strategy(config.instruction)
         config.instruction.node()
     if config.detector is not None:
-        config.detector.built(config.stack)
+        config.detector.build(config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector requires a detector")
     if start:

@@ -311,7 +311,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
         refuse_given({"node_restart_s"}, _DYING)
     mission.loaded_stack()
     if mission.detector is not None:
-        mission.detector.built(mission.stack)
+        mission.detector.build(mission.stack)
     elif fault is not None and fault.attacks_detector:
         raise click.UsageError(f"--inject {fault.target} needs --detector NAME")
     return mission

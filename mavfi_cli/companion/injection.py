@@ -12,7 +12,7 @@ from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.files import write_json
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
-from mavfi_cli.fi.bits import told_apart
+from mavfi_cli.fi.bits import format_distinct
 from mavfi_cli.fi.injector import (
     Injector,
     Listener,
@@ -75,7 +75,7 @@ class _Killer(Injector):
 
     def strike(self, moment: Moment) -> None:
         if self._due(moment):
-            self._tell(moment, moment.tick, ())
+            self._record(moment, moment.tick, ())
 
 
 class SourceInjection(NoInjection):
@@ -208,7 +208,7 @@ def _strike_text(strike: Strike) -> str:
     if not strike.changes:
         return "fault: the process is killed"
     changes = [
-        f"{c.state}: {' -> '.join(told_apart(c.before, c.after))} "
+        f"{c.state}: {' -> '.join(format_distinct(c.before, c.after))} "
         f"(bit{'s' if len(c.bits) != 1 else ''} {', '.join(map(str, c.bits)) or 'none'})"
         for c in strike.changes
     ]

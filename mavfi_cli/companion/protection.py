@@ -140,7 +140,7 @@ class Protection(NoProtection):
     def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
         self._config = config
         self._wall = wall
-        detector = config.built(stack)
+        detector = config.build(stack)
         stages = frozenset(Stage(name) for name in config.protect)
         self.gate: Gate = Gate(detector, stages, extended=config.extended_ranges(detector))
         self._threshold = detector.threshold
@@ -294,13 +294,13 @@ class Protection(NoProtection):
     @staticmethod
     def is_compiled(config: DetectorConfig, stack: str) -> bool:
         """Return True if the kernels are compiled. Otherwise `warm_up` takes many seconds."""
-        judge = getattr(config.built(stack), "tick_judge", None)
+        judge = getattr(config.build(stack), "tick_judge", None)
         return in_cache(judge or take_tick)
 
     @staticmethod
     def warm_up(config: DetectorConfig, stack: str) -> None:
         """Load and compile everything that a gate runs. Raises as `DetectorConfig.built`."""
-        gate = Gate(config.built(stack))
+        gate = Gate(config.build(stack))
         report = CollisionReport(
             stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
         )

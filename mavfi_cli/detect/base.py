@@ -191,7 +191,7 @@ class Model:
 
 def _require_finite(name: str, array: FloatArray, path: Path) -> None:
     if not np.isfinite(array).all():
-        raise ModelError(f"array {name!r} must be finite", path=path)
+        raise ModelError(f"array {name!r} must be finite, got NaN or infinity", path=path)
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:

@@ -105,7 +105,7 @@ class PreprocessParams:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if not -1022 <= value <= 1023:
-                raise ConfigError(f"must be from -1022 to 1023, got {value}", key=name)
+                raise ConfigError(f"must be between -1022 and 1023, got {value}", key=name)
         floor, ceiling = self.time_to_collision_floor, self.time_to_collision_ceiling
         if ceiling <= floor:
             problem = f"must be above the floor {floor}, got {ceiling}"

@@ -149,7 +149,7 @@ def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
 NUMPY_TYPES = {kind.name: kind for kind in (FLOAT64, FLOAT32, INT16, INT32, INT64, BOOL)}
 
 
-def told_apart(*values: object) -> list[str]:
+def format_distinct(*values: object) -> list[str]:
     """Format values with six digits, or with all digits if they would look equal."""
     short = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
     return short if len(set(short)) == len(short) else [repr(value) for value in values]

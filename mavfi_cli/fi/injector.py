@@ -43,7 +43,7 @@ _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Comman
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """The mission's current state, which triggers are compared with."""
+    """The state of the mission at one moment, with which triggers are compared."""
 
     stamp_s: float
     flight_s: float  # since the companion took over
@@ -167,7 +167,7 @@ class Injector(NoInjector):
         super().__init__()
         self.drawn_time_s = float(rng.uniform(0.0, shortest_flight_s))
         self._trigger, self._corruption = trigger, corruption
-        self._came = False  # the trigger has occurred, even if there was nothing to strike
+        self._triggered = False  # the trigger has occurred, even if there was nothing to strike
         self._begun_s: float | None = None
         self._last_s = -math.inf
         self._listener = listener
@@ -179,11 +179,11 @@ class Injector(NoInjector):
 
         A phase may begin and end before the next message with the attacked state.
         """
-        self._came = self._came or self._comes(moment)
+        self._triggered = self._triggered or self._is_triggered(moment)
 
     @property
     def missed(self) -> str:
-        """The reason if the fault never struck."""
+        """Why the fault never struck."""
         never, since = {
             When.PHASE: (
                 f"the pilot was never in phase {self._trigger.phase}",
@@ -191,7 +191,7 @@ class Injector(NoInjector):
             ),
             When.FORESEEN: ("no collision was ever foreseen", "a collision was first foreseen"),
         }.get(self._trigger.when, ("the mission ended before the trigger", "the trigger"))
-        return f"no {self._awaits} came after {since}" if self._came else never
+        return f"no {self._awaits} came after {since}" if self._triggered else never
 
     def _due(self, moment: Moment, invocations: int = 0) -> bool:
         """True if the fault strikes now; `invocations` counts the kernel's outputs so far."""
@@ -201,7 +201,7 @@ class Injector(NoInjector):
             if self._trigger.when is When.INVOCATION:
                 return invocations >= self._trigger.number
             lasts = self._trigger.when in (When.PHASE, When.FORESEEN)
-            return self._came if lasts else self._comes(moment)
+            return self._triggered if lasts else self._is_triggered(moment)
         if corruption.persistence is Persistence.TRANSIENT:
             return False
         if moment.stamp_s - self._begun_s >= corruption.duration_s:
@@ -210,7 +210,7 @@ class Injector(NoInjector):
             return moment.stamp_s - self._last_s >= corruption.period_s - 1e-9
         return True
 
-    def _comes(self, moment: Moment) -> bool:
+    def _is_triggered(self, moment: Moment) -> bool:
         """True if the trigger has occurred; invocations are counted with the messages instead."""
         trigger = self._trigger
         return {
@@ -222,7 +222,7 @@ class Injector(NoInjector):
             When.RANDOM: moment.flight_s >= self.drawn_time_s,
         }[trigger.when]
 
-    def _tell(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> Strike:
+    def _record(self, moment: Moment, invocation: int, changes: Sequence[Change]) -> Strike:
         self._begun_s = moment.stamp_s if self._begun_s is None else self._begun_s
         self._last_s = moment.stamp_s
         strike = Strike(
@@ -240,7 +240,7 @@ class Injector(NoInjector):
 
 
 class SourceInjector(Injector):
-    """Carries one fault in messages, or in the active plan, through one mission."""
+    """Injects one fault into the messages, or into the active plan, of one mission."""
 
     def __init__(
         self, fault: SourceFault, *, seed: int, shortest_flight_s: float, listener: Listener
@@ -299,7 +299,7 @@ class SourceInjector(Injector):
             changes.append(change)
         # An unchanged message remains the same object: its readers may read an earlier strike.
         struck: Any = changed if any(change.bits for change in changes) else message
-        self.follower.struck(struck, self._tell(moment, self._invocations, changes))
+        self.follower.struck(struck, self._record(moment, self._invocations, changes))
         result: M = struck
         return result
 
@@ -331,9 +331,9 @@ Memory = Mapping[str, NDArray[Any]]
 
 
 class MemoryInjector(Injector):
-    """Carries one fault in a memory, an element of one of several arrays, through one mission.
+    """Injects one fault into a memory during one mission: into one element of one array.
 
-    It attacks a detector's memory (thresholds, means, weights), which can be hit too.
+    It attacks the memory of a detector: its thresholds, means and weights.
 
     Args:
         array: the attacked array; None draws one with a probability in proportion to its bits.
@@ -389,7 +389,7 @@ class MemoryInjector(Injector):
         before = place.flat[self.element].item()
         change = _change_of(self.array, self.element, before, self._kind, self._pattern)
         place.flat[self.element] = change.after
-        self._tell(moment, moment.tick, [change])
+        self._record(moment, moment.tick, [change])
 
 
 class Activation(Enum):

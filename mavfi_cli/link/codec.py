@@ -83,7 +83,7 @@ class Signing:
         self._next_timestamp = max(self._next_timestamp, timestamp)
         return True
 
-    def vouches(self, data: bytes) -> bool:
+    def authenticates(self, data: bytes) -> bool:
         """Return True if data begins with a signed frame that is authentic and not a replay.
 
         The frame is not remembered, so `accept` takes it afterwards.

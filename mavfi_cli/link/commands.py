@@ -70,7 +70,9 @@ class Commands:
         self._telemetry = telemetry
         self.now_s = 0.0
         self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
-        self._asked: dict[int, tuple[Ticket, float]] = {}  # message id -> request, next one's time
+        self._requested: dict[
+            int, tuple[Ticket, float]
+        ] = {}  # message id -> request, next one's time
         self.begin()
 
     def submit(
@@ -181,7 +183,7 @@ class Commands:
             self.refuse(name, ticket.result)
         return False
 
-    def mode(self, mode: str) -> bool:
+    def request_mode(self, mode: str) -> bool:
         """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
 
         Raises CommandRefused if it did not change after the maximum number of requests.
@@ -203,26 +205,26 @@ class Commands:
                 enabled,
                 *self._telemetry.autopilot.mode_parameters(mode),
             )
-        self.look_at_heartbeat()
+        self.request_heartbeat()
         return False
 
-    def look_at_heartbeat(self) -> None:
+    def request_heartbeat(self) -> None:
         """Request a HEARTBEAT now instead of waiting up to a second for the next."""
-        self._ask_for(dialect.MAVLINK_MSG_ID_HEARTBEAT, _LOOK_INTERVAL_S)
+        self._request_message(dialect.MAVLINK_MSG_ID_HEARTBEAT, _LOOK_INTERVAL_S)
 
-    def home(self) -> None:
+    def request_home(self) -> None:
         """Request HOME_POSITION once a second."""
-        self._ask_for(dialect.MAVLINK_MSG_ID_HOME_POSITION, _HOME_INTERVAL_S)
+        self._request_message(dialect.MAVLINK_MSG_ID_HOME_POSITION, _HOME_INTERVAL_S)
 
-    def _ask_for(self, message_id: int, interval_s: float) -> None:
-        if message_id in self._asked:
-            ticket, next_s = self._asked[message_id]
+    def _request_message(self, message_id: int, interval_s: float) -> None:
+        if message_id in self._requested:
+            ticket, next_s = self._requested[message_id]
             if ticket.pending or self.now_s < next_s:
                 return
         ticket = self.submit(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
-        self._asked[message_id] = ticket, self.now_s + interval_s
+        self._requested[message_id] = ticket, self.now_s + interval_s
 
-    def streams(self, state_rate_hz: float) -> None:
+    def request_streams(self, state_rate_hz: float) -> None:
         """Request the message streams of a flight: the state at this rate, the others slower."""
         state_us = 1e6 / state_rate_hz
         for message_id, interval_us in (

@@ -143,7 +143,7 @@ def parse_endpoint(url: str) -> Endpoint:
         raise malformed
     port = number(match["port"], 65_535)
     if port == 0 and scheme not in LISTENING:
-        raise LinkError(f"{url}: port 0 cannot be called")
+        raise LinkError(f"{url}: the port must be at least 1, got 0")
     return Endpoint(url=url, scheme=scheme, host=host or _LOOPBACK, port=port)
 
 
@@ -158,8 +158,8 @@ class SenderSlot(Generic[Sender]):
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.holder: Sender | None = None  # the current sender
-        # A sender that spoke while the place was taken, and whom the holder has outlived: not an
-        # autopilot that restarts at another port.
+        # A sender that sent while the place was taken, before the holder sent again. It is not the
+        # holder after a restart at another port.
         self.rival: Sender | None = None
         self._challenger: Sender | None = None
         self._silent_from_s = 0.0  # the holder has been silent for too long
@@ -172,15 +172,15 @@ class SenderSlot(Generic[Sender]):
     def take(self, sender: Sender) -> None:
         """Give the place to a sender."""
         self.holder, self._challenger = sender, None
-        self.hears(sender)
+        self.refresh(sender)
 
     def leave(self, sender: Sender) -> None:
         """Free the place if a sender holds it."""
         if sender == self.holder:
             self.holder = None
 
-    def hears(self, sender: Sender) -> bool:
-        """Note that a sender has spoken. Return True if it holds the place."""
+    def refresh(self, sender: Sender) -> bool:
+        """Record that a sender has sent. Return True if it holds the place."""
         if sender != self.holder:
             return False
         if self._challenger is not None:

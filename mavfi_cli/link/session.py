@@ -26,7 +26,7 @@ _NO_ACCELERATION = 0x01C0
 _NO_YAW = 0x0400
 _LARGEST_FLOAT32 = 3.4028234663852886e38
 
-_HEARD = (
+_HANDLED = (
     dialect.MAVLINK_MSG_ID_TIMESYNC,
     dialect.MAVLINK_MSG_ID_PING,
     dialect.MAVLINK_MSG_ID_COMMAND_ACK,
@@ -193,7 +193,7 @@ class OffboardSession:
         """Handle a message of the autopilot or its camera. Other senders are ignored."""
         telemetry, number = self.telemetry, type(message).id
         telemetry.handle(message)
-        if number not in _HEARD:
+        if number not in _HANDLED:
             return
         of_camera = telemetry.is_from(message, CAMERA)
         if not (of_camera or telemetry.is_from(message, AUTOPILOT)):
@@ -210,11 +210,11 @@ class OffboardSession:
             if number == dialect.MAVLINK_MSG_ID_COMMAND_ACK:
                 self._commands.acknowledge(message)
             if of_camera:
-                self._hear_camera(number, message)
+                self._handle_camera(number, message)
         if reply is not None and len(self._answers) < _MAX_ANSWERS:
             self._answers.append(reply)
 
-    def _hear_camera(self, number: int, message: Message) -> None:
+    def _handle_camera(self, number: int, message: Message) -> None:
         """Handle a message of the camera, which runs the referee of a foreign autopilot."""
         if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET:
             if self.phase is Phase.CONNECTING:  # a later origin would displace a flying vehicle
@@ -226,9 +226,9 @@ class OffboardSession:
             is_new = number == dialect.MAVLINK_MSG_ID_HEARTBEAT and not self._camera_heard
             self._camera_heard = True
             if is_new and not self._settings.needs_camera:
-                self._ask_camera()
+                self._request_origin()
 
-    def _ask_camera(self) -> None:
+    def _request_origin(self) -> None:
         """Request the origin, or the camera's information if positions are the world's."""
         wanted = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
         if self._settings.needs_camera:
@@ -294,9 +294,9 @@ class OffboardSession:
         if not self._greeted:
             self._greeted, self._phase_since_s = True, self._now_s
             if self._settings.request_streams:
-                self._commands.streams(self._settings.state_rate_hz)
+                self._commands.request_streams(self._settings.state_rate_hz)
             if self._settings.needs_camera:
-                self._ask_camera()
+                self._request_origin()
         if self._position_known():
             self._enter(Phase.WAITING_READY)
 
@@ -329,10 +329,10 @@ class OffboardSession:
             return
         autopilot = telemetry.autopilot
         in_mode = telemetry.mode in autopilot.arming_modes
-        if not in_mode and not commands.mode(autopilot.arming_modes[0]):
+        if not in_mode and not commands.request_mode(autopilot.arming_modes[0]):
             return
         if autopilot.takeoff_amsl and telemetry.home_amsl_m is None:
-            commands.home()
+            commands.request_home()
         elif in_mode and telemetry.ready and telemetry.state is not None:
             self._ground_m = float(telemetry.state.position_enu_m[2])
             if self._settings.needs_camera:  # the home position may be from an earlier flight
@@ -360,7 +360,7 @@ class OffboardSession:
         if self.telemetry.armed:
             self._enter(Phase.TAKING_OFF)
         elif self._commands.insist("arming", dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0):
-            self._commands.look_at_heartbeat()
+            self._commands.request_heartbeat()
             if self._elapsed_s() >= self._settings.arm_timeout_s:
                 self._commands.refuse("arming", "accepted, but the vehicle did not arm")
 
@@ -370,7 +370,7 @@ class OffboardSession:
             commands.refuse("take-off", "disarmed before the height was reached")
         self._was_up = self._was_up or self._climbed()
         if self._was_up:
-            if commands.mode(telemetry.autopilot.offboard_mode):
+            if commands.request_mode(telemetry.autopilot.offboard_mode):
                 self._enter(Phase.OFFBOARD)
             return
         if not (commands.commanded and telemetry.in_air):
@@ -412,12 +412,12 @@ class OffboardSession:
         if telemetry.mode != telemetry.autopilot.land_mode:
             unused = telemetry.autopilot.unused
             commands.insist("landing", dialect.MAV_CMD_NAV_LAND, unused=unused)
-            commands.look_at_heartbeat()
+            commands.request_heartbeat()
         elif telemetry.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND:
             self._disarm_late()
         timeout_s = self._settings.land_timeout_s
         if self._elapsed_s() >= timeout_s:
-            commands.refuse("landing", f"not down and disarmed within {timeout_s:g} s")
+            commands.refuse("landing", f"not landed and disarmed within {timeout_s:g} s")
 
     def _disarm_late(self) -> None:
         if self._down_since_s is None:

@@ -399,7 +399,7 @@ class _Udp(_SocketOwner, Transport):
         return b""
 
     def _is_peer(self, data: bytes, sender: Any, admits: Callable[[bytes], bool]) -> bool:
-        if self._slot.hears(sender):
+        if self._slot.refresh(sender):
             return True
         if not admits(data):
             return False

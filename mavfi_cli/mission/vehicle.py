@@ -277,7 +277,9 @@ def other_end(
     """
     if config.link is not None and not config.eyes:
         signing = signing_from_file(config.key_file)
-        signed: Any = {"signed": True, "admits": signing.vouches} if signing is not None else {}
+        signed: Any = (
+            {"signed": True, "admits": signing.authenticates} if signing is not None else {}
+        )
         with contextlib.closing(open_transport(config.link, **signed)) as link:
             yield link, None
         return

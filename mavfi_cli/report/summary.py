@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.fi.bits import told_apart
+from mavfi_cli.fi.bits import format_distinct
 from mavfi_cli.fi.tracer.image import short_name
 from mavfi_cli.mission.measures import DetectionCost, FlightRecord, record_of
 from mavfi_cli.mission.run_folder import Run
@@ -294,7 +294,7 @@ def _formatted(change: dict[str, Any], when: str) -> str:
             pattern, f"nan {pattern}"
         )
     other = change["after" if when == "before" else "before"]
-    return told_apart(value, *([] if other is None else [other]))[0]
+    return format_distinct(value, *([] if other is None else [other]))[0]
 
 
 def difference_lines(run: Run, golden: Run) -> list[str]:
@@ -308,7 +308,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     sides = ["inf or nan" if v is None else v for v in (parting.this, parting.other)]
     lines = [
         f"Effect      first at {parting.stamp_s:.2f} s in {parting.column}: "
-        f"{' instead of '.join(told_apart(*sides))}",
+        f"{' instead of '.join(format_distinct(*sides))}",
         f"            at most {run.largest_deviation_m(golden):.2f} m from the golden vehicle",
     ]
     our_s, their_s = (record.quality_of_flight["flight_time_s"] for record in (ours, theirs))

@@ -285,9 +285,9 @@ def _treatment(flight: FlightRecord) -> list[str]:
 def _struck(fault: Mapping[str, Any]) -> str:
     """Return the fault in words, with the state or the node that was drawn."""
     if fault["level"] == "instruction":
-        return InstructionConfig(**fault["request"]).words(fault["node"])
+        return InstructionConfig(**fault["request"]).describe(fault["node"])
     states = fault["states"]
-    return FaultConfig(**fault["request"]).words(states[0] if len(states) == 1 else None)
+    return FaultConfig(**fault["request"]).describe(states[0] if len(states) == 1 else None)
 
 
 # Flights of one mission: golden, with a fault, protected ---------------------------------------

@@ -80,7 +80,7 @@ class DetectorConfig:
         """Return the model file; None if the detector has no model.
 
         It is the configured file, or else the one shipped for the stack or for its nearest base
-        stack. `built` rejects the model of a base stack without `any_stack`.
+        stack. `build` rejects the model of a base stack without `any_stack`.
 
         Args:
             stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
@@ -101,7 +101,7 @@ class DetectorConfig:
         path = self.model_path(stack)
         return "none" if path is None else file_digest(path)
 
-    def built(self, stack: str) -> Detector:
+    def build(self, stack: str) -> Detector:
         """Create a new detector for a mission with the given stack.
 
         Args:

@@ -77,7 +77,7 @@ class FaultConfig:
         """Array of the detector's memory to corrupt; None to draw one."""
         return self.target.partition(".")[2] or None
 
-    def words(self, struck: str | None = None) -> str:
+    def describe(self, struck: str | None = None) -> str:
         """Describe the fault for a title, such as "an exponent bit of waypoint x, stuck-at".
 
         Args:
@@ -255,7 +255,7 @@ class InstructionConfig:
     def __post_init__(self) -> None:
         _check_seed(self.seed)
 
-    def words(self, struck: str | None = None) -> str:
+    def describe(self, struck: str | None = None) -> str:
         """Describe the fault for a title, such as "a bit in an instruction of octomap".
 
         Args:

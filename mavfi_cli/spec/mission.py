@@ -146,9 +146,11 @@ class MissionConfig:
         for name in ("start", "goal", "origin"):
             place = getattr(self, name) or ()
             if not all(map(math.isfinite, place)):
-                raise ConfigError("must be three finite numbers", key=name)
+                raise ConfigError(f"must be three finite numbers, got {place}", key=name)
             if not all(abs(coordinate) <= _REMOTE_M for coordinate in place):
-                raise ConfigError(f"must be within {_REMOTE_M:g} m of the origin", key=name)
+                raise ConfigError(
+                    f"must be within {_REMOTE_M:g} m of the origin, got {place}", key=name
+                )
         if self.fault is not None and self.instruction is not None:
             raise ConfigError(
                 "cannot be combined with a fault in a state: a mission takes one fault",

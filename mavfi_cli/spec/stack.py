@@ -134,7 +134,9 @@ class Stack:
         seen: set[str] = set()
         for nodes in self.processes:
             if len(nodes) < 2:
-                raise ValueError("processes: a shared process must have at least two nodes")
+                raise ValueError(
+                    f"processes: a shared process must have at least two nodes, got {list(nodes)}"
+                )
             for node in nodes:
                 if node not in KERNELS:
                     raise ValueError(f"processes: no node {node!r}; known: {', '.join(KERNELS)}")

@@ -147,7 +147,7 @@ class EvaluationPlan:
             ModelError: a model cannot be used; the message names the training flight.
         """
         for detector in map(self.detector_config, self.protectors):
-            detector.built(self.base.stack)
+            detector.build(self.base.stack)
             path = detector.model_path(self.base.stack)
             for flight in () if path is None else Model.read(path).training_flights:
                 seed = flight.rpartition("/")[2]
@@ -166,7 +166,7 @@ class EvaluationPlan:
         return EvaluatedPlan(
             detectors={
                 config.name: {
-                    "threshold": config.built(stack).threshold,
+                    "threshold": config.build(stack).threshold,
                     "model_sha256": config.model_digest(stack),
                 }
                 for config in configs

@@ -185,7 +185,7 @@ class DetectorContract:
 
     def test_a_mission_takes_the_model_of_its_stack_or_needs_none(self, name: str) -> None:
         for stack in ("mavbench", "hardened"):
-            detector = DetectorConfig(name=name).built(stack)
+            detector = DetectorConfig(name=name).build(stack)
             if isinstance(detector, FittedDetector):
                 assert detector.stack is not None
                 assert detector.stack.name == stack
@@ -194,22 +194,22 @@ class DetectorContract:
         self, name: str
     ) -> None:
         config = DetectorConfig(name=name, any_stack=True)
-        assert config.built("mavbench-release").name == name
+        assert config.build("mavbench-release").name == name
         if isinstance(base.find_detector(name), FittedDetector):
             with pytest.raises(ModelError, match="mavfi train --stack mavbench-release"):
-                DetectorConfig(name=name).built("mavbench-release")
+                DetectorConfig(name=name).build("mavbench-release")
         else:
-            assert DetectorConfig(name=name).built("mavbench-release").name == name
+            assert DetectorConfig(name=name).build("mavbench-release").name == name
 
     def test_extended_states_need_the_ranges_of_a_model(self, name: str) -> None:
         config = DetectorConfig(name=name, watch="extended")
         if isinstance(base.find_detector(name), FittedDetector):
-            assert config.built("mavbench").name == name
+            assert config.build("mavbench").name == name
         else:
             with pytest.raises(
                 ConfigError, match=f"needs the ranges of a model, and {name} has none"
             ):
-                config.built("mavbench")
+                config.build("mavbench")
 
 
 # Planners -----------------------------------------------------------------------------------------

@@ -98,10 +98,12 @@ class Camera:
             limits = f"above 0 and at most {MAX_RATE_HZ:g} Hz"
             raise ConfigError(f"camera rate must be {limits}, got {rate_hz:g}")
         if not (1 <= columns <= _MAX_SIDE_PX and 1 <= rows <= _MAX_SIDE_PX):
-            limits = f"1x1 to {_MAX_SIDE_PX}x{_MAX_SIDE_PX} pixels"
+            limits = f"between 1x1 and {_MAX_SIDE_PX}x{_MAX_SIDE_PX} pixels"
             raise ConfigError(f"camera size must be {limits}, got {columns}x{rows}")
         if not 0.01 <= hfov_rad <= 3.1:
-            raise ConfigError(f"camera field of view must be 0.01 to 3.1 rad, got {hfov_rad:g}")
+            raise ConfigError(
+                f"camera field of view must be between 0.01 and 3.1 rad, got {hfov_rad:g}"
+            )
         self.mount_offset_flu_m = np.array(mount_offset_flu_m, dtype=np.float64)
         self._columns, self._rows, self._hfov_rad = columns, rows, hfov_rad
         self.system = system

@@ -64,8 +64,8 @@ class _Linked(Peer):
             self._station.receive(message, self)
         return messages
 
-    def forward(self, *, frame: bytes, of: Peer) -> bool:
-        return self.awaits_frames and super().forward(frame=frame, of=of)
+    def forward(self, *, frame: bytes, sender: Peer) -> bool:
+        return self.awaits_frames and super().forward(frame=frame, sender=sender)
 
     def close(self) -> None:
         super().close()
@@ -301,13 +301,13 @@ class Station:
         """Handle a message of a peer, and pass it on."""
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
-            self.peers.send_in_turn(partial(_Linked.forward, frame=frame, of=source))
+            self.peers.send_in_turn(partial(_Linked.forward, frame=frame, sender=source))
 
     def _is_of_holder(self, message: Any, source: _Linked) -> bool:
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return True
         slot = source.slots.setdefault(message.get_srcSystem(), SenderSlot(self._clock))
-        if slot.hears(source):
+        if slot.refresh(source):
             if slot.rival is not None:
                 addresses = f"{source.transport.address} and {slot.rival.transport.address}"
                 slot.rival = None

@@ -243,7 +243,9 @@ class FirmwareProcess:
                 )  # fmt: skip
         except OSError as error:
             self._scratch.close()
-            raise VehicleProcessError(f"{binary} is not a firmware: {error.strerror}") from None
+            raise VehicleProcessError(
+                f"cannot run the firmware {binary}: {error.strerror}"
+            ) from None
 
     @staticmethod
     def program(path: Path) -> Path:

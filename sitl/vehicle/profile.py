@@ -259,10 +259,11 @@ def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 def _check_number(key: str, value: float) -> None:
     if value and not 1.0 / _LARGEST <= abs(value) <= _LARGEST:  # else sums and quotients overflow
-        raise ConfigError(f"no quadrotor has {value:g}", key=key)
+        limits = f"{1.0 / _LARGEST:g} and {_LARGEST:g} in size"
+        raise ConfigError(f"must be between {limits}, got {value:g}", key=key)
     may_be_zero = key in _MAY_BE_ZERO
     if not key.startswith(_ANY_SIGN) and (value < 0.0 or (value == 0.0 and not may_be_zero)):
-        limit = "must not be negative" if may_be_zero else "must be above zero"
+        limit = "must be at least 0" if may_be_zero else "must be above 0"
         raise ConfigError(f"{limit}, got {value:g}", key=key)
 
 
@@ -289,7 +290,7 @@ class _StandIn:
         for key in ("mass_kg", "rotor_pull_n", "hover_power_w", "battery_wh", "acceleration_mps2"):
             value = getattr(self, key)
             if value is not None and value <= 0.0:
-                raise ValueError(f"{key}: must be above zero, got {value:g}")
+                raise ValueError(f"{key}: must be above 0, got {value:g}")
 
     def profile(self, base: VehicleProfile) -> VehicleProfile:
         """Return the scaled quadrotor.

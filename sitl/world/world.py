@@ -97,7 +97,9 @@ class World:
             raise WorldError(f"world {self.name!r}: a box has a coordinate that is not finite")
         flat = (self.boxes_enu_m[:, 3:] <= self.boxes_enu_m[:, :3]).any(axis=1)
         if flat.any():
-            raise WorldError(f"world {self.name!r}: box {int(flat.argmax())} has max <= min")
+            raise WorldError(
+                f"world {self.name!r}: box {int(flat.argmax())} must have max above min"
+            )
         for what, place in (("start", self.start_enu_m), ("goal", self.goal_enu_m)):
             _refuse_bad_place(self.name, self.boxes_enu_m, self.bounds_enu_m, what, place)
 
@@ -178,7 +180,7 @@ def load_world(
         ConfigError: The file cannot be used. Names file, line and key.
     """
     if seed < 0:
-        raise WorldError(f"seed must not be negative, got {seed}")
+        raise WorldError(f"seed must be at least 0, got {seed}")
     start, goal = _place("start", start_enu_m), _place("goal", goal_enu_m)
     pair = _GENERATED.get(name_or_path) or _pair_of_spec(name_or_path)
     if pair is not None:
@@ -213,7 +215,7 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
         return None
     array = np.asarray(place, dtype=np.float64)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise PlaceError(f"{what} must be three finite numbers (east, north, up in m)")
+        raise PlaceError(f"{what} must be three finite numbers (east, north, up in m), got {place}")
     return array
 
 
@@ -230,7 +232,7 @@ class _Pair:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.density <= 1.0:
-            raise WorldError(f"density must be 0 to 1, got {self.density:g}")
+            raise WorldError(f"density must be between 0 and 1, got {self.density:g}")
         if not 0.0 < self.size_m <= _CELL_M:
             limits = f"above 0 and at most {_CELL_M:g} m"
             raise WorldError(f"size must be {limits}, got {self.size_m:g}")
@@ -307,7 +309,9 @@ class _Box:
 
     def __post_init__(self) -> None:
         if any(high <= low for low, high in zip(self.min_enu_m, self.max_enu_m, strict=True)):
-            raise ValueError("max_enu_m must be beyond min_enu_m along each axis")
+            raise ValueError(
+                f"max_enu_m must be above min_enu_m {self.min_enu_m}, got {self.max_enu_m}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -333,7 +337,9 @@ def _world_of_scene(
     boxes = np.array([[*b.min_enu_m, *b.max_enu_m] for b in scene.box]).reshape(-1, 6)
     bounds = np.array(scene.bounds_enu_m, dtype=np.float64)
     if (bounds[3:] <= bounds[:3]).any():
-        raise WorldError(f"world {name!r}: bounds_enu_m has max <= min")
+        raise WorldError(
+            f"world {name!r}: bounds_enu_m must have max above min, got {bounds.tolist()}"
+        )
     start = _place("start", scene.start_enu_m) if start is None else start
     goal = _place("goal", scene.goal_enu_m) if goal is None else goal
     if start is None or goal is None:

@@ -20,7 +20,7 @@ class OwnTarget:
     name = "own"
     stream = ()
 
-    def known(self):
+    def settings(self):
         return {"program": str(self.program)}
 
     def open(self):
@@ -57,7 +57,7 @@ class OwnPlace:
         ended = run_out(self.start())
         return Golden(output=self._left(), exit_code=ended.exit_code, cpu_s=0.01, wall_s=0.01)
 
-    def unlike(self, golden, again):
+    def describe_difference(self, golden, again):
         return "" if golden.output == again.output else "their outputs differ"
 
     def judge(self, golden, ended):

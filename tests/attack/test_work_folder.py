@@ -192,9 +192,9 @@ def test_what_cannot_be_copied_is_refused(made, home, monkeypatch, name):
     else:
         path.symlink_to({"up": "..", "zero": "/dev/zero", "gone": "/gone/away"}[name])
     expected = {
-        "up": f"gets no copy of {path}/data: it is a cycle or too deep",
-        "zero": f"gets no copy of {path}: it is not a file or folder",
-        "pipe": f"gets no copy of {path}: it is not a file or folder",
+        "up": f"{path}/data cannot be copied: it is a cycle or too deep",
+        "zero": f"{path} cannot be copied: it is neither a file nor a folder",
+        "pipe": f"{path} cannot be copied: it is neither a file nor a folder",
         "gone": f"its files cannot be copied: .*'{path}'",
     }
     with pytest.raises(TargetError, match=expected.get(name, "name large inputs by absolute")):

@@ -377,7 +377,7 @@ def test_a_udp_port_keeps_its_first_valid_sender_until_that_is_silent(
 
 def test_a_signed_udp_port_takes_no_unsigned_sender() -> None:
     signing = [Signing(key_from_passphrase("horse"), time.time) for _ in range(2)]
-    near = open_transport("udpin:127.0.0.1:0", signed=True, admits=signing[0].vouches)
+    near = open_transport("udpin:127.0.0.1:0", signed=True, admits=signing[0].authenticates)
     far = open_transport(f"udpout:127.0.0.1:{near.port}")  # type: ignore[attr-defined]
     try:
         far.send(Codec(1, 1).encode(HEARTBEAT))

@@ -40,7 +40,7 @@ from sitl.vehicle.profile import load_profile
 from sitl.world import load_world
 
 COMMANDS = {dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT}
-BY_COMPANION = {*telemetry._HANDLERS, *session._HEARD, *IMAGE_MESSAGES}
+BY_COMPANION = {*telemetry._HANDLERS, *session._HANDLED, *IMAGE_MESSAGES}
 BY_VEHICLE = {*services.ADDRESSED, *services.ANY_TARGET, dialect.MAVLINK_MSG_ID_STATUSTEXT}
 BY_CAMERA = COMMANDS | {
     dialect.MAVLINK_MSG_ID_HEARTBEAT,

@@ -56,7 +56,7 @@ def test_serial_urls(url: str, device: str, baud: int) -> None:
         ("udpout::14540", "not of the form udpout:host:port"),
         ("tcp:host:port", "not of the form"),
         ("tcp:host:70000", "at most 65535, got 70000"),
-        ("tcp:host:0", "port 0"),
+        ("tcp:host:0", "port must be at least 1, got 0"),
         ("udpin:::14540", "not of the form"),
         ("serial:", "not of the form serial"),
         ("serial::57600", "not of the form serial"),

@@ -20,19 +20,19 @@ def slot(now_s):
 def test_only_the_holder_is_heard_until_it_has_been_silent(slot, now_s):
     now_s[0] = SILENCE_S - 0.1
     assert not slot.is_free
-    assert not slot.hears("second")
-    assert slot.hears("first")
+    assert not slot.refresh("second")
+    assert slot.refresh("first")
     now_s[0] = 2 * SILENCE_S - 0.1
     assert slot.is_free
     slot.take("second")
-    assert slot.hears("second")
-    assert not slot.hears("first")
+    assert slot.refresh("second")
+    assert not slot.refresh("first")
 
 
 def test_a_rival_is_a_sender_whom_the_holder_outlives(slot):
     slot.challenge("second")
     assert slot.rival is None
-    slot.hears("first")
+    slot.refresh("first")
     assert slot.rival == "second"
 
 
@@ -40,7 +40,7 @@ def test_a_sender_that_has_taken_the_place_is_no_rival(slot, now_s):
     slot.challenge("second")
     now_s[0] = SILENCE_S
     slot.take("second")
-    slot.hears("second")
+    slot.refresh("second")
     assert slot.rival is None
 
 

@@ -167,14 +167,14 @@ def test_a_clock_before_the_epoch_counts_as_the_epoch() -> None:
 def test_a_signature_is_vouched_for_without_being_used_up() -> None:
     ours = Signing(KEY, Clock())
     frame = PING.pack(_pymavlink())
-    assert ours.vouches(frame)
-    assert ours.vouches(frame)
+    assert ours.authenticates(frame)
+    assert ours.authenticates(frame)
     assert len(Codec(1, 1, signing=ours).decode(frame)) == 1
-    assert not ours.vouches(frame)  # a replay
+    assert not ours.authenticates(frame)  # a replay
     tampered = bytearray(PING.pack(_pymavlink(timestamp=NOW + 9)))
     tampered[12] ^= 1
     for data in (
         b"", b"\xfd", frame[:-1], bytes(tampered), Codec(1, 1).encode(PING),
         PING.pack(_pymavlink(key=key_from_passphrase("other"))),
     ):  # fmt: skip
-        assert not ours.vouches(data)
+        assert not ours.authenticates(data)

@@ -219,7 +219,7 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
         (str(mine), "hardened"), ("hardened:guards_tracking=false", "hardened"),
     ):  # fmt: skip
         assert path(stack) == path(stack, any_stack=True) == shipped("gad", base)
-        assert DetectorConfig(name="gad", any_stack=True).built(stack).stack.name == base
+        assert DetectorConfig(name="gad", any_stack=True).build(stack).stack.name == base
     assert path("hardened", model="my.json") == Path("my.json")
     assert path("hardened", model="my.json", any_stack=True) == Path("my.json")
 
@@ -235,16 +235,16 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
 )  # fmt: skip
 def test_a_model_of_another_stack_is_refused_in_one_line(stack, asked, problem):
     with pytest.raises(ModelError, match=problem) as caught:
-        DetectorConfig(name="gad", **asked).built(stack)
+        DetectorConfig(name="gad", **asked).build(stack)
     assert "--any-stack-model" in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert DetectorConfig(name="gad", any_stack=True, **asked).built(stack).name == "gad"
+    assert DetectorConfig(name="gad", any_stack=True, **asked).build(stack).name == "gad"
 
 
 def test_a_stack_that_differs_in_nothing_needs_no_model_of_its_own():
     same = "mavbench:guards_tracking=false"
     assert load_stack(same).mark.digest == load_stack("mavbench").mark.digest
-    assert DetectorConfig(name="aad").built(same).stack.name == "mavbench"
+    assert DetectorConfig(name="aad").build(same).stack.name == "mavbench"
     assert load_stack("hardened").mark.digest != load_stack("mavbench").mark.digest
 
 
@@ -254,7 +254,7 @@ def test_a_model_of_the_stack_as_it_once_was_is_refused(tmp_path):
     (tmp_path / "old.json").write_text(json.dumps(held))
     config = DetectorConfig(name="gad", model=str(tmp_path / "old.json"))
     with pytest.raises(ModelError, match="for the stack 'mavbench as it was', not for"):
-        config.built("mavbench")
+        config.build("mavbench")
 
 
 # Whole missions ------------------------------------------------------------------------------

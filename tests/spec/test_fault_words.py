@@ -25,20 +25,24 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     ],
 )  # fmt: skip
 def test_a_fault_in_a_state_in_words(changes, words):
-    assert FaultConfig(**changes).words() == words
+    assert FaultConfig(**changes).describe() == words
 
 
 def test_a_drawn_state_stands_for_the_stage():
-    assert FaultConfig(target="planning").words("waypoint_z") == "a bit of waypoint z"
+    assert FaultConfig(target="planning").describe("waypoint_z") == "a bit of waypoint z"
     queued = FaultConfig(target="queue.waypoint_x")
-    assert queued.words("waypoint_x") == queued.words() == "a bit of waypoint x in control's queue"
+    assert (
+        queued.describe("waypoint_x")
+        == queued.describe()
+        == "a bit of waypoint x in control's queue"
+    )
 
 
 def test_a_fault_in_an_instruction_in_words():
     fault = InstructionConfig(target="perception", sites=("flags",), bits=2)
-    assert fault.words() == "2 bits in an instruction of perception (flags)"
-    assert fault.words("point_cloud") == "2 bits in an instruction of point cloud (flags)"
-    assert InstructionConfig(target="control", null=True).words().startswith("no bit in an")
+    assert fault.describe() == "2 bits in an instruction of perception (flags)"
+    assert fault.describe("point_cloud") == "2 bits in an instruction of point cloud (flags)"
+    assert InstructionConfig(target="control", null=True).describe().startswith("no bit in an")
 
 
 @pytest.mark.parametrize("kind", [FaultConfig, InstructionConfig])

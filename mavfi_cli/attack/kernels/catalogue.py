@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mavfi_cli.attack.kernels.scope import KernelScope
 
 Array = NDArray[np.generic]
-# A function takes effort that is no part of the kernel: it is called when the kernel has ended.
+# A function does work that is not part of the kernel. It is called after the kernel has ended.
 Output = dict[str, Array | Callable[[], Array]]
 Numbers = dict[str, Array]
 

@@ -88,5 +88,5 @@ def inputs_of_bytes(data: bytes) -> tuple[KernelInputs, ...]:
     """
     inputs = unpack(data, _Stored).inputs
     if not inputs:
-        raise ValueError("it has none")
+        raise ValueError("it holds no inputs")
     return inputs

@@ -63,7 +63,7 @@ class KernelTarget:
         """Name of the kernel's random stream: its faults do not depend on other kernels."""
         return (self.name,)
 
-    def known(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Return everything that determines the results."""
         return {
             "inputs_sha256": self.inputs_sha256,
@@ -117,7 +117,7 @@ class _KernelPlace:
         try:
             scope: KernelScope = receive(self._template.connection)
         except (OSError, EOFError):
-            words = self._template.last_words()
+            words = self._template.last_error()
             raise TargetError(self.name, f"cannot be attacked: {words}") from None
         return scope
 
@@ -184,7 +184,7 @@ class _KernelPlace:
             raise TargetError(self.name, f"fails without a fault: {text}")
         return output
 
-    def unlike(self, golden: Golden, again: Golden) -> str:
+    def describe_difference(self, golden: Golden, again: Golden) -> str:
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:

@@ -205,26 +205,26 @@ _PATHS = {
 
 
 @dataclass(slots=True)
-class Watched:
+class ObservedRun:
     """What a program did in one run.
 
     Attributes:
-        company: description of the first thread, child or program that it started; empty if none.
-            The rest of the run was not watched.
+        started: description of the first thread, child or program that it started; empty if none.
+            The rest of the run was not observed.
         written: absolute paths that it wrote, made, renamed or removed, in order.
         terminal: whether it requested a terminal.
         lacked_memory: whether it was refused memory.
     """
 
-    company: str = ""
+    started: str = ""
     written: list[str] = field(default_factory=list)
     terminal: bool = False
     lacked_memory: bool = False
 
 
-def watch(tracee: Tracee, *, wall_s: float) -> Watched:
+def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
     """Run a stopped program to its end, at most `wall_s`, and watch its system calls."""
-    watched, entering, number = Watched(), True, 0
+    observed, entering, number = ObservedRun(), True, 0
     with linux.ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
         while True:
             tracee.registers.forget()
@@ -236,41 +236,41 @@ def watch(tracee: Tracee, *, wall_s: float) -> Watched:
             number = 0
             if status.event in _STARTS:
                 call = _NAMES.get(tracee.registers.system_call or 0, "a system call")
-                watched.company = f"{_STARTS[status.event]} (system call {call})"
+                observed.started = f"{_STARTS[status.event]} (system call {call})"
                 break
             if status.signal == _CALL_STOP:
-                (_note_request if entering else _note_answer)(tracee, watched)
+                (_record_entry if entering else _record_exit)(tracee, observed)
                 entering = not entering
             elif status.event == 0:
                 number = status.signal
     if alarm.fired:
         tracee.kill()
-    return watched
+    return observed
 
 
-def _note_request(tracee: Tracee, watched: Watched) -> None:
+def _record_entry(tracee: Tracee, observed: ObservedRun) -> None:
     """Record the request of a system call, at its entry."""
     registers = tracee.registers
     number = registers.system_call
     if number == _IOCTL:
         fd, request = (registers.read(name) for name in CALL_ARGUMENTS[:2])
-        watched.terminal |= fd <= 2 and request & 0xFFFF_FFFF in _TERMINAL_IOCTLS
+        observed.terminal |= fd <= 2 and request & 0xFFFF_FFFF in _TERMINAL_IOCTLS
     if number not in _PATHS:
         return
     folder, path, flags = _PATHS[number]
     name = _text(tracee.memory, registers.read(CALL_ARGUMENTS[path]))
-    watched.terminal |= name == "/dev/tty"
+    observed.terminal |= name == "/dev/tty"
     if name and (flags < 0 or registers.read(CALL_ARGUMENTS[flags]) & _WRITING):
         base = _HERE if folder < 0 else _signed(registers.read(CALL_ARGUMENTS[folder]), 32)
         whole = _absolute(tracee.pid, base, name)
-        if whole not in watched.written and not whole.startswith(_DEVICES):
-            watched.written.append(whole)
+        if whole not in observed.written and not whole.startswith(_DEVICES):
+            observed.written.append(whole)
 
 
-def _note_answer(tracee: Tracee, watched: Watched) -> None:
+def _record_exit(tracee: Tracee, observed: ObservedRun) -> None:
     """Record whether a system call was refused memory, at its end."""
     refused = _signed(tracee.registers.read("rax"), 64) == _NO_MEMORY
-    watched.lacked_memory |= refused and tracee.registers.system_call in _MAPS
+    observed.lacked_memory |= refused and tracee.registers.system_call in _MAPS
 
 
 def _absolute(pid: int, folder: int, path: str) -> str:

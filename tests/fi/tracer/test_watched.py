@@ -14,7 +14,7 @@ def test_written_paths_are_absolute(start, tmp_path, monkeypatch, name):
     os.mkdir(tmp_path / "below")
     watched = watch(start("guest", "writes", given), wall_s=20.0)
     assert watched.written == [os.path.normpath(tmp_path / given)]
-    assert not watched.company
+    assert not watched.started
 
 
 def test_what_is_only_read_is_not_written(start, tmp_path, monkeypatch):
@@ -25,11 +25,11 @@ def test_what_is_only_read_is_not_written(start, tmp_path, monkeypatch):
 
 def test_a_program_that_goes_on_is_ended(start):
     tracee = start("guest", "waits")
-    assert not watch(tracee, wall_s=0.3).company
+    assert not watch(tracee, wall_s=0.3).started
     assert tracee.ended.signal == 9
 
 
 def test_signals_reach_a_watched_program(start):
     tracee = start("signals")
-    assert not watch(tracee, wall_s=20.0).company
+    assert not watch(tracee, wall_s=20.0).started
     assert tracee.ended.exit_code == 0

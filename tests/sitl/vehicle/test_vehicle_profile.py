@@ -106,8 +106,8 @@ def test_too_much_payload():
         ("body_box_m = [0.438, 0.438, 0.16]", "body_box_m = [0.438, 0.438]", "body_box_m"),
         ("horizontal_speed_mps = 12.0", "horizontal_speed_mps = 0.0", "horizontal_speed_mps"),
         ("leg_radius_m = 0.12", "leg_radius_m = 0.0", "leg_radius_m"),
-        ("motor_resistance_ohm = 0.12", "motor_resistance_ohm = 5e-324", "no quadrotor has"),
-        ("max_rpm = 7814.4", "max_rpm = 1e200", "rotor.max_rpm: no quadrotor has"),
+        ("motor_resistance_ohm = 0.12", "motor_resistance_ohm = 5e-324", "in size, got 4.94"),
+        ("max_rpm = 7814.4", "max_rpm = 1e200", "rotor.max_rpm: must be between 1e-12 and"),
     ],
 )
 def test_values_that_make_no_vehicle(tmp_path, old, new, words):
