@@ -164,9 +164,11 @@ class _Pace:
         self._due_s = time.monotonic()
 
     def next_tick(self, tick_s: float) -> None:
+        """Schedule the next tick `tick_s` of simulated time after the last one."""
         self._due_s = max(self._due_s + tick_s / self.speed, time.monotonic() - _PATIENCE_S)
 
     def remaining_s(self) -> float:
+        """Return the time until the scheduled tick, s; negative if it is overdue."""
         return self._due_s - time.monotonic()
 
 
@@ -316,6 +318,7 @@ class _Realtime:
         self._serve(send, STEP_US, stopped)
 
     def close(self) -> None:
+        """Close the clients and their endpoints."""
         self._clients.close()
 
     def _serve(

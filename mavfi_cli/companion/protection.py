@@ -299,7 +299,7 @@ class Protection(NoProtection):
 
     @staticmethod
     def warm_up(config: DetectorConfig, stack: str) -> None:
-        """Load and compile everything that a gate runs. Raises as `DetectorConfig.built`."""
+        """Load and compile everything that a gate runs. Raises as `DetectorConfig.build`."""
         gate = Gate(config.build(stack))
         report = CollisionReport(
             stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0

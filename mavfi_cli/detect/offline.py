@@ -87,6 +87,7 @@ class _Probe:
         return score
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
+        """Pass an accepted sample to the detector, if there is one."""
         if self._detector is not None:
             self._detector.learn(deltas, stage)
 
@@ -242,6 +243,7 @@ class _Messages:
         return self._trajectory if self._has_waypoint[row] else None
 
     def command(self, row: int) -> Command | None:
+        """Return the command of this tick, or None before the first."""
         if not self._has_command[row]:
             return None
         return Command(

@@ -399,6 +399,16 @@ ADDED: dict[int, Any] = {
 }
 """Message classes by id."""
 
+SLOW_STREAMS_US = {
+    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: 5e5,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5e5,
+}
+"""Intervals of the streams that a flight needs besides the state, us, by message id."""
+STATE_STREAMS = (
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+)  # fmt: skip
+
 CHUNK_LENGTH = 50  # characters of a STATUSTEXT
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from mavfi_cli.core.errors import CommandRefused
-from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.codec import SLOW_STREAMS_US, STATE_STREAMS, Message, dialect
 from mavfi_cli.link.telemetry import Telemetry
 
 TIMEOUT_S = 0.5
@@ -226,12 +226,6 @@ class Commands:
 
     def request_streams(self, state_rate_hz: float) -> None:
         """Request the message streams of a flight: the state at this rate, the others slower."""
-        state_us = 1e6 / state_rate_hz
-        for message_id, interval_us in (
-            (dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, state_us),
-            (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, state_us),
-            (dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 2e5),
-            (dialect.MAVLINK_MSG_ID_SYS_STATUS, 5e5),
-            (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 5e5),
-        ):
+        state = dict.fromkeys(STATE_STREAMS, 1e6 / state_rate_hz)
+        for message_id, interval_us in {**state, **SLOW_STREAMS_US}.items():
             self.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)

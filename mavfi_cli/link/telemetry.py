@@ -85,6 +85,7 @@ class _StateHistory:
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
+        """Append a state. Return False for one that arrives late. A restarted clock clears all."""
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -165,6 +166,7 @@ class _TextCollector:
         self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[_Text]:
+        """Return the texts that arrived after the first `total` of them, oldest first."""
         if total == self.total:
             return []
         fresh = min(self.total - total, len(self.texts))

@@ -70,6 +70,7 @@ class _TlogWriter:
             raise self._error(error) from None
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
+        """Record frames at a stamp. They reach the file within a second or 64 KiB."""
         time_us = self._epoch_us + round(stamp_s * 1e6)
         records = time_us.to_bytes(8, "big").join([b"", *frames])
         self._pending.append(records)
@@ -97,6 +98,7 @@ class _TlogWriter:
         self._whole += written
 
     def close(self) -> None:
+        """Write the pending records and close the file."""
         self.flush()
         if self._descriptor is not None:
             os.close(self._descriptor)

@@ -261,6 +261,7 @@ class _TcpListener(_SocketOwner):
         self._peers: list[_Stream] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
+        """Return the new clients. The stream of a patient one waits for its reader."""
         clients: list[_Stream] = []
         while True:
             try:
@@ -472,6 +473,7 @@ class _UdpListener(_SocketOwner):
         return fresh
 
     def pump(self) -> None:
+        """Sort waiting datagrams by their sender; an admitted new sender becomes a peer."""
         judged = 0
         for _ in range(_MAX_WAITING):
             data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
@@ -489,6 +491,7 @@ class _UdpListener(_SocketOwner):
             peer.waiting.append(data)
 
     def send_to(self, data: bytes, address: Any) -> None:
+        """Send whole frames to one peer."""
         _send_datagrams(self._socket, data, address)
 
     def close(self) -> None:

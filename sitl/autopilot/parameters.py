@@ -34,9 +34,11 @@ class _Parameter(NamedTuple):
 
     @property
     def wire_type(self) -> int:
+        """MAV_PARAM_TYPE of the value on the wire."""
         return TYPE_INT32 if isinstance(self.default, int) else TYPE_REAL32
 
     def packed(self, value: float) -> bytes:
+        """Return the four bytes of a value on the wire."""
         return struct.pack("<i" if self.wire_type == TYPE_INT32 else "<f", value)
 
     def stored(self, value: float) -> float | int:

@@ -66,6 +66,7 @@ class _Schedule:
         return True
 
     def restart(self) -> None:
+        """Make it due at the next poll, with a new phase."""
         self._first_s, self._count = None, 0
 
 

@@ -18,7 +18,13 @@ from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.errors import LinkLost, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.fork_server import die_with
-from mavfi_cli.link.codec import Codec, dialect, text_messages
+from mavfi_cli.link.codec import (
+    SLOW_STREAMS_US,
+    STATE_STREAMS,
+    Codec,
+    dialect,
+    text_messages,
+)
 from mavfi_cli.link.transport import Transport
 from sitl.autopilot.telemetry import Link, Links
 from sitl.camera.component import COMPONENT_ID as CAMERA
@@ -26,14 +32,7 @@ from sitl.geodesy import Origin
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.truth import Truth
 
-_STATE_US = 20_000.0
-_STREAMS_US = {
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _STATE_US,
-    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _STATE_US,
-    dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,
-    dialect.MAVLINK_MSG_ID_SYS_STATUS: 5e5,
-    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5e5,
-}
+_STREAMS_US = {**dict.fromkeys(STATE_STREAMS, 20_000.0), **SLOW_STREAMS_US}
 _FOLLOWING = {  # the mode in which a firmware follows a companion
     dialect.MAV_AUTOPILOT_PX4: 6 << 16,  # OFFBOARD
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: 4,  # GUIDED

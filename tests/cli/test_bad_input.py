@@ -81,7 +81,7 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--inject", "control", "--at", "time=99999"), "at time=99999: must be within the"),
         (("--inject", "control", "--at", "tick=15001"), "at tick=15001: must be within the"),
         (("--time-limit", "inf"), "--time-limit: must be between"),
-        (("--seed", "-1"), "--seed: must be between 0 and 2^31 - 1, got -1"),
+        (("--seed", "-1"), "--seed: must be between 0 and 2147483647, got -1"),
         (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
         (("--inject", "planning", "--bit", "64"), "Invalid value for '--bit': 64 is not in"),
         (("--goal", "1e9,0,5"), "--goal: must be within 1e+07 m of the origin"),

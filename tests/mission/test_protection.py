@@ -59,7 +59,7 @@ def per_stage(request):
 @pytest.fixture
 def limit(monkeypatch, per_stage):
     """The registry knows one detector."""
-    monkeypatch.setattr(DetectorConfig, "built", lambda *_: Limit(per_stage=per_stage))
+    monkeypatch.setattr(DetectorConfig, "build", lambda *_: Limit(per_stage=per_stage))
     return DetectorConfig(name="limit", alarms_max=3)
 
 

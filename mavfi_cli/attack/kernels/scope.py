@@ -20,6 +20,7 @@ from typing import Any
 
 from elftools.elf.elffile import ELFFile
 
+from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
 from mavfi_cli.core.errors import FaultError, UnknownName
 from mavfi_cli.fi.tracer.image import (
     Function,
@@ -30,8 +31,7 @@ from mavfi_cli.fi.tracer.image import (
     executable_mapping,
 )
 
-PLANNERS = ("rrtstar", "rrt", "rrtconnect")
-KERNELS = ("point_cloud", "octomap", "collision_check", *PLANNERS, "control")
+KERNELS = ("point_cloud", "octomap", "collision_check", *OUR_PLANNERS, "control")
 
 # A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
 # The classes that all planners call belong to it too. Mangled name, and the end of its class.
@@ -93,7 +93,7 @@ def kernel_scope(kernel: str) -> KernelScope:
     """
     if kernel not in KERNELS:
         raise UnknownName("kernel", kernel, KERNELS)
-    if kernel in PLANNERS:
+    if kernel in OUR_PLANNERS:
         return _planner(kernel)
     if kernel == "octomap":
         return _octomap()
@@ -148,7 +148,7 @@ def node_scope(node: str, planner: str) -> KernelScope:
     """
     kernel = kernel_of_node(node, planner)
     scope = kernel_scope(kernel)
-    return scope if kernel not in PLANNERS else _whole_request(scope)
+    return scope if kernel not in OUR_PLANNERS else _whole_request(scope)
 
 
 def _whole_request(search: KernelScope) -> KernelScope:
@@ -171,9 +171,9 @@ def kernel_of_node(node: str, planner: str) -> str:
     """Return the kernel that a node runs, given the mission's planner."""
     if node != "planner":
         return node
-    name = planner.lower().replace("*", "star").replace("-", "").replace("_", "")
-    if name not in PLANNERS:
-        raise UnknownName("planner with a known scope", planner, PLANNERS)
+    name = canonical_planner(planner)
+    if name not in OUR_PLANNERS:
+        raise UnknownName("planner with a known scope", planner, OUR_PLANNERS)
     return name
 
 

@@ -56,10 +56,10 @@ class MemoryUse:
     """Bytes that an instruction reads or writes: base + index * scale + displacement."""
 
     base: str | None
-    index: str | None
-    scale: int
+    index: str | None = None
+    scale: int = 1
     displacement: int
-    segment: str | None
+    segment: str | None = None
     size: int
     mask: int  # bits of it that are read or written
     reads: bool
@@ -186,10 +186,7 @@ def _stack(decoded: Any) -> list[MemoryUse]:
     return [
         MemoryUse(
             base="rbp" if mnemonic == "leave" else "rsp",
-            index=None,
-            scale=1,
             displacement=displacement,
-            segment=None,
             size=8,
             mask=_FULL,
             reads=reads,

@@ -65,9 +65,9 @@ class InstructionCorruption:
 
     site: Site
     role: Role
-    register: str  # the full register; empty for opcode and memory
+    register: str = ""  # the full register; empty for opcode and memory
     operand: str  # as the assembler names it
-    bits: tuple[int, ...]  # bits of the full register, opcode bytes or memory operand
+    bits: tuple[int, ...] = ()  # bits of the full register, opcode bytes or memory operand
     memory_operand: int = 0  # index among the instruction's memory operands
     inverts: str = ""  # only bits that invert the decision of a conditional jump are flipped
 
@@ -182,16 +182,6 @@ def _operands(instruction: Instruction, model: FaultModel) -> list[_Operand]:
     return operands
 
 
-def _operand(
-    site: Site, role: Role, mask: int, operand: str, register: str = "", memory_operand: int = 0
-) -> _Operand:
-    corruption = InstructionCorruption(
-        site=site, role=role, register=register, operand=operand, bits=(),
-        memory_operand=memory_operand,
-    )  # fmt: skip
-    return corruption, mask
-
-
 def _registers(
     instruction: Instruction, model: FaultModel, role: Role, uses: tuple[RegisterUse, ...]
 ) -> list[_Operand]:
@@ -203,7 +193,10 @@ def _registers(
         mask, name = use.mask & _field_mask(instruction, model, role, site), use.operand
         if use.register in merged:  # the flags of one instruction are one operand
             mask, name = mask | merged[use.register][1], use.register
-        merged[use.register] = _operand(site, role, mask, name, use.register)
+        corruption = InstructionCorruption(
+            site=site, role=role, register=use.register, operand=name
+        )
+        merged[use.register] = corruption, mask
     return [operand for operand in merged.values() if operand[1]]
 
 
@@ -223,8 +216,9 @@ def _field_mask(instruction: Instruction, model: FaultModel, role: Role, site: S
 def _memory(instruction: Instruction, model: FaultModel, role: Role) -> list[_Operand]:
     if Site.MEMORY not in model.sites or model.field is not Field.ANY:
         return []
+    template = InstructionCorruption(site=Site.MEMORY, role=role, operand="")
     return [
-        _operand(Site.MEMORY, role, use.mask, use.operand, memory_operand=index)
+        (replace(template, operand=use.operand, memory_operand=index), use.mask)
         for index, use in enumerate(instruction.memory)
         if (use.reads if role is Role.SOURCE else use.writes)
     ]
@@ -234,10 +228,14 @@ def _control(instruction: Instruction, model: FaultModel) -> list[_Operand]:
     operands = []
     if Site.INSTRUCTION_POINTER in model.sites:
         mask = (1 << width_of("rip")) - 1
-        operands.append(_operand(Site.INSTRUCTION_POINTER, Role.DESTINATION, mask, "rip", "rip"))
+        pointer = InstructionCorruption(
+            site=Site.INSTRUCTION_POINTER, role=Role.DESTINATION, register="rip", operand="rip"
+        )
+        operands.append((pointer, mask))
     if Site.OPCODE in model.sites:
         mask = (1 << 8 * len(instruction.raw)) - 1
-        operands.append(_operand(Site.OPCODE, Role.SOURCE, mask, "opcode"))
+        opcode = InstructionCorruption(site=Site.OPCODE, role=Role.SOURCE, operand="opcode")
+        operands.append((opcode, mask))
     return operands
 
 
@@ -361,8 +359,8 @@ def _draw_pinfi(
         if use.writes:
             bit = int(rng.integers(8 * use.size))
             return InstructionCorruption(
-                site=Site.MEMORY, role=Role.SOURCE, register="", operand=use.operand,
-                bits=(bit,), memory_operand=index,
+                site=Site.MEMORY, role=Role.SOURCE, operand=use.operand, bits=(bit,),
+                memory_operand=index,
             )  # fmt: skip
     bit = int(rng.integers(_FLAGS_WIDTH))
     return _flags((bit,) if bit in bits.bits_of(FLAGS) else ())
