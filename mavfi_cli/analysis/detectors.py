@@ -25,8 +25,8 @@ from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
-from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
-from mavfi_cli.stats.roc import curves
+from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
+from mavfi_cli.stats.roc import Curves
 from mavfi_cli.stats.shares import Interval, Share, mixture, rate
 
 NONE = "none"  # no detector: the reference of all others
@@ -211,20 +211,9 @@ class DetectorComparison:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DetectorCurves:
-    """The curves of a detector, as in `stats.roc.curves`; `areas` of the faults of each group."""
+class DetectorCurves(Curves):
+    """The curves of a detector; `areas` of the faults of each group."""
 
-    positives: int
-    negatives: int
-    thresholds: list[float]
-    false_positive_rate: list[float]
-    recall: list[float]
-    precision: list[float]
-    area: float
-    area_low: float
-    area_high: float
-    average_precision: float
-    operating_point: tuple[float, float]
     areas: list[dict[str, str | float]]
 
 
@@ -481,9 +470,10 @@ def _curves(scores: pa.Table, error_free: Sequence[float]) -> DetectorCurves:
     areas = []
     for by in ("stage", "field"):
         for value in pc.unique(scores[by]).to_pylist():
-            part = curves(chosen(scores, **{by: value})["score"].to_pylist(), error_free)
-            areas.append({"by": by, "value": value, **{name: part[name] for name in names}})
-    return DetectorCurves(**curves(scores["score"].to_pylist(), error_free), areas=areas)
+            part = Curves.of(chosen(scores, **{by: value})["score"].to_pylist(), error_free)
+            numbers_of = {name: getattr(part, name) for name in names}
+            areas.append({"by": by, "value": value, **numbers_of})
+    return DetectorCurves.of(scores["score"].to_pylist(), error_free, areas=areas)
 
 
 def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> ErrorFreeRow:
@@ -593,13 +583,13 @@ def _worst(pairs: pa.Table) -> _WorstFlight:
         worst = [np.maximum(times[rows].max(axis=-1), 0.0) for times in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 
-    worst = worst_case(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
-    longer = 1.0 + worst["increase"] > LONGER
+    worst = WorstCase.of(OWN, (1.0 + faulty).tolist(), (1.0 + protected).tolist())
+    longer = 1.0 + worst.increase > LONGER
     return _WorstFlight(
-        faulty=worst["increase"],
-        protected=worst["protected_worst"] - 1.0,
+        faulty=worst.increase,
+        protected=worst.protected_worst - 1.0,
         recovered=interval_of_rows(len(faulty), recovered, resamples=RESAMPLES),
-        recovered_share=worst["recovered_share"] if longer else math.nan,
+        recovered_share=worst.recovered_share if longer else math.nan,
     )
 
 

@@ -35,7 +35,7 @@ from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_rows, median
-from mavfi_cli.stats.paired import OWN, McNemar, sign_flips, worst_case
+from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, sign_flips
 from mavfi_cli.stats.shares import Interval, Share, rate
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
@@ -447,7 +447,7 @@ class FaultCosts:
         """
         cost_s, over_own = (_by_mission(self.costs, name) for name in ("cost_s", "over_own"))
         worst, count = self._largest("over_own"), len(cost_s)
-        recovered = worst_case(OWN, [bare._largest("over_own")], [worst])["recovered_share"]
+        recovered = WorstCase.of(OWN, [bare._largest("over_own")], [worst]).recovered_share
         rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
         flights = rows.select([*MISSION, "fault_seed"]).slice(0, 1).to_pylist()
         return CostRow(
@@ -496,16 +496,16 @@ def _longest(
     golden_s, faulty_s, times_s = (
         numbers(table, "flight_time_s").tolist() for table in (golden, faulty, flights)
     )
-    own = worst_case(golden_s, times_s)
+    own = WorstCase.of(golden_s, times_s)
     protected_s = () if setting in (GOLDEN, NONE) else times_s
     return LongestFlight(
         platform=platform,
         setting=setting,
         flights=len(times_s),
-        golden_mean_s=own["golden"],
-        worst_s=own["faulty_worst"],
-        over_mean_ratio=1.0 + own["increase"],
-        over_mean_recovered_share=worst_case(golden_s, faulty_s, protected_s)["recovered_share"],
+        golden_mean_s=own.golden,
+        worst_s=own.faulty_worst,
+        over_mean_ratio=1.0 + own.increase,
+        over_mean_recovered_share=WorstCase.of(golden_s, faulty_s, protected_s).recovered_share,
     )
 
 

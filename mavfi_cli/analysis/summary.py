@@ -20,7 +20,7 @@ from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, l
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
-from mavfi_cli.stats.paired import OWN, McNemar, holm, worst_case
+from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
 from mavfi_cli.stats.shares import Interval, Share, rate
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
@@ -84,8 +84,8 @@ class Comparison:
     success: McNemar
     corrected_p: float
     differences: Mapping[str, Interval]
-    over_own: Mapping[str, float]
-    over_mean: Mapping[str, float]
+    over_own: WorstCase
+    over_mean: WorstCase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,7 +301,7 @@ class _Match:
         change = self.second.metrics[metric][self.at_second]
         return known((change - self.first.metrics[metric][self.at_first])[first & second])
 
-    def worst(self) -> tuple[dict[str, float], dict[str, float]]:
+    def worst(self) -> tuple[WorstCase, WorstCase]:
         """Worst cases relative to each pair's own golden flight, and to the mean of these.
 
         A pair counts only if its golden flight succeeded.
@@ -319,10 +319,10 @@ class _Match:
         golden_s = reference[used][once]
         pairs = list(zip(times, usable, strict=True))
         return (
-            worst_case(
+            WorstCase.of(
                 OWN, *((times_s[both] / reference[both]).tolist() for times_s, both in pairs)
             ),
-            worst_case(golden_s.tolist(), *(times_s[both].tolist() for times_s, both in pairs)),
+            WorstCase.of(golden_s.tolist(), *(times_s[both].tolist() for times_s, both in pairs)),
         )
 
     def _golden_of_first(self) -> IntArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,15 @@ class Number(click.FloatRange):
 
 
 class _OutPath(click.Path):
-    """A path to write: not empty, which would mean the current folder."""
+    """A path to write: not empty, which would mean the current folder.
+
+    Args:
+        require: rejects what cannot be written by a RecordError.
+    """
+
+    def __init__(self, require: Callable[[Path], None], **kinds: bool) -> None:
+        super().__init__(path_type=Path, **kinds)
+        self._require = require
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         """Return the path, or fail if it cannot be written."""
@@ -37,28 +45,20 @@ class _OutPath(click.Path):
             self.fail(f"{error}.", param, ctx)
         return path
 
-    def _require(self, path: Path) -> None:
-        """Reject what cannot be written. Raises RecordError."""
-        raise NotImplementedError
-
 
 class OutFolder(_OutPath):
     """A folder for results, which is made if it does not exist."""
 
     def __init__(self) -> None:
-        super().__init__(path_type=Path, file_okay=False)
-
-    def _require(self, path: Path) -> None:
-        require_folder(path)
+        super().__init__(require_folder, file_okay=False)
 
 
 class OutFile(_OutPath):
     """A file to write, with one of some suffixes."""
 
     def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
-        super().__init__(path_type=Path, dir_okay=False, allow_dash=allow_dash)
-        self._suffixes = suffixes
+        def require(path: Path) -> None:
+            if not (allow_dash and str(path) == "-"):
+                require_output(path, suffixes)
 
-    def _require(self, path: Path) -> None:
-        if not (self.allow_dash and str(path) == "-"):
-            require_output(path, self._suffixes)
+        super().__init__(require, dir_okay=False, allow_dash=allow_dash)

@@ -401,11 +401,11 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
 
 
 def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> _ListedMission:
-    """A mission of a campaign; the command names its export by the name of the file."""
+    """A mission of a campaign; the command names an export by its path as given, if relative."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
     kept = _is_kept(flight["path"])
-    place = source.name if source.suffix else str(source)
+    place = source.name if source.suffix and source.is_absolute() else str(source)
     run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
     return _ListedMission(
         number=flight["number"],

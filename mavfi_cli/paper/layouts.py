@@ -21,7 +21,7 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.items import BY_NAME, printed
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable, Printed
-from mavfi_cli.stats.paired import OWN, worst_case
+from mavfi_cli.stats.paired import OWN, WorstCase
 
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
@@ -398,8 +398,8 @@ def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     the longest is longer.
 
     Args:
-        measure: key of `worst_case`.
+        measure: attribute of `WorstCase`.
     """
     bare, own = protected.known("bare_over_own"), protected.ratios
-    value = PERCENT * worst_case(OWN, bare.tolist(), own.tolist())[measure]
+    value = PERCENT * getattr(WorstCase.of(OWN, bare.tolist(), own.tolist()), measure)
     return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -34,6 +34,7 @@ from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.setting_table import SettingColumns, SettingRow
 from mavfi_cli.report.table import number, percent, rate, spread
+from mavfi_cli.stats.paired import WorstCase
 from mavfi_cli.stats.shares import Interval
 
 _STAGES = tuple(stage.value for stage in Stage)
@@ -196,18 +197,18 @@ def _comparison_cells(row: Comparison) -> list[str]:
         f"{row.corrected_p:.3g}",
         "" if math.isnan(time.low) else spread(time, 2, sign="+"),
         _worst(row.over_own),
-        "" if math.isnan(row.over_mean["recovered_share"]) else _worst(row.over_mean),
+        "" if math.isnan(row.over_mean.recovered_share) else _worst(row.over_mean),
     ]
 
 
-def _worst(worst: Mapping[str, float]) -> str:
-    if math.isnan(worst["increase"]):
+def _worst(worst: WorstCase) -> str:
+    if math.isnan(worst.increase):
         return ""
-    increase = percent(worst["increase"], "+.1f")
-    if math.isnan(worst["recovered_share"]):
+    increase = percent(worst.increase, "+.1f")
+    if math.isnan(worst.recovered_share):
         return increase
-    points = number(worst["recovered"], ".1f", 100.0, " points")
-    return f"{increase}, recovered {points}, {percent(worst['recovered_share'])}"
+    points = number(worst.recovered, ".1f", 100.0, " points")
+    return f"{increase}, recovered {points}, {percent(worst.recovered_share)}"
 
 
 # Quality of flight ----------------------------------------------------------------------------

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
-OWN = (1.0,)  # golden values over their own, for `worst_case` whatever the missions' lengths
+OWN = (1.0,)  # golden values over their own, for `WorstCase.of` whatever the missions' lengths
 _PATTERNS = 9999  # of signs, in `sign_flips`
-_CHUNK = 4_000_000  # signs drawn at once
+_CHUNK = 1_000_000  # signs drawn at once; larger arrays leave the processor's cache
 _DIGITS = 9  # of a sum over the largest sum; equal sums differ by rounding
 
 
@@ -138,38 +138,53 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def worst_case(
-    golden: Sequence[float], faulty: Sequence[float], protected: Sequence[float] = ()
-) -> dict[str, float]:
-    """Worst values of successful flights, compared with the golden ones.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorstCase:
+    """Worst values of successful flights, compared with the golden ones; NaN without flights.
 
-    Args:
-        golden, faulty, protected: flight times, or energies, of the successful missions of each
-            setting. Where each value is over that of the same mission's golden flight, `golden` is
-            OWN.
-
-    Returns:
-        `golden`: the reference, the mean of the golden flights. `golden_worst`, `faulty_worst`,
-        `protected_worst`: the largest values. `increase`: faulty worst case over the reference,
-        minus 1; 0.738 in the example. `recovered`: reduction by protection, in the same unit;
-        0.642. `recovered_share`: recovered part of the increase, 0.87; NaN unless the faulty worst
-        case exceeds the worst golden one. NaN where flights are missing.
+    Attributes:
+        golden: the reference, the mean of the golden flights.
+        golden_worst, faulty_worst, protected_worst: the largest values.
+        increase: faulty worst case over the reference, minus 1; 0.738 in the example.
+        recovered: reduction by protection, in the same unit; 0.642.
+        recovered_share: recovered part of the increase, 0.87; NaN unless the faulty worst case
+            exceeds the worst golden one.
     """
-    reference = math.fsum(golden) / len(golden) if golden and faulty else math.nan
-    worst = [max(each, default=math.nan) for each in (golden, faulty, protected)]
-    if not (golden and faulty):
-        worst = [math.nan] * 3
-    increase = worst[1] / reference - 1.0
-    recovered = (worst[1] - worst[2]) / reference
-    return {
-        "golden": reference,
-        "golden_worst": worst[0],
-        "faulty_worst": worst[1],
-        "protected_worst": worst[2],
-        "increase": increase,
-        "recovered": recovered,
-        "recovered_share": recovered / increase if worst[1] > worst[0] else math.nan,
-    }
+
+    golden: float
+    golden_worst: float
+    faulty_worst: float
+    protected_worst: float
+    increase: float
+    recovered: float
+    recovered_share: float
+
+    @classmethod
+    def of(
+        cls, golden: Sequence[float], faulty: Sequence[float], protected: Sequence[float] = ()
+    ) -> WorstCase:
+        """Compare the flight times, or energies, of the successful missions of each setting.
+
+        Args:
+            golden: OWN if each value is over that of the same mission's golden flight.
+        """
+        known = bool(golden and faulty)
+        reference = math.fsum(golden) / len(golden) if known else math.nan
+        worst, faulty_worst, protected_worst = (
+            max(values, default=math.nan) if known else math.nan
+            for values in (golden, faulty, protected)
+        )
+        increase = faulty_worst / reference - 1.0
+        recovered = (faulty_worst - protected_worst) / reference
+        return cls(
+            golden=reference,
+            golden_worst=worst,
+            faulty_worst=faulty_worst,
+            protected_worst=protected_worst,
+            increase=increase,
+            recovered=recovered,
+            recovered_share=recovered / increase if faulty_worst > worst else math.nan,
+        )
 
 
 # Effects ------------------------------------------------------------------------------------------

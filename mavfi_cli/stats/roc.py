@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,50 +22,74 @@ from mavfi_cli.stats.shares import z_of
 _NEAR = 1e-9  # areas of 0 and 1 have no spread, so their far ends are searched from beside them
 
 
-def curves(harmful: Sequence[float], error_free: Sequence[float]) -> dict[str, Any]:
-    """Curves from scores in units of the threshold; empty unless both kinds have flights.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Curves over the thresholds, which are in units of the detector's own; (m,) each.
 
-    Returns:
-        `positives`, `negatives`: number of scores of each kind. In descending order of threshold,
-        from one without alarms, (m,) each: `thresholds`; `false_positive_rate`, the share of
-        error-free flights with an alarm; `recall`, that of harmful faults; `precision`, the share
-        of harmful faults among all with an alarm, 1 at the first. `area`, `area_low`, `area_high`:
-        under the ROC curve, with its 95 % interval. `average_precision`: under the precision-recall
-        curve; it depends on the mix of flights, chance is positives / (positives + negatives).
-        `operating_point`: false positive rate and recall at the detector's own threshold.
+    Without flights of one kind the curves are empty and the numbers NaN.
+
+    Attributes:
+        positives, negatives: number of scores of harmful faults and of error-free flights.
+        thresholds: in descending order, from one without alarms.
+        false_positive_rate: share of error-free flights with an alarm.
+        recall: share of harmful faults with an alarm.
+        precision: share of harmful faults among all with an alarm; 1 at the first threshold.
+        area, area_low, area_high: under the ROC curve, with its 95 % interval.
+        average_precision: under the precision-recall curve; it depends on the mix of flights,
+            chance is positives / (positives + negatives).
+        operating_point: false positive rate and recall at the detector's own threshold.
     """
-    from scipy.stats import rankdata
 
-    positive, negative = (np.sort(np.asarray(s, np.float64)) for s in (harmful, error_free))
-    found: dict[str, Any] = {"positives": len(positive), "negatives": len(negative)}
-    if not len(positive) or not len(negative):
-        lists = ("thresholds", "false_positive_rate", "recall", "precision")
-        numbers = ("area", "area_low", "area_high", "average_precision")
-        found |= {name: [] for name in lists} | dict.fromkeys(numbers, math.nan)
-        return {**found, "operating_point": (math.nan, math.nan)}
-    levels = np.unique(np.concatenate([positive, negative]))[::-1]
-    # At the n-th threshold, alarms are the flights whose score is at least the n-th level.
-    hits = len(positive) - np.searchsorted(positive, levels, side="left")
-    false = len(negative) - np.searchsorted(negative, levels, side="left")
-    recall, precision = hits / len(positive), hits / (hits + false)
-    below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
-    # The probability that a harmful fault scores higher than an error-free flight, ties halved.
-    ranks = rankdata(np.concatenate([positive, negative]))[: len(positive)]
-    above = float(ranks.sum()) - len(positive) * (len(positive) + 1) / 2.0  # Mann-Whitney's U
-    area = above / (len(positive) * len(negative))
-    low, high = _area_interval(area, len(positive), len(negative))
-    return {
-        **found,
-        "thresholds": [float(levels[0]), *below.tolist()],
-        "false_positive_rate": [0.0, *(false / len(negative)).tolist()],
-        "recall": [0.0, *recall.tolist()],
-        "precision": [1.0, *precision.tolist()],
-        "area": area,
-        "area_low": low,
-        "area_high": high,
-        "average_precision": float((precision * np.diff(recall, prepend=0.0)).sum()),
-        "operating_point": (float((negative > 1.0).mean()), float((positive > 1.0).mean())),
-    }
+    positives: int
+    negatives: int
+    thresholds: list[float] = field(default_factory=list)
+    false_positive_rate: list[float] = field(default_factory=list)
+    recall: list[float] = field(default_factory=list)
+    precision: list[float] = field(default_factory=list)
+    area: float = math.nan
+    area_low: float = math.nan
+    area_high: float = math.nan
+    average_precision: float = math.nan
+    operating_point: tuple[float, float] = (math.nan, math.nan)
+
+    @classmethod
+    def of(cls, harmful: Sequence[float], error_free: Sequence[float], **more: Any) -> Self:
+        """Compute the curves from scores in units of the threshold.
+
+        Args:
+            more: fields of a subclass.
+        """
+        from scipy.stats import rankdata
+
+        positive, negative = (np.sort(np.asarray(s, np.float64)) for s in (harmful, error_free))
+        positives, negatives = len(positive), len(negative)
+        if not positives or not negatives:
+            return cls(positives=positives, negatives=negatives, **more)
+        levels = np.unique(np.concatenate([positive, negative]))[::-1]
+        # At the n-th threshold, alarms are the flights whose score is at least the n-th level.
+        hits = positives - np.searchsorted(positive, levels, side="left")
+        false = negatives - np.searchsorted(negative, levels, side="left")
+        recall, precision = hits / positives, hits / (hits + false)
+        below = np.concatenate([levels[1:], [-math.inf]])  # thresholds below each level
+        # The probability that a harmful fault scores higher than an error-free flight, ties halved.
+        ranks = rankdata(np.concatenate([positive, negative]))[:positives]
+        above = float(ranks.sum()) - positives * (positives + 1) / 2.0  # Mann-Whitney's U
+        area = above / (positives * negatives)
+        low, high = _area_interval(area, positives, negatives)
+        return cls(
+            positives=positives,
+            negatives=negatives,
+            thresholds=[float(levels[0]), *below.tolist()],
+            false_positive_rate=[0.0, *(false / negatives).tolist()],
+            recall=[0.0, *recall.tolist()],
+            precision=[1.0, *precision.tolist()],
+            area=area,
+            area_low=low,
+            area_high=high,
+            average_precision=float((precision * np.diff(recall, prepend=0.0)).sum()),
+            operating_point=(float((negative > 1.0).mean()), float((positive > 1.0).mean())),
+            **more,
+        )
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:

@@ -85,8 +85,8 @@ def test_faults_are_held_against_the_golden_flights_of_the_same_missions(book):
     assert faulty.differences["flight_time_s"].value == pytest.approx(10.0 + 1 / 7)
     assert faulty.differences["flight_time_s"].count == 7
     assert faulty.differences["replans"].value == 0.0
-    assert faulty.over_own["increase"] == pytest.approx(11.0 / 20.0)
-    assert math.isnan(faulty.over_own["recovered"])
+    assert faulty.over_own.increase == pytest.approx(11.0 / 20.0)
+    assert math.isnan(faulty.over_own.recovered)
     assert saved.second == SAVED
 
 
@@ -97,9 +97,9 @@ def test_protection_is_held_against_the_same_faults_without_it(book):
     assert (saved.success.only_second, saved.success.neither) == (2, 1)
     assert saved.differences["flight_time_s"].value == pytest.approx(-8.0)
     for worst in (saved.over_own, saved.over_mean):
-        assert worst["recovered"] == pytest.approx((31.0 - 23.0) / 20.0)
-        assert worst["recovered_share"] == pytest.approx(8.0 / 11.0)
-    assert saved.over_mean["golden"] == 20.0
+        assert worst.recovered == pytest.approx((31.0 - 23.0) / 20.0)
+        assert worst.recovered_share == pytest.approx(8.0 / 11.0)
+    assert saved.over_mean.golden == 20.0
 
 
 def test_the_worst_case_is_no_missions_own_length(book):
@@ -109,8 +109,8 @@ def test_the_worst_case_is_no_missions_own_length(book):
         book.add(FI, seed, time_s)
     book.add({"setting": "golden"}, 2, 100.0, injected=GOLDEN)
     (faulty,) = summary(book.ledger).faults
-    assert faulty.over_own["increase"] == 0.0
-    assert faulty.over_mean["golden"] == 20.0
+    assert faulty.over_own.increase == 0.0
+    assert faulty.over_mean.golden == 20.0
     told = CampaignReport.of(book.ledger).lines()
     assert told[-2].endswith("  worst over own golden")
     assert told[-1].endswith("  +0.0 %")
@@ -129,12 +129,12 @@ def test_what_protection_recovers_is_of_each_missions_own_golden_flight(book):
     book.add(FI, 3, 20.0, outcome="collision")  # a flight of its protection is still a pair
     book.add(SAVED, 3, 26.0)
     (saved,) = summary(book.ledger).protection
-    assert saved.over_own["increase"] == pytest.approx(1.0)
-    assert saved.over_own["protected_worst"] == pytest.approx(1.3)
-    assert saved.over_own["recovered_share"] == pytest.approx(0.7)
-    assert (saved.over_mean["golden"], saved.over_mean["golden_worst"]) == (20.0, 30.0)
-    assert (saved.over_mean["faulty_worst"], saved.over_mean["protected_worst"]) == (33.0, 30.0)
-    assert saved.over_mean["recovered_share"] == pytest.approx(3.0 / 13.0)
+    assert saved.over_own.increase == pytest.approx(1.0)
+    assert saved.over_own.protected_worst == pytest.approx(1.3)
+    assert saved.over_own.recovered_share == pytest.approx(0.7)
+    assert (saved.over_mean.golden, saved.over_mean.golden_worst) == (20.0, 30.0)
+    assert (saved.over_mean.faulty_worst, saved.over_mean.protected_worst) == (33.0, 30.0)
+    assert saved.over_mean.recovered_share == pytest.approx(3.0 / 13.0)
     told = [re.split("  +", line)[-1] for line in CampaignReport.of(book.ledger).lines()]
     assert told[-5:-3] == ["worst over own golden", "+100.0 %, recovered 70.0 points, 70.0 %"]
     assert told[-2:] == ["worst over mean golden", "+65.0 %, recovered 15.0 points, 23.1 %"]

@@ -12,7 +12,7 @@ from scipy import stats
 
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.stats.bootstrap import FEW, LARGE, interval, mean, median
-from mavfi_cli.stats.paired import McNemar, holm, sign_flips, worst_case
+from mavfi_cli.stats.paired import McNemar, WorstCase, holm, sign_flips
 from mavfi_cli.stats.shares import (
     cross_layer,
     missions_for_margin,
@@ -189,19 +189,19 @@ def test_bootstrap_intervals_repeat_and_survive_few_values():
 
 def test_the_worst_case_is_the_papers():
     """Factory: +73.8 %, recovered by 64.2 points (VII-A), which is 87.1 % of it (Fig. 14)."""
-    found = worst_case([99.0, 101.0], [100.0, 173.8], [100.0, 109.6])
-    assert found["increase"] == pytest.approx(0.738)
-    assert found["recovered"] == pytest.approx(0.642)
-    assert found["recovered_share"] == pytest.approx(0.871, abs=0.002)
+    worst = WorstCase.of([99.0, 101.0], [100.0, 173.8], [100.0, 109.6])
+    assert worst.increase == pytest.approx(0.738)
+    assert worst.recovered == pytest.approx(0.642)
+    assert worst.recovered_share == pytest.approx(0.871, abs=0.002)
 
 
 def test_no_worst_case_without_flights():
-    assert math.isnan(worst_case([], [1.0], [1.0])["increase"])
-    assert math.isnan(worst_case([1.0], [2.0])["recovered"])
-    assert math.isnan(worst_case([2.0], [1.0], [1.0])["recovered_share"])
-    longest_world = worst_case([10.0, 30.0], [10.0, 30.0], [10.0, 29.0])
-    assert longest_world["increase"] == 0.5
-    assert math.isnan(longest_world["recovered_share"])
+    assert math.isnan(WorstCase.of([], [1.0], [1.0]).increase)
+    assert math.isnan(WorstCase.of([1.0], [2.0]).recovered)
+    assert math.isnan(WorstCase.of([2.0], [1.0], [1.0]).recovered_share)
+    longest_world = WorstCase.of([10.0, 30.0], [10.0, 30.0], [10.0, 29.0])
+    assert longest_world.increase == 0.5
+    assert math.isnan(longest_world.recovered_share)
 
 
 def test_failure_given_corruption():
