@@ -57,7 +57,7 @@ def _options(*options: Decorator) -> Decorator:
 
 
 def complete_world(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """The named worlds that begin as typed, for the shell."""
+    """Return the named worlds that begin as typed, for the shell."""
     from sitl.world.world import named_worlds
 
     return [name for name in named_worlds() if name.startswith(incomplete)]

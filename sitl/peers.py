@@ -84,11 +84,11 @@ class Peers(Generic[P]):
         self.lost: LinkLost | None = None  # of the only peer of an endpoint that calls
 
     def __iter__(self) -> Iterator[P]:
-        """Iterate over the present peers. They may leave meanwhile."""
+        """Iterate over the present peers. Peers may leave during the iteration."""
         return iter(list(self._peers))
 
     def open(self, url: str, make: Callable[[Transport], P]) -> None:
-        """Open an endpoint, whose transports `make` turns into peers; else close all.
+        """Open an endpoint, whose transports `make` turns into peers. On an error, close all.
 
         Raises LinkError if it cannot be opened.
         """
@@ -104,7 +104,7 @@ class Peers(Generic[P]):
         self._endpoints.append((parse_endpoint(url).scheme, listener, make))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until bytes or a connection arrive, or until the time is over."""
+        """Wait until bytes or a connection arrive, at most `timeout_s`."""
         poller = select.poll()
         descriptors = {listener.fileno() for _, listener, _ in self._endpoints}
         for descriptor in descriptors | {peer.transport.fileno() for peer in self._peers}:
@@ -113,7 +113,7 @@ class Peers(Generic[P]):
         poller.poll(timeout_s * 1e3)
 
     def serve(self, until_s: float) -> None:
-        """Accept new peers, and handle the bytes of all in turn until the time is over."""
+        """Accept new peers, then serve all peers round-robin until the deadline."""
         self._accept()
         idle = 0
         while idle < len(self._peers) and self._clock() < until_s:
@@ -130,7 +130,7 @@ class Peers(Generic[P]):
             self._call(action, peer)
 
     def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
-        """Call a function that sends with every peer in turn, with a silent UDP peer less often.
+        """Call a function that sends for every peer in turn, and for a silent UDP peer less often.
 
         The intervals of a silent peer double. Once the time is over, the remaining peers wait for
         the next call, which begins with them. The function returns False if it had nothing to send.
@@ -188,6 +188,6 @@ class Peers(Generic[P]):
 
 
 def _is_due(peer: Peer, now_s: float) -> bool:
-    """Return True if a peer is no UDP peer, is not silent, or has waited for half its silence."""
+    """Return True unless a silent UDP peer has waited for less than half of its silence."""
     silent_s, unsent_s = now_s - peer.last_received_s, now_s - peer.last_sent_s
     return peer.scheme != "udpin" or silent_s <= max(peer.full_rate_s, 2.0 * unsent_s)

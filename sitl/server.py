@@ -259,7 +259,7 @@ class EmbeddedVehicle:
         return True
 
     def end(self) -> None:
-        """Fly the companion's last answer. May be called repeatedly."""
+        """Fly the tick of the companion's last answer, and close. May be called repeatedly."""
         if self._ended:
             return
         self._ended = True
@@ -448,7 +448,7 @@ def _firmware_settings(options: ServerOptions) -> list[str]:
 
 
 def _clients_of(url: str) -> list[str]:
-    """Return a line for each known client with the option that connects it to an endpoint."""
+    """Return one line per known client, with the option that connects it to an endpoint."""
     at = parse_endpoint(url)
     if at.scheme not in _CALLERS:
         return []

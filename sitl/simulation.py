@@ -86,7 +86,7 @@ class Simulation:
         self._look()
 
     def restart(self) -> None:
-        """Begin again at the start as after a reboot, which only the parameters survive."""
+        """Begin again at the start, as after a reboot. Only the parameters survive."""
         before = self.autopilot
         self._set_up()
         assert isinstance(before, Autopilot)

@@ -91,7 +91,7 @@ def golden_run(place: JudgedPlace) -> Golden:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attacker:
-    """Runs faults in one place against one golden run."""
+    """Runs faults in one place and compares them with one golden run."""
 
     place: JudgedPlace
     golden: Golden

@@ -155,7 +155,7 @@ def _await_end(
 
 
 def _is_complete(path: Path) -> bool:
-    """True if callgrind has finished a file: its last line is the total."""
+    """Return True if callgrind has finished a file: its last line is the total."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _LAST_BYTES))

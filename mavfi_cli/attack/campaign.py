@@ -64,7 +64,7 @@ class Plan:
     null: bool = False  # leave out the flip
 
     def strategy(self) -> Strategy:
-        """The sampling strategy."""
+        """Return the sampling strategy."""
         return Strategy.of(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> dict[str, Any]:
@@ -108,11 +108,11 @@ class TargetRuns:
         return self.profiles[0]
 
     def input_of(self, run: int) -> int:
-        """The input that the fault of this number strikes."""
+        """Return the input that the fault of this number strikes."""
         return run % len(self.goldens)
 
     def records_of(self, number: int) -> tuple[FaultRecord, ...]:
-        """The runs on one input."""
+        """Return the runs on one input."""
         return self.records[number :: len(self.goldens)]
 
 
@@ -126,7 +126,7 @@ def run_campaign(
     stage: Stage = lambda _: None,
     notice: Stage = lambda _: None,
 ) -> list[TargetRuns]:
-    """Make golden run, profile, fault list and runs of every target.
+    """For every target, make the golden run, profile it, draw the faults and run them.
 
     Args:
         targets: one or more targets; several need distinct streams.
@@ -209,7 +209,7 @@ def _attack(
 def _prepare(
     plan: Plan, target: AttackTarget, stage: Stage, notice: Stage
 ) -> tuple[JudgedPlace, tuple[Golden, ...], Profiles]:
-    """Open the target and make golden run and profile of each input."""
+    """Open the target. Make the golden run and the profile of each input."""
     stage("loading")
     with contextlib.ExitStack() as undo:
         place = target.open()
@@ -316,7 +316,7 @@ class _TargetSetup:
     golden: tuple[Golden, ...]  # of each input
 
     def attackers(self, place: JudgedPlace) -> tuple[Attacker, ...]:
-        """One attacker for each input of the target, open at a place."""
+        """Return one attacker for each input of the target that is open at a place."""
         pairs = zip(places_of(place), self.golden, strict=True)
         return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
@@ -325,7 +325,7 @@ class _TargetSetup:
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
     def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
-        """Fault number i; None for a time rule."""
+        """Return fault number i; None for a time rule."""
         profile = profiles[index % len(profiles)]
         if profile is None:
             return None

@@ -42,7 +42,7 @@ class Difference:
     parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Entries of a record; a size that is not finite is null."""
+        """Return the entries of a record. A size that is not finite is null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,
@@ -120,12 +120,12 @@ class OutputComparison:
         )
 
     def difference(self, golden: bytes, output: bytes) -> Difference | None:
-        """The difference between the numbers of two outputs; None if anything else differs."""
+        """Return the difference between the numbers of two outputs; None if other text differs."""
         size = _magnitude(golden, output)
         return None if size is None else Difference(relative=size, absolute=size)
 
     def same(self, golden: bytes, output: bytes) -> bool:
-        """True if two outputs are equal, or differ only in numbers within the tolerance."""
+        """Return True if two outputs are equal, or differ only in numbers within the tolerance."""
         if golden == output:
             return True
         size = _magnitude(golden, output) if self.tolerance > 0.0 else None
@@ -165,13 +165,13 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
 
 
 def _beginning(path: Path) -> bytes:
-    """The contents of a file, truncated to just beyond the compared size."""
+    """Return the contents of a file, truncated to just beyond the compared size."""
     with path.open("rb") as file:
         return file.read(LARGEST_BYTES + 1)
 
 
 def _magnitude(golden: bytes, output: bytes) -> float | None:
-    """Largest relative difference between the numbers of two texts.
+    """Return the largest relative difference between the numbers of two texts.
 
     The difference is absolute where the golden number is 0, and infinite where one of two differing
     numbers is not finite. Returns None if the texts differ in more than their numbers.

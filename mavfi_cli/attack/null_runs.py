@@ -169,12 +169,12 @@ def _in_turn(lists: Iterable[Sequence[Task]]) -> list[Task]:
 
 
 def _detours(fault: InstructionFault | None) -> list[CountedStop]:
-    """The stages of a fault's trigger that a detour counts."""
+    """Return the stages of a fault's trigger that a detour counts."""
     stages = () if fault is None else fault.trigger
     return [stage for stage in stages if stage.detour is not None and stage.count >= DETOUR_COST]
 
 
 def _counting(fault: InstructionFault | None) -> Counting:
-    """Counting method of a fault; of several, the one that changes the most code."""
+    """Return the counting method of a fault; of several, the one that changes the most code."""
     used = {stage.detour.counting for stage in _detours(fault) if stage.detour is not None}
     return next((method for method in Counting if method in used), Counting.BREAKPOINT)

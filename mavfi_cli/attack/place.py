@@ -29,10 +29,10 @@ class AttackPlace(Protocol):
         """Start a run, stopped before any code in scope."""
 
     def image(self, tracee: Tracee) -> Image:
-        """The memory image of a run."""
+        """Return the memory image of a run."""
 
     def scope(self, image: Image) -> Scope:
-        """The code that may be hit."""
+        """Return the code that may be hit."""
 
     def close(self) -> None:
         """End all processes and remove all temporary files."""
@@ -55,5 +55,5 @@ class Golden:
 
 
 def digest(output: bytes) -> str:
-    """SHA-256 of an output."""
+    """Return the SHA-256 of an output."""
     return hashlib.sha256(output).hexdigest()

@@ -81,7 +81,7 @@ class TargetProfile:
 
     @property
     def windows(self) -> str:
-        """Stepped windows of all windows, as text."""
+        """The number of stepped windows, such as "4 of 12"."""
         stepped = sum(len(stratum.segments) for stratum in self.strata)
         return f"{stepped} of {sum(stratum.windows_in_run for stratum in self.strata)}"
 
@@ -109,7 +109,7 @@ class TargetProfile:
         return 0.0 if self.counted is None else self.counted.not_reached
 
     def code_at(self, address: int) -> bytes:
-        """16 bytes of code."""
+        """Return 16 bytes of code at an address, or fewer at the end."""
         return _code_of(self.code, address)
 
     def contains(self, addresses: NDArray[np.int64]) -> bool:
@@ -121,7 +121,7 @@ class TargetProfile:
         return bool(inside.all())
 
     def locate(self, address: int) -> Location:
-        """The location of an address in scope."""
+        """Return the location of an address in scope."""
         for piece in self.code:
             if 0 <= (at := address - piece.start) < len(piece.data) - _TAIL:
                 return Location(piece.object, piece.offset + at)
@@ -331,7 +331,7 @@ def profile_counted(
 
 
 def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
-    """CPU time of a native run until it has executed as much as has been counted, s.
+    """Return the CPU time of a native run until it has executed as much as has been counted, s.
 
     Args:
         counts: execution counts of the first part of the run.

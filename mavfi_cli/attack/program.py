@@ -103,7 +103,7 @@ class ProgramTarget:
         return self.objects or (self.name,)
 
     def context(self) -> dict[str, Any]:
-        """Entries of every record about the program."""
+        """Return the entries of every record about the program."""
         entries: dict[str, Any] = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),

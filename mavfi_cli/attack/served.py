@@ -37,7 +37,7 @@ _early: dict[str, ServedProcess] = {}
 
 
 class ServedProcess:
-    """A started program. Loading it may take long, so start it early.
+    """A started program. Loading may take long, so start it early.
 
     A program that compiles its modules has a different memory layout from one that loads their
     bytecode. So a program that wrote to a cache is replaced by another, which loads from it.
@@ -109,7 +109,7 @@ class ServedProcess:
         return answer
 
     def last_error(self) -> str:
-        """The last line that the program wrote to its standard error."""
+        """Return the last line that the program wrote to its standard error."""
         lines = os.pread(self._errors, 1 << 20, 0).decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "its process ended"
 

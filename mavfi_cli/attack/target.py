@@ -70,7 +70,7 @@ class JudgedPlace(AttackPlace, Protocol):
         """The limits beyond which a run counts as hung."""
 
     def context(self) -> dict[str, Any]:
-        """Entries of every record about the target."""
+        """Return the entries of every record about the target."""
 
     def profile(self, rng: np.random.Generator, *, windows: int, watch: Watch) -> TargetProfile:
         """Step the golden run, or a sample of it."""
@@ -142,6 +142,6 @@ def judged(
 
 
 def signal_name(number: int) -> str:
-    """The name of a signal."""
+    """Return the name of a signal."""
     known = {member.value for member in signal.Signals}
     return signal.Signals(number).name if number in known else f"signal {number}"

@@ -110,7 +110,9 @@ def _extent(
     high = np.minimum(high, np.ceil(bounds[3:] / resolution).astype(np.int64) + reach)
     size = np.maximum(high - low, 0)
     if float(np.prod(size.astype(np.float64))) > MAX_VOXELS:
-        raise GridTooLarge(f"obstacle grid of {size.tolist()} voxels is too large")
+        raise GridTooLarge(
+            f"obstacle grid must be at most {MAX_VOXELS} voxels, got {size.tolist()}"
+        )
     return low, size
 
 

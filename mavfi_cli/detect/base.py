@@ -55,7 +55,7 @@ class Detector(Protocol):
 
     @property
     def threshold(self) -> float:
-        """Threshold. A score above it, or a NaN score, raises an alarm."""
+        """The threshold. A score above it, or a NaN score, raises an alarm."""
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
@@ -105,7 +105,7 @@ def checked_threshold(value: float, key: str = "threshold") -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """A fitted detector, with the keys of its file."""
+    """A fitted detector and its provenance: the contents of a model file."""
 
     schema: int = SCHEMA
     mavfi: str = field(default_factory=lambda: version("mavfi"))
@@ -159,7 +159,9 @@ class Model:
         if (schema := data.get("schema", SCHEMA)) != SCHEMA:
             raise ModelError(f"model schema must be {SCHEMA!r}, got {schema!r}", path=path)
         if odd := set(data) ^ {key.name for key in fields(cls)}:
-            raise ModelError(f"corrupt model file: keys {', '.join(sorted(odd))}", path=path)
+            raise ModelError(
+                f"corrupt model file: missing or unknown keys {', '.join(sorted(odd))}", path=path
+            )
         try:
             model = structure(data, cls)
         except ConfigError as error:
@@ -195,7 +197,7 @@ def _require_finite(name: str, array: FloatArray, path: Path) -> None:
 
 
 def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
-    """Return the path of the model of our detector that is shipped for a stack, if one is."""
+    """Return the path of a detector's shipped model for a stack. The file may not exist."""
     return SHIPPED / stack / f"{detector}.json"
 
 

@@ -45,7 +45,7 @@ _YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
-    """Check before the flights that `fit` will be able to use them.
+    """Check, before the flights, that `fit` will be able to use them.
 
     Raises:
         UnknownName: A kind is unknown.

@@ -50,7 +50,7 @@ class Alarm:
 
 
 class _ExtendedWatch:
-    """Watch of the extended states, each judged by its range of changes in error-free flights.
+    """Judges each extended state by its range of changes in error-free flights.
 
     The change since the last accepted message must lie between the smallest and the largest change
     in the training flights. All counters begin at 0 without a predicted collision, so the first
@@ -81,7 +81,7 @@ class _ExtendedWatch:
             self._accepted[message.stamp_s] = message
 
     def lose(self, kind: type[CollisionReport | Trajectory]) -> None:
-        """Note that a message of that kind did not take effect."""
+        """Record that a message of that kind did not take effect."""
         self._lost[kind] += 1
 
     def judge_flown(self, plan: Trajectory) -> Alarm | None:
@@ -219,7 +219,7 @@ class Gate:
         return alarm
 
     def lose_plan(self) -> None:
-        """Note that the planner has failed or its plan is not used."""
+        """Record that the planner has failed or that its plan is not used."""
         if self._watch is not None:
             self._watch.lose(Trajectory)
 

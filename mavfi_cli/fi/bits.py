@@ -44,12 +44,12 @@ class BitType:
 
     @classmethod
     def raw(cls, size_bytes: int) -> BitType:
-        """A register or memory operand of `size_bytes` bytes, without fields."""
+        """Return a register or memory operand of `size_bytes` bytes, without fields."""
         width = 8 * size_bytes
         return cls(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
 
     def field_bits(self, field: Field) -> range:
-        """The bits of `field`.
+        """Return the bits of `field`.
 
         Raises:
             FaultSpecError: the type has no such field.
@@ -63,7 +63,7 @@ class BitType:
         return FaultSpecError(f"{self.name} has no field {field!r}; it has: {', '.join(known)}")
 
     def mask(self, bits: Iterable[int]) -> int:
-        """The xor mask of distinct bits.
+        """Return the xor mask of distinct bits.
 
         Raises:
             FaultSpecError: the type does not have one of the bits.
@@ -80,7 +80,7 @@ class BitType:
     def draw(
         self, rng: np.random.Generator, *, field: Field = Field.ANY, count: int = 1
     ) -> tuple[int, ...]:
-        """`count` distinct bits of a field, uniformly, ascending.
+        """Draw `count` distinct bits of a field uniformly, and return them in ascending order.
 
         Raises:
             FaultSpecError: the type has no such field, or the field has fewer than `count` bits.
@@ -94,12 +94,12 @@ class BitType:
         return tuple(sorted(candidates[int(index)] for index in chosen))
 
     def pattern(self, value: Scalar) -> int:
-        """The bits of a value; a float32 is rounded to the nearest representable first."""
+        """Return the bits of a value; a float32 is rounded to the nearest representable first."""
         of_value, of_pattern = _FORMATS[self.name]
         return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
 
     def value(self, pattern: int) -> Scalar:
-        """The value of a pattern.
+        """Return the value of a pattern.
 
         A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
         """
@@ -108,7 +108,7 @@ class BitType:
         return value
 
     def flip(self, value: Scalar, bits: Iterable[int]) -> Scalar:
-        """The value with `bits` of its pattern inverted."""
+        """Return the value with `bits` of its pattern inverted."""
         return self.value(self.pattern(value) ^ self.mask(bits))
 
 
@@ -136,12 +136,12 @@ BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
 
 
 def bits_of(mask: int) -> tuple[int, ...]:
-    """The set bits of a mask, ascending."""
+    """Return the numbers of the set bits of a mask in ascending order."""
     return tuple(bit for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 
 def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
-    """Raw little-endian bytes with `bits` inverted (bit 8 is bit 0 of the second byte)."""
+    """Return little-endian bytes with `bits` inverted. Bit 8 is bit 0 of the second byte."""
     pattern = int.from_bytes(data, "little") ^ BitType.raw(len(data)).mask(bits)
     return pattern.to_bytes(len(data), "little")
 

@@ -53,7 +53,7 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """The time of the fault. PHASE uses the name, RANDOM and FORESEEN neither name nor number."""
+    """The time of a fault. PHASE uses `phase`; RANDOM and FORESEEN use neither field."""
 
     when: When = When.RANDOM
     number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)
@@ -94,7 +94,7 @@ class Corruption:
             raise FaultSpecError(f"period_s must be finite and above 0, got {self.period_s:g}")
 
     def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
-        """Refuse a corruption that needs bits that this type does not have.
+        """Refuse a corruption of bits that a type does not have.
 
         Raises:
             FaultError: an exact bit or the field is missing, or the field has too few bits.
@@ -103,7 +103,8 @@ class Corruption:
             kind.mask(bits)
         elif self.effect is Effect.FLIP and self.bits > len(kind.field_bits(self.field)):
             raise FaultSpecError(
-                f"{name} is {kind.name}: its field {self.field.value} has no {self.bits} bits"
+                f"{name} is {kind.name}: bits of its field {self.field.value} must be at most "
+                f"{len(kind.field_bits(self.field))}, got {self.bits}"
             )
 
 

@@ -133,7 +133,7 @@ class NoInjector:
         """Update the mission's current state, once per control tick and for every report."""
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """Return a published message as its receiver gets it."""
+        """Return a published message, corrupted if the fault strikes it."""
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
@@ -194,7 +194,7 @@ class Injector(NoInjector):
         return f"no {self._awaits} came after {since}" if self._triggered else never
 
     def _due(self, moment: Moment, invocations: int = 0) -> bool:
-        """True if the fault strikes now; `invocations` counts the kernel's outputs so far."""
+        """Return True if the fault strikes now. `invocations` is the number of outputs so far."""
         self.watch(moment)
         corruption = self._corruption
         if self._begun_s is None:
@@ -211,7 +211,7 @@ class Injector(NoInjector):
         return True
 
     def _is_triggered(self, moment: Moment) -> bool:
-        """True if the trigger has occurred; invocations are counted with the messages instead."""
+        """Return True if the trigger has occurred. Invocations are counted with the messages."""
         trigger = self._trigger
         return {
             When.TIME: moment.flight_s >= trigger.number - 1e-9,
@@ -284,7 +284,7 @@ class SourceInjector(Injector):
         return struck
 
     def _strikes_latched(self) -> bool:
-        """True for every trigger except an invocation, which is checked on publication."""
+        """Return True for every trigger except an invocation, which is checked on publication."""
         return self.fault.trigger.when is not When.INVOCATION
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
@@ -450,7 +450,7 @@ class Follower:
         states: Collection[str],
         index: int | None = None,
     ) -> None:
-        """Record that a receiver reads a message's states, at one waypoint or at all."""
+        """Record that a receiver reads states of a message, at one waypoint or at all of them."""
         if self._message is None or message is not self._message:
             return
         for state, at in self._corrupted.items():
@@ -471,6 +471,6 @@ class Follower:
             self._become(Activation.OVERWRITTEN)
 
     def _become(self, activation: Activation) -> None:
-        """Raise the activation; a later strike never lowers that of an earlier one."""
+        """Set the activation. A later strike never replaces WITHHELD of an earlier one."""
         if self.activation is not Activation.WITHHELD:
             self.activation = activation

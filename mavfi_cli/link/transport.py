@@ -36,7 +36,7 @@ _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 
 
 class Transport(ABC):
-    """Bytes to and from one peer."""
+    """Carries bytes to and from one peer."""
 
     url: str  # of the endpoint, for error messages
     datagram = False  # every `receive` returns whole frames; an argument of `Codec.decode`
@@ -68,7 +68,7 @@ class Transport(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """The descriptor that becomes readable when `receive` would return something; -1: none."""
+        """Return the descriptor that is readable when `receive` would return data; -1: none."""
 
     @abstractmethod
     def close(self) -> None:

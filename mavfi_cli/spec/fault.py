@@ -116,7 +116,9 @@ class FaultConfig:
         if node not in KERNELS:
             raise UnknownName("node", node, KERNELS)
         if replace(self, seed=1, at="random") != FaultConfig(target=self.target):
-            raise FaultSpecError(f"{self.target}: a fault that kills a process takes no bits")
+            raise FaultSpecError(
+                f"{self.target}: a fault that kills a process takes only a seed and a trigger"
+            )
         if self.trigger().when is When.INVOCATION:
             raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
 
@@ -196,7 +198,7 @@ class FaultConfig:
 
 
 def target_names(*, instruction: bool = False) -> list[str]:
-    """Return all injection sites of a level: nodes, or states, groups and processes."""
+    """Return the names of all injection sites at instruction level or at source level."""
     if instruction:
         return [*_NODES]
     stages = [stage.value for stage in Stage]

@@ -62,7 +62,7 @@ class PlatformProfile:
         if self.cores < 1:
             raise ValueError(f"cores must be at least 1, got {self.cores}")
         if missing := [f"kernels.{kernel}" for kernel in KERNELS if kernel not in self.kernels]:
-            raise ValueError(f"{', '.join(missing)}: missing, a kernel without a latency")
+            raise ValueError(f"{', '.join(missing)}: missing; every kernel must have a latency")
         check_hardware(self)
 
     @staticmethod

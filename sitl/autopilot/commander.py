@@ -74,7 +74,7 @@ class FlightMode(Enum):
 
 
 class Severity(IntEnum):
-    """Used levels of MAV_SEVERITY."""
+    """The levels of MAV_SEVERITY that are used."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -83,7 +83,7 @@ class Severity(IntEnum):
 
 
 class Result(IntEnum):
-    """MAV_RESULT."""
+    """The values of MAV_RESULT that are used."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1

@@ -149,7 +149,7 @@ def _attitude_target(s: Snapshot) -> Any:
 
 
 def _position_target_local_ned(s: Snapshot) -> Any:
-    """The active setpoint, as in PX4."""
+    """Return the active setpoint, as in PX4."""
     unset = np.isnan(s.setpoint)
     mask = sum(bits for start, bits in _ZERO_MASKS if unset[start : start + 3].all())
     sent = np.where(unset, 0.0, s.setpoint).tolist()

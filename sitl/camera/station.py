@@ -166,7 +166,7 @@ class PoseTracker:
 
 
 class Witness:
-    """Collision, clearance and energy of a foreign vehicle, derived from its pose.
+    """Derives collision, clearance and energy of a foreign vehicle from its pose.
 
     The record begins when the vehicle arms. The energy is that of the regression; the power of the
     propellers is not known. The profile's body box and regression stand for the vehicle's.
@@ -289,7 +289,7 @@ class Station:
             self.serve()
 
     def serve(self) -> None:
-        """Handle waiting messages, for a bounded time, and send the due ones."""
+        """Handle waiting messages for a bounded time, then send the messages that are due."""
         self.peers.serve(self._clock() + _TURN_S)
         if self.peers.lost is not None:
             raise self.peers.lost

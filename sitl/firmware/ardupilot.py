@@ -59,7 +59,7 @@ class ArduPilotLink:
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> ArduPilotLink:
-        """Open ArduPilot's port, or any if we start it. Raises LinkError."""
+        """Open ArduPilot's port, or any port if we start ArduPilot. Raises LinkError."""
         return cls(sensors, 0 if ours else PORT)
 
     @staticmethod

@@ -48,7 +48,7 @@ def follows_companion(heartbeat: Any) -> bool:
 
 
 class FirmwareAutopilot(Links):
-    """A firmware behind a MAVLink link, as the autopilot of a simulation.
+    """A firmware at the other end of a MAVLink link, as the autopilot of a simulation.
 
     It requests the streams of a flight, and sets the firmware's local origin to the world's, so
     that its positions are world coordinates. Clients of any preset get all its `common` messages.
@@ -270,7 +270,7 @@ class FirmwareProcess:
         return VehicleProcessError(f"{problem}; {self._state()}")
 
     def _state(self) -> str:
-        """Return a line: whether it runs or how it ended, and the last lines of its output."""
+        """Describe in a line whether it runs or how it ended, with the last lines of its output."""
         code = self._process.poll()
         how = "is running" if code is None else f"ended with code {code}"
         if code is not None and code < 0:

@@ -79,7 +79,7 @@ class Px4Link:
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
-        """Open the first free port of PX4's instances, of the first one unless we start it.
+        """Open the first free port of PX4's instances; only the first port unless we start PX4.
 
         Raises LinkError if all of them are in use.
         """

@@ -58,7 +58,7 @@ class _WorldCheck:
 
 
 def check_world(world: World, *, clearance_m: float = DEFAULT_CLEARANCE_M) -> _WorldCheck:
-    """Search a path from start to goal with `clearance_m` to every box.
+    """Search for a path from start to goal with `clearance_m` to every box.
 
     Raises WorldError if the world is too large for the grid.
     """

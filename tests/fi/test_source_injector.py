@@ -297,7 +297,7 @@ def test_the_listener_hears_before_the_message_goes_on():
             FaultError,
             "int32",
         ),
-        ("collision", {"corruption": {"bits": 2}}, FaultSpecError, "no 2 bits"),
+        ("collision", {"corruption": {"bits": 2}}, FaultSpecError, "at most 1, got 2"),
     ],
 )
 def test_what_does_not_fit_is_said(target, options, error, message):
@@ -336,8 +336,13 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
 @pytest.mark.parametrize(
     ("corruption", "bits", "error", "message"),
     [
-        (Corruption(bits=2, field=Field.SIGN), None, FaultSpecError, "field sign has no 2 bits"),
-        (Corruption(bits=65), None, FaultSpecError, "mean is float64: its field any has no 65"),
+        (
+            Corruption(bits=2, field=Field.SIGN),
+            None,
+            FaultSpecError,
+            "field sign must be at most 1, got 2",
+        ),
+        (Corruption(bits=65), None, FaultSpecError, "mean is float64: bits of its field any must be at most 64"),
         (Corruption(), [64], FaultError, "64"),
     ],
 )

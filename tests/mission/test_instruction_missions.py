@@ -216,7 +216,7 @@ def test_the_habits_of_another_injector_keep_a_moment_that_repeats():
     pinfi = InstructionConfig(target="control", compat="pinfi")
     assert mission_strategy(pinfi).rule is Rule.INSTRUCTION
     assert pinfi.sampling_name() == "instruction-uniform with the operands and bits of pinfi"
-    with pytest.raises(FaultSpecError, match="pinfi chooses sites, roles, field and bits by its"):
+    with pytest.raises(FaultSpecError, match="pinfi cannot be combined with sites, roles"):
         mission_strategy(InstructionConfig(target="control", compat="pinfi", bits=3))
 
 

@@ -75,7 +75,7 @@ def unpack(data: bytes) -> Numbers:
 
 
 def _numbers(golden: Numbers, output: Numbers) -> Difference:
-    """Largest difference of a number, relative to the golden one, or absolute if that is 0.
+    """Return the largest difference of a number, relative to the golden one unless that is 0.
 
     It is noticeable if it is larger than `_SMALL`.
     """
@@ -108,7 +108,7 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def _maps(golden: Numbers, output: Numbers) -> Difference:
-    """Compare two trees: number of nodes that only one has or whose log-odds differ.
+    """Compare two trees by the nodes that only one has or whose log-odds differ.
 
     The difference is noticeable if the sets of occupied voxels differ, in the tree or in the
     planner's map.
@@ -318,7 +318,7 @@ def _place_nodes(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kernel:
-    """One kernel with everything that an isolated run of it needs.
+    """One kernel, with everything that an isolated run of it needs.
 
     Attributes:
         name: value of `--kernel`.
@@ -353,7 +353,7 @@ class Kernel:
         return self.memory_mb / _FILLED_MB_PER_S
 
     def scope(self) -> KernelScope:
-        """Return the machine code in scope, in a process in which the kernel has run."""
+        """Return the machine code in scope. The kernel must have run in this process."""
         from mavfi_cli.attack.kernels.scope import compiled_scope, kernel_scope
 
         scope = kernel_scope(self.name) if self.code is None else self.code()

@@ -61,7 +61,7 @@ _PAGE = 4096
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelScope:
-    """Entry and scope of one kernel in one process.
+    """The entry and the code in scope of one kernel in one process.
 
     Attributes:
         entry: the instruction whose execution counts as one invocation of the kernel. The
@@ -85,7 +85,7 @@ class KernelScope:
 
 
 def kernel_scope(kernel: str) -> KernelScope:
-    """Find entry and scope of a kernel in this process.
+    """Find the entry and the scope of a kernel in this process.
 
     Raises:
         UnknownName: no such kernel; names the nearest.
@@ -101,7 +101,7 @@ def kernel_scope(kernel: str) -> KernelScope:
 
 
 def library_scope(library: str, function: str) -> KernelScope:
-    """Find entry and scope of a function of a shared library; all code of the library is in scope.
+    """Find the entry of a library's function. All code of the library is in scope.
 
     Raises:
         UnknownName: no such library or function; names the nearest.
@@ -111,7 +111,7 @@ def library_scope(library: str, function: str) -> KernelScope:
 
 
 def compiled_scope(kernel: str, function: Any) -> KernelScope:
-    """Find entry and scope of a function that numba compiled and that has run in this process.
+    """Find the entry and the scope of a numba function that has run in this process.
 
     Python calls this entry. The hash of the compiled object identifies the build, because the code
     in memory contains addresses of the process.
@@ -136,7 +136,7 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
 
 
 def node_scope(node: str, planner: str) -> KernelScope:
-    """Find entry and scope of a mission node's work in this process.
+    """Find the entry and the scope of a mission node's work in this process.
 
     A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
     after that is in scope up to the reply: the tests of straight segments and of pieces of the
@@ -210,7 +210,7 @@ def _collision_check() -> KernelScope:
 
 
 def _tests_spheres(symbol: str) -> bool:
-    """True if a function of FCL takes part in testing a sphere against an octree."""
+    """Return True if a function of FCL takes part in testing a sphere against an octree."""
     if "OcTree" in symbol and "Sphere" in symbol:
         return "libccd" in symbol
     return any(name in symbol for name in _FCL_USED)
@@ -237,7 +237,7 @@ def _planner(kernel: str) -> KernelScope:
 
 
 def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
-    """The nearest-neighbour searches that a planner's tree may call."""
+    """Return the nearest-neighbour searches that a planner's tree may call."""
     return tuple(
         Location(library, function.start)
         for function in _functions_with(image, library, motion)
@@ -248,7 +248,7 @@ def _nearest(image: Image, library: str, motion: str) -> tuple[Location, ...]:
 
 
 def _functions_with(image: Image, library: str, *parts: str) -> list[Function]:
-    """The functions of a library whose names contain one of the texts."""
+    """Return the functions of a library whose names contain one of the texts."""
     named = image.named(library).functions
     return [function for function in named if any(part in function.name for part in parts)]
 

@@ -270,23 +270,23 @@ class CountedRun:
         return 1.0 - self.executed / max(1, int(self.counts.sum()))
 
     def _at(self, position: int) -> tuple[int, int]:
-        """Index and number of the execution, from 1, of one executed instruction."""
+        """Return the index and number of the execution, from 1, of one executed instruction."""
         index = int(np.searchsorted(self._ends, position, side="right"))
         return index, position - int(self._ends[index] - self.reached[index]) + 1
 
     def address(self, position: int) -> int:
-        """The address of one executed instruction."""
+        """Return the address of one executed instruction."""
         return int(self.addresses[self._at(position)[0]])
 
     def trigger(
         self, position: int, locate: Locate, _: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """The trigger of one executed instruction, and k, the number of its execution."""
+        """Return the trigger of one executed instruction, and k, the number of its execution."""
         index, k = self._at(position)
         return self.stages(index, k, locate), k
 
     def stages(self, index: int, k: int, locate: Locate) -> tuple[CountedStop, ...]:
-        """The stages to execution k of an instruction."""
+        """Return the stages to execution k of an instruction."""
         place = int(self.places[index])
         here, there = (locate(int(self.addresses[at])) for at in (index, place))
         detour = self.detours[place]
@@ -298,7 +298,7 @@ class CountedRun:
 
 
 def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> int:
-    """Return the bytes of the instructions from one on that a detour would replace."""
+    """Return the number of bytes that a detour at one instruction would replace."""
     size, expected = 0, None
     while (how := _flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
@@ -324,7 +324,7 @@ def _without_repeats(
 
 
 def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) -> list[bool]:
-    """Return whether instructions are the only predecessor of the next, (n,)."""
+    """Return flags (n,): True if an instruction is the only predecessor of the next."""
     joined = [
         how is not None
         and how.straight
@@ -370,7 +370,7 @@ def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> De
 
 
 def _places(detours: Sequence[Detour | None], joined: Sequence[bool]) -> list[int]:
-    """Return the indices at which instructions are counted: their own, or one of their block."""
+    """Return the index at which each instruction is counted: its own, or one of its block."""
     places: list[int] = []
     start = 0
     for at, more in enumerate(joined):

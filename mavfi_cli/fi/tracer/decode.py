@@ -144,7 +144,7 @@ _INTEGERS = re.compile(r"v?p\w*s[ds]$")  # of signed doublewords: pmaxsd, pabsd
 
 
 def _elements(mnemonic: str) -> tuple[str | None, str | None]:
-    """The floats that an instruction reads and writes."""
+    """Return the floats that an instruction reads and writes."""
     if match := _CONVERSION.match(mnemonic):
         return _FLOATS.get(match[1]), _FLOATS.get(match[2])
     element = None if _INTEGERS.match(mnemonic) else _FLOATS.get(mnemonic[-2:])
@@ -346,7 +346,7 @@ def _bits(decoded: Any) -> tuple[Touched, ...]:
 
 
 def _default(op: Any, width: int) -> Touched:
-    """Return the bits by capstone's access flags, as wide as the operand's name."""
+    """Return the bits that capstone's access flags give, as wide as the operand's name."""
     mask = low(width)
     reads, writes = bool(op.access & capstone.CS_AC_READ), bool(op.access & capstone.CS_AC_WRITE)
     whole = mask if width < 32 else low(max(64, width))

@@ -88,7 +88,7 @@ class InstructionCorruption:
         return tuple(sorted([less] * below + [zero] * equal))
 
     def to_json(self) -> dict[str, Any]:
-        """The corruption part of a record."""
+        """Return the corruption part of a record."""
         names = {"site": self.site.value, "role": self.role.value, "bits": list(self.bits)}
         values = asdict(self) | names
         return values if self.inverts else {k: v for k, v in values.items() if k != "inverts"}
@@ -124,7 +124,7 @@ class FaultModel:
     def named(
         cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
     ) -> FaultModel:
-        """Make a model from names. Without sites it has the data registers, without roles both.
+        """Make a model from names. The default is all data registers and both roles.
 
         Raises:
             UnknownName: a name does not exist; the message suggests the nearest.
@@ -294,7 +294,7 @@ class Strategy:
                 raise UnknownName("compatibility mode", compat, COMPAT)
             if model not in (None, FaultModel()):
                 raise FaultSpecError(
-                    f"{compat} chooses sites, roles, field and bits by its own rule"
+                    f"{compat} cannot be combined with sites, roles, field or bits: it chooses them"
                 )
             return COMPAT[compat]
         rule = named_member(Rule, "sampling rule", name)
@@ -328,7 +328,7 @@ _VECTOR = re.compile(r"([xyz])mm\d*(\d)$")
 def _draw_rosfi(
     instruction: Instruction, _following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """ROSFI: moves bits 52 to 62 (110 to 126 of XMM) to byte 0, and refuses most registers."""
+    """Draw as ROSFI: move bits 52 to 62 (110 to 126 of XMM) to byte 0, refuse most registers."""
     drawn = _draw_corruption(instruction, _ROSFI_MODEL, rng)
     if drawn is None or drawn.operand in _ROSFI_REFUSED:
         return None
@@ -340,7 +340,7 @@ def _draw_rosfi(
 def _draw_pinfi(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """PINFI: one bit of a register that the instruction writes, after it has executed.
+    """Draw as PINFI: one bit of a register that the instruction writes, after it has executed.
 
     Flags are flipped only if no other register is written: to invert the conditional jump that
     follows, or else as 64 bits, most of which are not flags and change nothing. Without such a
@@ -369,7 +369,7 @@ def _draw_pinfi(
 def _draw_pinfi_with_bugs(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """PINFI with its bugs: it numbers a vector register by the last digit of its name.
+    """Draw as PINFI with its bugs: the last digit of its name numbers a vector register.
 
     So it takes xmm10 to xmm15 for xmm0 to xmm5, and looks for a bit of a YMM register in its upper
     half.

@@ -61,7 +61,7 @@ class _ElfFacts:
             raise FaultError(f"{self.path}: not a readable ELF object ({error})") from None
 
     def function_at(self, address: int) -> Function | None:
-        """The function that holds a linked address.
+        """Return the function that holds a linked address.
 
         If several start at one address, the largest one with the last name is returned. A
         function without a size extends to the next.
@@ -113,7 +113,7 @@ def _text(elf: Any) -> tuple[range, ...]:
 
 
 def _functions(elf: Any) -> Iterator[Function]:
-    """The functions of both symbol tables."""
+    """Return the functions of both symbol tables."""
     for table in (".symtab", ".dynsym"):
         section = elf.get_section_by_name(table)
         if section is None or not section["sh_size"]:
@@ -254,7 +254,7 @@ class Image:
         return self._paths.get(name, "")
 
     def find(self, name: str) -> _LoadedObject | None:
-        """An object or region by its name; None if no such object is loaded.
+        """Return an object or region by its name; None if no such object is loaded.
 
         An object is read on first use, because a Python process has hundreds.
         """
@@ -264,14 +264,14 @@ class Image:
         return self._loaded[name]
 
     def object_at(self, address: int) -> _LoadedObject | None:
-        """The object that holds an address."""
+        """Return the object that holds an address."""
         index = bisect.bisect_right(self._starts, address) - 1
         if index < 0 or address >= self._sorted[index][1]:
             return None
         return self.find(self._sorted[index][2])
 
     def named(self, name: str) -> _LoadedObject:
-        """An object by its file name.
+        """Return an object by its file name.
 
         Raises:
             UnknownName: no such object is loaded.
@@ -282,14 +282,14 @@ class Image:
         return loaded
 
     def locate(self, address: int) -> Location:
-        """The location of an address; unknown memory is the object `?`."""
+        """Return the location of an address; unknown memory is the object `?`."""
         loaded = self.object_at(address)
         if loaded is None:
             return Location("?", address)
         return Location(loaded.name, address - loaded.bias)
 
     def address(self, location: Location) -> int:
-        """The address of a location in this process.
+        """Return the address of a location in this process.
 
         Raises:
             UnknownName: its object is not loaded.
@@ -297,7 +297,7 @@ class Image:
         return self.named(location.object).bias + location.offset
 
     def symbol(self, location: Location) -> str:
-        """`function+offset` of a location, or the empty string."""
+        """Return `function+offset` of a location, or the empty string."""
         loaded = self.find(location.object)
         if loaded is None or loaded.facts is None:
             return ""
@@ -305,7 +305,7 @@ class Image:
         return "" if function is None else f"{function.name}+{location.offset - function.start:#x}"
 
     def function(self, name: str, objects: Iterable[str]) -> Location:
-        """The entry of a function in one of the named objects.
+        """Return the entry of a function in one of the named objects.
 
         Raises:
             UnknownName: none of them has it; the message suggests the nearest.
@@ -319,7 +319,7 @@ class Image:
         raise UnknownName("function", name, known[:200])
 
     def scope(self, objects: Iterable[str]) -> Scope:
-        """The text of the named objects.
+        """Return the code of the named objects.
 
         Raises:
             UnknownName: an object is not loaded; the message suggests the nearest.
@@ -353,7 +353,7 @@ def executable_mapping(pid: int, address: int) -> range:
 
 
 def _load(path: str, mappings: list[_Mapping]) -> _LoadedObject | None:
-    """The object of a mapped file; None if it is not an ELF file."""
+    """Return the object of a mapped file; None if it is not an ELF file."""
     if not Path(path).is_file():
         return None
     try:

@@ -28,7 +28,7 @@ class BitActivation(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Injection:
-    """The result of corrupting at the stop."""
+    """The result of a corruption at the stop."""
 
     applied: bool
     reason: str  # why it was not applied; empty if it was
@@ -51,7 +51,7 @@ NOTHING = Followed(activation=BitActivation.NOT_INJECTED, after_instructions=0)
 
 
 def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
-    """Run to the exact execution of the trigger.
+    """Run the target to the exact execution that the trigger names.
 
     Returns:
         Why it was not reached, or the empty string.

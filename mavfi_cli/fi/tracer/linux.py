@@ -130,7 +130,7 @@ class Memory:
         return self._file
 
     def read(self, address: int, size: int) -> bytes:
-        """Bytes at an address."""
+        """Return the bytes at an address."""
         return os.pread(self._open(), size, address)
 
     def write(self, address: int, data: bytes) -> None:
@@ -146,7 +146,7 @@ class Memory:
 
 @contextmanager
 def fixed_addresses() -> Iterator[None]:
-    """Start programs inside without address-space randomisation, so that addresses repeat."""
+    """Programs that start in this context have no address-space randomisation: addresses repeat."""
     before = int(_personality(0xFFFF_FFFF))
     if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
         yield  # a sandbox may refuse; then only offsets repeat, not addresses
@@ -170,7 +170,7 @@ def share_processor(pid: int) -> None:
 
 
 def cpu_time_s(pid: int) -> float:
-    """CPU time that all threads of a process have used, s; 0 when it has ended.
+    """Return the CPU time that all threads of a process have used, s; 0 when it has ended.
 
     The clock id encoding is that of clock_getcpuclockid(3) on Linux.
     """
@@ -214,7 +214,7 @@ class Status:
 
 
 def wait(tid: int) -> Status:
-    """Wait for the next report of one thread, or of any with -1.
+    """Wait for the next report of one thread, or of any thread for -1.
 
     Raises:
         ChildProcessError: there is no thread to wait for.

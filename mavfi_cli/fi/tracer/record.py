@@ -30,7 +30,7 @@ VERSION = 2  # version 1 had whole registers as operands
 
 
 def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecord:
-    """Return the record before the flip.
+    """Return the record of a fault before the flip.
 
     Args:
         image: image of the process, for symbols and build ids.
@@ -69,7 +69,7 @@ def _stage_to_json(stage: CountedStop) -> StageRecord:
 def completed(
     record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
 ) -> FaultRecord:
-    """Return the record after the run; `injection` is None if the trigger was not reached."""
+    """Return the record after the run. `injection` is None if the trigger was not reached."""
     what: dict[str, Any] = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}

@@ -34,7 +34,7 @@ _CODE = bytes.fromhex(
 
 
 def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
-    """EAX, EBX, ECX, EDX of one CPUID leaf."""
+    """Return EAX, EBX, ECX, EDX of one CPUID leaf."""
     page = mmap.mmap(-1, 4096, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     page.write(_CODE)
     start = ctypes.addressof(ctypes.c_char.from_buffer(page))
@@ -47,7 +47,7 @@ def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
 
 @functools.lru_cache(maxsize=1)
 def _xsave_offsets() -> dict[int, int]:
-    """Offsets of the XSAVE components from 2 on, in the standard (not compacted) format, bytes."""
+    """Return the offsets of XSAVE components 2 and above, bytes, in the standard format."""
     low, _, _, high = _cpuid(0xD, 0)
     enabled = low | high << 32
     return {n: _cpuid(0xD, n)[1] for n in range(2, 63) if enabled >> n & 1}
@@ -72,7 +72,7 @@ CALL_ARGUMENTS = ("rdi", "rsi", "rdx", "r10", "r8", "r9")  # of a system call
 
 @functools.lru_cache(maxsize=1)
 def widest_vector() -> str:
-    """The name of the full vector registers of this processor."""
+    """Return the name of the full vector registers of this processor."""
     offsets = _xsave_offsets()
     return "zmm" if ZMM_HIGH in offsets else "ymm" if AVX in offsets else "xmm"
 
@@ -87,7 +87,7 @@ class _Span:
 
 
 def width_of(name: str) -> int:
-    """Width of a full register in bits.
+    """Return the width of a full register in bits.
 
     Raises:
         KeyError: no such register.
@@ -102,7 +102,7 @@ def width_of(name: str) -> int:
 
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:
-    """The parts of a vector register that this processor has."""
+    """Return the parts of a vector register that this processor has."""
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
     offsets = _xsave_offsets()
     if index >= 16:
@@ -132,7 +132,7 @@ class Registers:
         self._extended = None
 
     def general(self) -> list[int]:
-        """`user_regs_struct` as 27 integers."""
+        """Return `user_regs_struct` as 27 integers."""
         if self._general is None:
             buffer = ctypes.create_string_buffer(216)
             linux.get_registers(self.tid, NT_PRSTATUS, buffer)
@@ -141,7 +141,7 @@ class Registers:
         return self._general
 
     def extended(self) -> bytes:
-        """The XSAVE area in standard format."""
+        """Return the XSAVE area in standard format."""
         if self._extended is None:
             buffer = ctypes.create_string_buffer(16384)
             size = linux.get_registers(self.tid, NT_X86_XSTATE, buffer)
@@ -149,7 +149,7 @@ class Registers:
         return self._extended
 
     def read(self, name: str) -> int:
-        """The value of a full register.
+        """Return the value of a full register.
 
         Raises:
             KeyError: no such register on this processor.

@@ -62,7 +62,7 @@ class Stratum:
     detours: bool = True  # whether detours count executions
 
     def without_detours(self) -> Stratum:
-        """The same windows, without detours on the way to an execution."""
+        """Return the same windows, without detours on the way to an execution."""
         segments = (
             replace(segment, start=tuple(replace(stop, detour=None) for stop in segment.start))
             for segment in self.segments
@@ -85,18 +85,18 @@ class Stratum:
         return len(self.segments) == self.windows_in_run
 
     def address(self, position: int) -> int:
-        """The address of one executed instruction, counted over all segments."""
+        """Return the address of one executed instruction, counted over all segments."""
         segment, index = self._at(position)
         return int(segment.trace[index])
 
     def trigger(
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """The trigger of one executed instruction, and k, the number of its execution."""
+        """Return the trigger of one executed instruction, and k, the number of its execution."""
         return _plan_trigger(*self._at(position), locate, code_at if self.detours else None)
 
     def _at(self, position: int) -> tuple[Segment, int]:
-        """The segment and index of one executed instruction, counted over all segments."""
+        """Return the segment and index of one executed instruction, counted over all segments."""
         for segment in self.segments:
             if position < len(segment.trace):
                 return segment, position

@@ -58,7 +58,7 @@ class Program:
         stdin: Path = Path(os.devnull),
         memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
-        """Make a command whose program is searched on the path.
+        """Make a command. Its program is searched on the PATH.
 
         Args:
             environment: by default the variables of this process for paths, language and number of
@@ -171,7 +171,7 @@ def _fix_random_bytes(tracee: Tracee) -> None:
 
 
 def _auxiliary(pid: int, key: int) -> int | None:
-    """A value of the auxiliary vector of a program (getauxval(3))."""
+    """Return a value of the auxiliary vector of a program (getauxval(3))."""
     words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
     return next((value for name, value in words if name == key), None)
 
@@ -249,7 +249,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
 
 
 def _record_entry(tracee: Tracee, observed: ObservedRun) -> None:
-    """Record the request of a system call, at its entry."""
+    """Record what a system call requests, at its entry."""
     registers = tracee.registers
     number = registers.system_call
     if number == _IOCTL:
@@ -288,7 +288,7 @@ def _signed(value: int, bits: int) -> int:
 
 
 def _text(memory: linux.Memory, address: int) -> str:
-    """The text at an address; empty if there is none."""
+    """Return the text at an address; empty if there is none."""
     try:
         data = memory.read(address, 4096 - address % 4096)
         if b"\0" not in data:

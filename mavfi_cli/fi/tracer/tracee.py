@@ -58,7 +58,7 @@ class Mechanism(Enum):
 
     @classmethod
     def best(cls) -> Mechanism:
-        """The best mechanism that this machine allows."""
+        """Return the best mechanism that this machine allows."""
         return cls.PERF if perf_allowed() is None else cls.DEBUG
 
 
@@ -112,7 +112,7 @@ class ExecutionCounter:
         self._fd = _open_event(tid, address, stop_at)
 
     def read(self) -> int:
-        """Executions since the counter was opened; valid after the thread's end too."""
+        """Return the executions since the counter was opened, also after the thread's end."""
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
@@ -135,14 +135,14 @@ _ANY_CHILD = -1
 
 
 def _signal_code(tid: int) -> int:
-    """The `si_code` of a signal-delivery stop."""
+    """Return the `si_code` of a signal-delivery stop."""
     buffer = (ctypes.c_int * 32)()
     linux.request(linux.GETSIGINFO, tid, 0, ctypes.addressof(buffer))
     return int(buffer[2])
 
 
 def _threads_of(pid: int) -> list[int]:
-    """The thread ids of a process, ascending; empty when it has ended."""
+    """Return the thread ids of a process, ascending; empty when it has ended."""
     try:
         return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
     except FileNotFoundError:
@@ -210,11 +210,11 @@ class Tracee:
         self._interrupting = False
 
     def step(self) -> Ended | None:
-        """Execute one instruction, or one iteration of a repeated one; return as `resume`."""
+        """Execute one instruction, or one iteration of a repeated one. Return as `resume`."""
         return self._go(linux.SINGLESTEP)
 
     def resume(self) -> Ended | None:
-        """Run until the tracer's trap stops the target thread. Return None then, or the end."""
+        """Run until the tracer's trap stops the target. Return None, or how the process ended."""
         return self._go(linux.CONT)
 
     def resume_until_alarm(self, alarm: ProcessTimer) -> Ended | None:
@@ -365,7 +365,7 @@ class Tracee:
                 self._continue(status, linux.CONT)
 
     def _trapped(self, status: linux.Status) -> bool:
-        """True if the caller waits for this stop of the target; False if it passes."""
+        """Return True if the caller waits for this stop of the target; False if it passes."""
         if status.event == linux.EVENT_STOP:
             return self._interrupting
         if status.trapped:

@@ -53,7 +53,7 @@ class Touched:
 
 
 def low(count: int) -> int:
-    """A mask of the lowest bits."""
+    """Return a mask of the `count` lowest bits."""
     return (1 << count) - 1
 
 
@@ -91,7 +91,7 @@ class _VectorForm:
         return self.first if name == "a" else self.last
 
     def is_vector(self, position: int) -> bool:
-        """True for a vector register."""
+        """Return True if the operand is a vector register."""
         return bool(VECTOR.match(self.names[position]))
 
     def read(self, position: int, mask: int) -> None:
@@ -108,7 +108,7 @@ class _VectorForm:
             target.clears = low(64)  # a mask, or a general register of 32 bits or more
 
     def same(self, one: int, other: int) -> bool:
-        """True if two operands are the same register."""
+        """Return True if two operands are the same register."""
         return bool(self.names[one]) and self.names[one] == self.names[other]
 
 
