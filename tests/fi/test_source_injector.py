@@ -342,7 +342,12 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
             FaultSpecError,
             "field sign must be at most 1, got 2",
         ),
-        (Corruption(bits=65), None, FaultSpecError, "mean is float64: bits of its field any must be at most 64"),
+        (
+            Corruption(bits=65),
+            None,
+            FaultSpecError,
+            "mean is float64: bits of its field any must be",
+        ),
         (Corruption(), [64], FaultError, "64"),
     ],
 )
