@@ -133,7 +133,7 @@ KERNELS = ("point_cloud", "octomap", "collision_check", "planner", "control")
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("[kernels.control]\nlatency_s = 0.1\n", "", "kernels.control: missing; every"),
+        ("[kernels.control]\nlatency_s = 0.1\n", "", "error: p.toml: kernels.control: missing;"),
         ("[kernels.planner]\nlatency_s = 0.1", "[kernels.planner]\nlatency_s = -0.1",
          "error: p.toml:11: kernels.planner: latency_s must be at least 0, got -0.1"),
         ("power_w = 5.0", "power_w = -5.0", "error: p.toml: power_w: must be at least 0, got -5"),
