@@ -15,7 +15,7 @@ from mavfi_cli.analysis.pairs import paired
 from mavfi_cli.companion.pipeline import BRAKE_SHARE
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.bootstrap import interval
-from mavfi_cli.stats.shares import Interval, Share, rate
+from mavfi_cli.stats.shares import Interval, Share, wilson
 from mavfi_cli.vpm.model import REFERENCE, SCHEMES, Performance
 from mavfi_cli.vpm.report import ModelReport, VehicleReport
 
@@ -242,7 +242,7 @@ class _Arm:
             braking_velocity_mps=setup.braking_velocity_mps,
             cut=setup.cut,
             errors=tuple(errors(self.flights, "{reason}")),
-            success=rate(won.num_rows, ended.num_rows),
+            success=wilson(won.num_rows, ended.num_rows),
             outcomes=dict(Counter(ended["outcome"].to_pylist()).most_common()),
             velocity_mps=beside(performance.velocity_mps, "mean_speed_mps"),
             top_velocity_mps=beside(performance.velocity_mps, "max_speed_mps"),

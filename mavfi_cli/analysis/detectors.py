@@ -27,7 +27,7 @@ from mavfi_cli.link.session import SessionSettings
 from mavfi_cli.stats.bootstrap import interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
 from mavfi_cli.stats.roc import Curves
-from mavfi_cli.stats.shares import Interval, Share, mixture, rate
+from mavfi_cli.stats.shares import Interval, Share, mixture, wilson
 
 NONE = "none"  # no detector: the reference of all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
@@ -489,8 +489,8 @@ def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> Erro
         alarms=int(alarms.sum()),
         episodes=int(numbers(pairs, "episodes").sum()),
         alarms_per_hour=_rate_per_hour(alarms, hours),
-        with_alarm=rate(int(np.count_nonzero(alarms)), pairs.num_rows),
-        lost=rate(test.only_first, test.both + test.only_first),
+        with_alarm=wilson(int(np.count_nonzero(alarms)), pairs.num_rows),
+        lost=wilson(test.only_first, test.both + test.only_first),
         gained=test.only_second,
         success=test,
         lengthening=_interval(known(numbers(pairs, "lengthening")), median),
@@ -533,7 +533,7 @@ def _fault_row(by: str, value: str, detector: str, bare: pa.Table, pairs: pa.Tab
         golden_failed=active.num_rows - judged.num_rows,
         active=judged.num_rows,
         crashed=int(flags(judged, "crashed").sum()),
-        harmful=rate(harmful_count, judged.num_rows),
+        harmful=wilson(harmful_count, judged.num_rows),
         lost=counts[LOST],
         longer=counts[LATE],
         flown=flown.num_rows,
@@ -559,7 +559,7 @@ def _fault_row(by: str, value: str, detector: str, bare: pa.Table, pairs: pa.Tab
 
 
 def _share(pairs: pa.Table, column: str, *, wanted: bool = True) -> Share:
-    return rate(int((flags(pairs, column) == wanted).sum()), pairs.num_rows)
+    return wilson(int((flags(pairs, column) == wanted).sum()), pairs.num_rows)
 
 
 def _ends(pairs: pa.Table, first: str) -> McNemar:

@@ -19,7 +19,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer, rate
+from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer, wilson
 
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 
@@ -74,7 +74,7 @@ def setting_failures(
         if group.golden or not struck:
             continue
         failed = struck - int(group.succeeded[places].sum())
-        failure = rate(failed, struck, confidence)
+        failure = wilson(failed, struck, confidence=confidence)
         numbers = group.codes("number")[places].tolist()
         configs = list(ledger.configs(numbers)) if alone else []
         kernel, layers = _kernel(configs), None

@@ -36,7 +36,7 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_rows, median
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, sign_flips
-from mavfi_cli.stats.shares import Interval, Share, rate
+from mavfi_cli.stats.shares import Interval, Share, wilson
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
@@ -354,7 +354,7 @@ def _setting(platform: str, setting: str, flown: int, counted: pa.Table) -> Sett
         flown=flown,
         counted=counted.num_rows,
         outcomes=dict(sorted((end["values"], end["counts"]) for end in ends)),
-        success=rate(int(flags(counted, "succeeded").sum()), counted.num_rows),
+        success=wilson(int(flags(counted, "succeeded").sum()), counted.num_rows),
         quantities={own.name: _measured(own, counted) for own in QUANTITIES},
     )
 

@@ -21,7 +21,7 @@ from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
-from mavfi_cli.stats.shares import Interval, Share, rate
+from mavfi_cli.stats.shares import Interval, Share, wilson
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 INACTIVE = frozenset(kind.value for kind in Injected) - COUNTED
@@ -427,7 +427,7 @@ def summarise(
 def _setting(group: Group, confidence: float) -> SettingSummary:
     def success(fates: frozenset[str]) -> Share:
         chosen = group.succeeded[group.among("injected", fates)]
-        return rate(int(chosen.sum()), len(chosen), confidence)
+        return wilson(int(chosen.sum()), len(chosen), confidence=confidence)
 
     return SettingSummary(
         labels=group.labels,

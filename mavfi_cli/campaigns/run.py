@@ -49,7 +49,7 @@ from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import record_of
 from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import wilson
 
 Row = tuple[str | None, str | None]  # outcome, what happened to the fault
 
@@ -304,7 +304,7 @@ class MissionQueue:
     def _narrow(self, cell: int, stop: Stop) -> bool:
         rows = [self._over[number] for number in self._members[cell][: self._open[cell]]]
         counted = [outcome for outcome, injected in rows if injected in COUNTED]
-        share = rate(counted.count("success"), len(counted), stop.confidence)
+        share = wilson(counted.count("success"), len(counted), confidence=stop.confidence)
         return (share.high - share.low) / 2.0 <= stop.margin
 
 

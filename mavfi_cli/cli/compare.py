@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +63,9 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_output("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
 @_output("--csv", "as_csv", is_flag=True, help="Print the comparison as CSV, one number per row.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
-def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
+def compare(
+    out: Path, as_json: bool, as_csv: bool, quiet: bool, jobs: int | None, **options: Any
+) -> None:
     """Fly the same missions on each platform: golden, with faults, and with detectors.
 
     World, start, noise and faults are the same on all platforms. The same command resumes an
@@ -79,9 +81,9 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
 
     if as_json and as_csv:
         raise click.UsageError("--json cannot be combined with --csv")
-    plan = _plan(options)
+    plan = _plan(**options)
     with missions_view(quiet=quiet) as view:
-        comparison = run(plan, out, Options(jobs=options["jobs"] or 0), view)
+        comparison = run(plan, out, Options(jobs=jobs or 0), view)
     contents = plain(asdict(comparison))
     write_json(out / "compare.json", contents)
     write_text(out / "compare.csv", platform_csv(comparison))
@@ -96,20 +98,19 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any)
         echo_lines([*platform_lines(comparison), "", f"Files  {out}: {files}"])
 
 
-def _plan(options: dict[str, Any]) -> ComparePlan:
+def _plan(
+    *, platforms: tuple[str, ...], inject: str | None, detectors: str | None, **same: Any
+) -> ComparePlan:
     from mavfi_cli.core.errors import ConfigError
     from mavfi_cli.studies.compare import ComparePlan
 
-    names = ("world", "field", "missions", "first_seed", "seed", "stack")
-    chosen: dict[str, Any] = {name: options[name] for name in names}
-    if options["platforms"]:
-        chosen["platforms"] = options["platforms"]
-    if options["inject"] is not None:
-        targets = names_in(options["inject"])
+    plan = ComparePlan(**same)
+    if platforms:
+        plan = replace(plan, platforms=platforms)
+    if inject is not None:
+        targets = names_in(inject)
         if not targets:
-            problem = f"must name at least one target, or be none, got {options['inject']!r}"
+            problem = f"must name at least one target, or be none, got {inject!r}"
             raise ConfigError(problem, key="inject")
-        chosen["inject"] = () if targets == ("none",) else targets
-    if options["detectors"] is not None:
-        chosen["detectors"] = names_in(options["detectors"])
-    return ComparePlan(**chosen)
+        plan = replace(plan, inject=() if targets == ("none",) else targets)
+    return plan if detectors is None else replace(plan, detectors=names_in(detectors))

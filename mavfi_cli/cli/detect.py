@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,7 +108,9 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
 @_output("--json", "as_json", is_flag=True, help="Print the evaluation as JSON.")
 @_output("--csv", "as_csv", is_flag=True, help="Print the evaluation as CSV, one pair per row.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
-def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
+def evaluate(
+    out: Path, as_json: bool, as_csv: bool, quiet: bool, jobs: int | None, **options: Any
+) -> None:
     """Evaluate detectors on held-out missions: golden, faulty, and faulty with detector.
 
     The same command resumes an interrupted evaluation. More flights, worlds or detectors are added
@@ -127,9 +129,9 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
 
     if as_json and as_csv:
         raise click.UsageError("--json cannot be combined with --csv")
-    plan = _plan(options)
+    plan = _plan(**options)
     with missions_view(quiet=quiet) as view:
-        evaluation, pairs = run(plan, out, Options(jobs=options["jobs"] or 0), view)
+        evaluation, pairs = run(plan, out, Options(jobs=jobs or 0), view)
     contents = plain(asdict(evaluation))
     write_json(out / "evaluation.json", contents)
     write_text(out / "evaluation.csv", detector_csv(*pairs))
@@ -144,19 +146,29 @@ def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any
         echo_lines([*detector_lines(evaluation), "", f"Files  {out}: {files}"])
 
 
-def _plan(options: dict[str, Any]) -> EvaluationPlan:
+def _plan(
+    *,
+    worlds: tuple[str, ...] | None,
+    detectors: str | None,
+    golden_flights: int,
+    flights: int,
+    protect: str,
+    fields: str,
+    platform: str | None,
+    stack: str | None,
+    **same: Any,
+) -> EvaluationPlan:
     from mavfi_cli.spec.mission import MissionConfig
     from mavfi_cli.studies.evaluate import DETECTORS, WORLDS, EvaluationPlan
 
-    base = {key: options[key] for key in ("platform", "stack") if options[key] is not None}
-    named = options["detectors"]
-    same = ("flights", "first_seed", "models", "level", "seed")
+    base = MissionConfig()
     return EvaluationPlan(
-        worlds=options["worlds"] or WORLDS,
-        detectors=DETECTORS if named is None else names_in(named),
-        golden_flights=max(options["golden_flights"], options["flights"]),
-        protect=names_in(options["protect"]),
-        fields=names_in(options["fields"]),
-        base=MissionConfig(**base),
-        **{name: options[name] for name in same},
+        worlds=worlds or WORLDS,
+        detectors=DETECTORS if detectors is None else names_in(detectors),
+        golden_flights=max(golden_flights, flights),
+        flights=flights,
+        protect=names_in(protect),
+        fields=names_in(fields),
+        base=replace(base, platform=platform or base.platform, stack=stack or base.stack),
+        **same,
     )

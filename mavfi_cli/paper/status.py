@@ -30,7 +30,7 @@ from mavfi_cli.paper.items import (
 from mavfi_cli.paper.layouts import of_flights
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.report.setting_table import SettingColumns
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import wilson
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 
@@ -165,7 +165,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
     rows = []
     for group in found:
         won = group.succeeded[group.counted]
-        success = PaperCell.of_share(rate(int(won.sum()), len(won)))
+        success = PaperCell.of_share(wilson(int(won.sum()), len(won)))
         means = (PaperCell.of_mean(k * group.successes(name)) for name, k in _MEANS.values())
         labels = tuple(settings.cells(group.labels, group.name))
         rows.append(PaperRow(labels=labels, cells=(success, *means)))

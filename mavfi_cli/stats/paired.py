@@ -73,27 +73,6 @@ class McNemar:
         """Success rate of the second minus that of the first; NaN without pairs."""
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
 
-    @property
-    def effect(self) -> Interval:
-        """The difference with its interval; NaN without pairs.
-
-        D. G. Bonett and R. M. Price, J. Educational and Behavioral Statistics 37, 2012: one pair is
-        added to each kind of pair that differs, so 0 of n differences still has a width.
-        """
-        if not self.pairs:
-            return NO_INTERVAL
-        gained, lost = (
-            (each + 1) / (self.pairs + 2) for each in (self.only_second, self.only_first)
-        )
-        centre = gained - lost
-        half = z_of(0.95) * math.sqrt((gained + lost - centre**2) / (self.pairs + 2))
-        return Interval(
-            value=self.difference,
-            low=max(-1.0, centre - half),
-            high=min(1.0, centre + half),
-            count=self.pairs,
-        )
-
 
 def sign_flips(differences: Sequence[float]) -> float:
     """Two-sided p-value of Fisher's randomisation test of paired differences.
@@ -201,7 +180,8 @@ def paired_difference(
     """Rate of the second minus rate of the first, of the same missions; NaN without any.
 
     The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
-    37, 2012). The number of pairs is divided by the design effect of the clusters.
+    37, 2012): one pair is added to each kind of pair that differs, so 0 of n differences still has
+    a width. The number of pairs is divided by the design effect of the clusters.
 
     Args:
         first, second: whether each mission is a hit under each treatment, (n,).

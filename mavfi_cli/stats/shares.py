@@ -130,11 +130,6 @@ def z_of(confidence: float) -> float:
     return float(ndtri(0.5 + confidence / 2.0))
 
 
-def rate(successes: int, total: int, confidence: float = 0.95) -> Share:
-    """A proportion with its Wilson score interval."""
-    return wilson(successes, total, confidence=confidence)
-
-
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
     """`share`, `low` and `high` of a whole from its parts, each weighted by its true size.
 
@@ -233,8 +228,8 @@ def cross_layer(
         corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
         failed, mission_faults: failures beyond the golden ones and applied faults of missions.
     """
-    corruption = rate(corrupted, kernel_faults, confidence)
-    failure = rate(failed, mission_faults, confidence)
+    corruption = wilson(corrupted, kernel_faults, confidence=confidence)
+    failure = wilson(failed, mission_faults, confidence=confidence)
     ends = None
     if corrupted and failure.share <= corruption.share:
         value, low, high = (

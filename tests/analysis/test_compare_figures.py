@@ -11,7 +11,7 @@ from flown_twice import PLAN, SEEDS, comparison, figures_of, flight
 
 from mavfi_cli.analysis.platforms import QUANTITIES, ChangedQuantity
 from mavfi_cli.report.platforms import platform_csv, platform_lines
-from mavfi_cli.stats.shares import Share, rate
+from mavfi_cli.stats.shares import Share, wilson
 from mavfi_cli.studies.compare import ComparePlan
 
 
@@ -43,8 +43,10 @@ def test_success_is_counted_with_wilsons_interval():
     flights = [flight("x86", s, 20.0, outcome="success" if s > 3 else "collision") for s in SEEDS]
     told = figures_of(ComparePlan(platforms=("x86",), inject=()), flights)
     (golden,) = told.settings
-    wilson = rate(7, 10)
-    assert golden.success == Share(count=7, total=10, share=0.7, low=wilson.low, high=wilson.high)
+    interval = wilson(7, 10)
+    assert golden.success == Share(
+        count=7, total=10, share=0.7, low=interval.low, high=interval.high
+    )
     assert golden.outcomes == {"collision": 3, "success": 7}
     assert golden.quantities["flight_time_s"].median.count == 7
     assert golden.quantities["response_median_s"].median.count == 10  # failed ones too

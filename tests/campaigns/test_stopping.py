@@ -11,11 +11,11 @@ from mavfi_cli.campaigns.missions import Injected, MissingMission
 from mavfi_cli.campaigns.run import MissionQueue
 from mavfi_cli.campaigns.specification import Stop
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import rate
+from mavfi_cli.stats.shares import wilson
 
 CONFIG = MissionConfig()
 STOP = Stop(margin=0.12, batch=10)
-rate(1, 2)  # imports SciPy, for which an example of hypothesis has no time
+wilson(1, 2)  # imports SciPy, for which an example of hypothesis has no time
 
 
 def fly(outcomes, cells, slots, seed):
@@ -47,13 +47,13 @@ def test_slots_and_order_make_no_difference(outcomes, seed):
     assert gate.stopped == same.stopped
     for cell in (0, 1):
         mine = [outcomes[number] for number in flown if cells[number] == cell]
-        share = rate(mine.count("success"), len(mine))
+        share = wilson(mine.count("success"), len(mine))
         width = (share.high - share.low) / 2
         assert len(mine) % STOP.batch == 0
         assert len(mine) == 60 or width <= STOP.margin
         if len(mine) > STOP.batch:
             before = mine[: -STOP.batch]
-            share = rate(before.count("success"), len(before))
+            share = wilson(before.count("success"), len(before))
             assert (share.high - share.low) / 2 > STOP.margin
 
 

@@ -18,7 +18,6 @@ from mavfi_cli.stats.shares import (
     missions_for_margin,
     mixture,
     pairs_for_difference,
-    rate,
     unseen_share,
     wilson,
 )
@@ -29,7 +28,7 @@ COUNTS = st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.j
 @given(COUNTS, st.sampled_from([0.8, 0.95, 0.99]))
 def test_intervals_of_rates_are_wilsons(counts, confidence):
     successes, total = counts
-    share = rate(successes, total, confidence)
+    share = wilson(successes, total, confidence=confidence)
     oracle = stats.binomtest(successes, total).proportion_ci(confidence, method="wilson")
     assert (share.low, share.high) == pytest.approx((oracle.low, oracle.high), abs=1e-12)
 
@@ -48,7 +47,7 @@ def test_the_planned_number_is_the_fewest_with_such_a_margin(margin, expected, c
 
 def test_the_planned_number_of_a_known_case():
     assert missions_for_margin(0.05) == 381
-    enough, less = (rate(190, missions) for missions in (381, 380))
+    enough, less = (wilson(190, missions) for missions in (381, 380))
     assert enough.high - enough.low <= 2 * 0.05 < less.high - less.low
 
 
@@ -214,23 +213,23 @@ def test_failure_given_corruption():
 
 
 def test_failures_an_hour_are_the_upsets_that_fail_missions():
-    share = rate(20, 100)
+    share = wilson(20, 100)
     assert share.per_hour(3.0) == pytest.approx((0.6, 3.0 * share.low, 3.0 * share.high))
     with pytest.raises(ConfigError, match="at least 0"):
         share.per_hour(-1.0)
 
 
 def test_a_mixture_of_one_part_is_that_part():
-    part = rate(7, 9)
-    whole = mixture([(90, part), (0, rate(0, 0))])
+    part = wilson(7, 9)
+    whole = mixture([(90, part), (0, wilson(0, 0))])
     assert whole == pytest.approx({"share": part.share, "low": part.low, "high": part.high})
 
 
 def test_a_mixture_weighs_by_size_not_by_sample():
-    whole = mixture([(900, rate(10, 10)), (100, rate(0, 50))])
+    whole = mixture([(900, wilson(10, 10)), (100, wilson(0, 50))])
     assert whole["share"] == pytest.approx(0.9)
     assert whole["low"] < 0.9 <= whole["high"]
-    assert math.isnan(mixture([(5, rate(0, 0)), (5, rate(1, 1))])["share"])
+    assert math.isnan(mixture([(5, wilson(0, 0)), (5, wilson(1, 1))])["share"])
 
 
 @pytest.mark.parametrize(("count", "total"), [(0, 10), (3, 10), (10, 10), (84, 1000)])
