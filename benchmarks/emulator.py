@@ -31,7 +31,10 @@ from unicorn.unicorn_py3.unicorn import uclib
 
 ENVIRONMENT = {
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-AVX,-AVX_Fast_Unaligned_Load,-FMA,-ERMS",
+    "LC_CTYPE": "C.UTF-8",  # as Python sets it in the C locale
     "LD_BIND_NOW": "1",  # or the first call of a function saves the registers by an AVX instruction
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
     "PATH": "/usr/bin",
 }
 AVX_PREFIXES = (0x62, 0xC4, 0xC5)

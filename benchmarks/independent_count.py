@@ -1,9 +1,10 @@
 """PINFI's rule in mavfi and in an emulator: shares of outcomes, and the same faults in both.
 
     python benchmarks/independent_count.py --out FOLDER [--runs 5000]
-        [--emulated 2000] [--pairs 500] [--jobs 2] [--program NAME ...]
+        [--emulated 2000] [--pairs 500] [--jobs 2] [--program NAME ...] [--sources FOLDER]
+        [--hang-ratio 200]
 
-For each program of tests/programs:
+For each program of tests/programs, or of another folder of C files:
 
 1. `mavfi kernels --program --compat pinfi` injects faults.
 2. The emulator (benchmarks/emulator.py) injects faults of its own. It draws an executed
@@ -44,7 +45,8 @@ from mavfi_cli.stats.shares import wilson
 
 SOURCES = Path(__file__).parents[1] / "tests" / "programs"
 OUTCOMES = ("benign", "crash", "hang", "sdc")
-HANG_RATIO = 200  # times the golden basic blocks; mavfi allows 10 times the CPU time, plus 1 s
+HANG_RATIO = 200  # times the golden basic blocks; mavfi allows 10 times the CPU time, plus 1 s,
+# which is the same for a program that takes 5 ms
 EXCLUDED = ("_start", "__libc", "__do_global", "frame_dummy", "call_gmon_start", "__stat")
 CARRY, PARITY, ZERO, SIGN, DIRECTION, OVERFLOW = 0, 2, 6, 7, 10, 11
 VISIBLE = {"flags": (1 << 32) - 1, "general": (1 << 64) - 1, "vector": (1 << 128) - 1}
@@ -217,9 +219,10 @@ class Bench:
     golden: End
     addresses: np.ndarray  # (n,) of the file, of the instructions that count
     executions: np.ndarray  # (n,)
+    hang_ratio: int
 
     @classmethod
-    def of(cls, program: Path) -> Bench:
+    def of(cls, program: Path, hang_ratio: int = HANG_RATIO) -> Bench:
         """Run a program once without a fault, and once to count executions."""
         snapshot, code = take_snapshot(program), Code(program)
         golden = Emulation(snapshot).finish(1 << 40)
@@ -230,7 +233,7 @@ class Bench:
         addresses = np.array(code.targets(), np.int64)
         return cls(
             snapshot=snapshot, code=code, golden=golden, addresses=addresses,
-            executions=counts[addresses - code.first],
+            executions=counts[addresses - code.first], hang_ratio=hang_ratio,
         )  # fmt: skip
 
     def draw(self, seed: int, number: int) -> Fault:
@@ -249,7 +252,7 @@ class Bench:
         if not run.run_to(self.snapshot.bias + fault.address, fault.k):
             raise RuntimeError(f"{fault} is never reached")
         before, after = self._flip(run, fault)
-        ended = run.finish(HANG_RATIO * self.golden.blocks)
+        ended = run.finish(self.hang_ratio * self.golden.blocks)
         return Result(
             outcome=self._outcome(ended), output_sha256=hashlib.sha256(ended.output).hexdigest(),
             before=before, after=after, reason=ended.reason,
@@ -287,14 +290,13 @@ class Bench:
 # --- mavfi
 
 
-def build(name: str, folder: Path) -> Path:
+def build(source: Path, folder: Path) -> Path:
     """Compile a program by the command that its source names."""
-    source = SOURCES / f"{name}.c"
     command = re.search(r"^ \* +(gcc .+)$", source.read_text(), re.MULTILINE)
     assert command is not None, f"{source} names no command"
     shutil.copy(source, folder)
     subprocess.run(command[1].split(), cwd=folder, check=True)
-    return (folder / name).resolve()
+    return (folder / source.stem).resolve()
 
 
 def inject(program: Path, out: Path, *, runs: int, jobs: int) -> list[dict[str, Any]]:
@@ -419,11 +421,11 @@ def shares_table(name: str, ours: list[str], theirs: list[str]) -> None:
 
 
 def compare(
-    name: str, folder: Path, *, runs: int, emulated: int, pairs: int, jobs: int
+    source: Path, folder: Path, *, runs: int, emulated: int, pairs: int, jobs: int, hang_ratio: int
 ) -> list[list[Any]]:
     """Compare both on a program; the rows of its counts."""
-    program = build(name, folder)
-    work = Work(bench=Bench.of(program), seed=1)
+    name, program = source.stem, build(source, folder)
+    work = Work(bench=Bench.of(program, hang_ratio), seed=1)
     print(f"{name}: {work.bench.executions.sum()} executed instructions that count")
     theirs = in_parallel(work.own, range(emulated), folder / f"{name}-emulator.jsonl", jobs)
     records = inject(program, folder / f"{name}-mavfi", runs=runs, jobs=jobs)
@@ -453,15 +455,18 @@ def main() -> None:
     parser.add_argument("--emulated", type=int, default=2000, help="runs of the emulator")
     parser.add_argument("--pairs", type=int, default=500, help="runs of mavfi that it repeats")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--program", action="append", default=[], help="all of tests/programs")
+    parser.add_argument("--program", action="append", default=[], help="default: all")
+    parser.add_argument("--sources", type=Path, default=SOURCES, help="default: tests/programs")
+    parser.add_argument("--hang-ratio", type=int, default=HANG_RATIO, help="limit, golden blocks")
     arguments = parser.parse_args()
     folder = arguments.out.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    names = arguments.program or sorted(path.stem for path in SOURCES.glob("*.c"))
+    names = arguments.program or sorted(path.stem for path in arguments.sources.glob("*.c"))
     rows = [["program", "injector", "runs", "outcome", "count"]]
-    numbers = {name: getattr(arguments, name) for name in ("runs", "emulated", "pairs", "jobs")}
+    counted = ("runs", "emulated", "pairs", "jobs", "hang_ratio")
+    numbers = {name: getattr(arguments, name) for name in counted}
     for name in names:
-        rows += compare(name, folder, **numbers)
+        rows += compare(arguments.sources / f"{name}.c", folder, **numbers)
     with (folder / "counts.csv").open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 

@@ -26,7 +26,7 @@ def count(monkeypatch):
 
 
 def test_recorded_faults_do_the_same_in_an_emulator(count, tracing, tmp_path):
-    program = count.build("sorting", tmp_path)
+    program = count.build(count.SOURCES / "sorting.c", tmp_path)
     records = count.inject(program, tmp_path / "faults", runs=FAULTS, jobs=1)
     work = count.Work(bench=count.Bench.of(program), seed=1)
     repeated = [work.repeated(record) for record in records]
@@ -35,7 +35,7 @@ def test_recorded_faults_do_the_same_in_an_emulator(count, tracing, tmp_path):
 
 
 def test_an_own_fault_strikes_where_it_is_drawn(count, tmp_path):
-    bench = count.Bench.of(count.build("stencil", tmp_path))
+    bench = count.Bench.of(count.build(count.SOURCES / "stencil.c", tmp_path))
     drawn = [bench.draw(1, number) for number in range(300)]
     assert all(bench.code.written(fault.address) for fault in drawn)
     fault = next(each for each in drawn if each.struck.operand == "rax")
