@@ -14,7 +14,7 @@ from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Balance, Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.paper.items import BY_NAME, printed_name
+from mavfi_cli.paper.items import BY_NAME, STACKS, printed_name
 from mavfi_cli.paper.verdicts import ISOLATED, LEVEL, JudgedClaim, Judgement, Verdict
 from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
@@ -34,10 +34,16 @@ def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judg
     return judged.judgements.get(place, {}).get(fate)
 
 
+_SHORT = {
+    "gad": "GAD", "aad": "AAD", "pc": "P+C", "pid": "PID", "octomap": "OctoMap",
+    "rrtstar": "RRT*", "rrtconnect": "RRTConnect", "seq": "number", "1": "1 bit", "5": "5 bits",
+}  # fmt: skip
+
+
 def short_name(judged: JudgedClaim) -> str:
     """A claim in two or three words, such as `Fig. 8 velocity`."""
-    item, _, rest = judged.claim.name.partition("-")
-    return f"{printed_name(item)} {rest.replace('-', ' ')}"
+    item, *words = judged.claim.name.split("-")
+    return " ".join([printed_name(item), *(_SHORT.get(word, word) for word in words)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,21 +155,38 @@ def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreemen
     for judged in claims:
         judgement = judgement_of(judged, stack)
         if judgement and judgement.verdict is Verdict.CONTRADICTED:
-            reason = REASONS.get(judged.claim.name, "")
+            reason = reason_of(judged, stack)
             by_reason.setdefault(reason or judged.claim.name, []).append(judged)
     return [
-        Disagreement(claims=mine, reason=REASONS.get(mine[0].claim.name, ""))
-        for mine in by_reason.values()
+        Disagreement(claims=mine, reason=reason_of(mine[0], stack)) for mine in by_reason.values()
     ]
 
 
-def _read_reasons() -> Mapping[str, str]:
+def reason_of(judged: JudgedClaim, stack: str) -> str:
+    """Why a claim is contradicted on a stack; empty if that is not known, or it is not.
+
+    A reason was written about an effect. It stands only beside effects within the interval of that
+    one, on the stack of the paper and of isolated kernels.
+    """
+    words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
+    judgement = judgement_of(judged, stack)
+    if not judgement or judgement.verdict is not Verdict.CONTRADICTED or judgement.effect is None:
+        return ""
+    explained = judged.claim.isolated or stack == STACKS[0]
+    return words if explained and low <= judgement.effect.value <= high else ""
+
+
+def _read_reasons() -> Mapping[str, tuple[str, float, float]]:
     data, _ = read_toml(Path(__file__).parent / "reasons.toml")
-    return {name: reason["words"] for reason in data["reason"] for name in reason["claims"]}
+    return {
+        name: (reason["words"], *ends)
+        for reason in data["reason"]
+        for name, ends in reason["intervals"].items()
+    }
 
 
 REASONS = _read_reasons()
-"""Why claims are contradicted, by their names; written after the data."""
+"""Why claims are contradicted, with the interval of the effect that it explains, by their names."""
 
 
 # What a designer should do ------------------------------------------------------------------------

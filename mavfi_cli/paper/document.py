@@ -17,7 +17,6 @@ from mavfi_cli.core.installed import __version__
 from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.paper.answers import (
     LEVELS,
-    REASONS,
     Delays,
     DetectorBalance,
     Disagreement,
@@ -32,6 +31,7 @@ from mavfi_cli.paper.answers import (
     families,
     judgement_of,
     protections,
+    reason_of,
     short_name,
 )
 from mavfi_cli.paper.beyond import (
@@ -47,9 +47,17 @@ from mavfi_cli.paper.beyond import (
 )
 from mavfi_cli.paper.claims import judged
 from mavfi_cli.paper.figures import OVER_GOLDEN, draw, panel
-from mavfi_cli.paper.items import ITEMS, LEFT_OUT, FlightsPlan, Item, Source, printed_name
+from mavfi_cli.paper.items import (
+    ITEMS,
+    LEFT_OUT,
+    STACKS,
+    FlightsPlan,
+    Item,
+    Source,
+    printed_name,
+)
 from mavfi_cli.paper.layouts import of_flights
-from mavfi_cli.paper.sources import STACKS, CampaignSource, Evidence, KernelSource
+from mavfi_cli.paper.sources import CampaignSource, Evidence, KernelSource
 from mavfi_cli.paper.status import of_kernels, of_model
 from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Verdict
 from mavfi_cli.report.charts import (
@@ -171,7 +179,9 @@ class Document:
         """The stack whose verdicts are shown first."""
         return self.stacks[0]
 
-    reasons = REASONS
+    def reason(self, judged: JudgedClaim) -> str:
+        """Why a claim is contradicted; empty if it is not, or that is not known."""
+        return reason_of(judged, self.stack)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
         """How many claims have which verdict, by stack and of isolated kernels."""
@@ -286,7 +296,8 @@ def _forest(claims: Sequence[JudgedClaim], stacks: Sequence[str]) -> Picture | N
         if effect
     ).csv()  # fmt: skip
     title = "Effects with their 95 % intervals beside the ranges that the paper's claims give"
-    return Picture.of("forest", title, draw_forest(rows, stacks), csv)
+    broad, narrow = (draw_forest(rows, stacks, columns) for columns in ("two", "one"))
+    return Picture.of("forest", title, broad, csv, narrow)
 
 
 def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
@@ -308,7 +319,8 @@ def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
         for added in values
     ).csv()  # fmt: skip
     title = "Share of faulty flights that take longer than golden by more than so many seconds"
-    return Picture.of("delays", title, draw_delays(curves, golden_s), csv)
+    broad, narrow = (draw_delays(curves, golden_s, columns) for columns in ("two", "one"))
+    return Picture.of("delays", title, broad, csv, narrow)
 
 
 def _spread(stack: str, flights: Flights) -> Picture | None:

@@ -25,6 +25,7 @@ from mavfi_cli.report.paper import PaperColumn, PaperRow, PaperTable, Printed
 
 _PAPER, _ = read_toml(Path(__file__).parent / "paper.toml")
 _META = "reproduction"  # key of the ledger's `meta`
+STACKS = ("mavbench", "hardened")  # the paper's, and ours
 OUT, KERNELS_FOLDER = Path("reproduction"), "kernels"
 Key = str  # the configuration of a mission as text; equal missions have equal keys
 _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")

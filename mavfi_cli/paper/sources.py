@@ -24,7 +24,6 @@ from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.items import FlightsPlan
 from mavfi_cli.paper.status import of_kernels
 
-STACKS = ("mavbench", "hardened")  # the paper's, and ours
 _EXPORT, _SPEC = ".parquet", ".toml"
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
 

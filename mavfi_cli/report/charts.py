@@ -40,22 +40,32 @@ class Picture:
         title: its caption and alt text.
         markup: an SVG element.
         csv: its numbers.
+        narrow: the SVG element for a narrow screen; empty if `markup` serves both.
     """
 
     name: str
     title: str
     markup: str
     csv: str
+    narrow: str = ""
 
     @classmethod
-    def of(cls, name: str, title: str, figure: Figure, csv: str) -> Picture:
-        """The picture of a figure, in the page's font and colours."""
-        text = svg(figure)
-        markup = _OWN_ID.sub("", text[text.index("<svg") :])
-        markup = _FONT.sub(r"font-size: \1", markup)
-        for colour, variable in _THEME.items():
-            markup = markup.replace(colour, variable)
-        return cls(name=name, title=title, markup=markup.strip(), csv=csv)
+    def of(
+        cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
+    ) -> Picture:
+        """The picture of a figure, and of one for narrow screens, in the page's look."""
+        wide, small = (_markup(each) if each else "" for each in (figure, narrow))
+        return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
+
+
+def _markup(figure: Figure) -> str:
+    """A figure as an SVG element in the page's font and colours."""
+    text = svg(figure)
+    markup = _OWN_ID.sub("", text[text.index("<svg") :])
+    markup = _FONT.sub(r"font-size: \1", markup)
+    for colour, variable in _THEME.items():
+        markup = markup.replace(colour, variable)
+    return markup.strip()
 
 
 # Effects beside ranges ----------------------------------------------------------------------------
@@ -80,15 +90,24 @@ class ForestRow:
     verdict: str
 
 
-def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str]) -> Figure:
-    """A row for each claim: the claimed range as a band, the effects of the stacks upon it."""
+_FOREST_IN = {"one": 2.9, "two": 4.3}
+_GAPS = {"one": "\n", "two": " "}  # between the halves of an axis label
+
+
+def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str = "two") -> Figure:
+    """A row for each claim: the claimed range as a band, the effects of the stacks upon it.
+
+    Args:
+        columns: `one` on a narrow screen, otherwise `two`.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+    gap = _GAPS[columns]
     parts = [part for kind in (False, True) if (part := [x for x in rows if x.number is kind])]
     heights = [len(part) + 1 for part in parts]
-    figure = new_figure(4.3, 0.7 + 0.117 * sum(heights))
+    figure = new_figure(_FOREST_IN[columns], 0.7 + 0.117 * sum(heights))
     grid = figure.subplots(len(parts), 1, height_ratios=heights, squeeze=False)
     for axes, part in zip(grid[:, 0], parts, strict=True):
         numbers = part[0].number
@@ -97,7 +116,7 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str]) -> Figure:
         axes.tick_params(labelsize=6.2, labeltop=True, top=False)
         if not numbers:
             axes.set_xscale("symlog", linthresh=1.0, linscale=0.6)
-            ticks = [-100, -10, -1, 0, 1, 10, 100]
+            ticks = [-100, -1, 0, 1, 100] if columns == "one" else [-100, -10, -1, 0, 1, 10, 100]
             axes.xaxis.set_major_locator(FixedLocator(ticks))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
             axes.xaxis.set_minor_locator(NullLocator())
@@ -111,7 +130,8 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str]) -> Figure:
                     _effect(axes, y, effect, scale, place, row.verdict)
         axes.set_yticks(range(len(part)), [row.label for row in part], fontsize=6.2)
         axes.set_ylim(len(part) - 0.4, -0.6)
-        axes.set_xlabel("a number" if numbers else "points or per cent (logarithmic beyond 1)",
+        shares = ("points or per cent", "(logarithmic beyond 1)")
+        axes.set_xlabel("a number" if numbers else gap.join(shares),
                         fontsize=6.2, labelpad=1)  # fmt: skip
     marks: list[Patch | Line2D] = [Patch(color=_BAND, label="the paper's range")]
     marks += [
@@ -139,18 +159,21 @@ def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, ve
 # Added time ---------------------------------------------------------------------------------------
 
 
-def draw_delays(panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float]) -> Figure:
+def draw_delays(
+    panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float], columns: str = "two"
+) -> Figure:
     """The share of flights that are longer by more than so many seconds, and so many per cent.
 
     Args:
+        columns: `one` on a narrow screen, otherwise `two`.
         panels: curves by title.
         golden_s: mean flight time of the golden flights of each panel.
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    across = min(2, len(panels))
+    across = min(2, len(panels)) if columns == "two" else 1
     down = math.ceil(len(panels) / across)
-    figure = new_figure(WIDTHS_IN["two"], 0.45 + 1.75 * down)
+    figure = new_figure(WIDTHS_IN[columns], 0.45 + 1.75 * down)
     grid = figure.subplots(down, across, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
@@ -174,7 +197,8 @@ def draw_delays(panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float]
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("flights, %", fontsize=SMALLEST)
-    figure.supxlabel("longer than golden by more than, s; a lost mission is longer than any",
+    words = ("longer than golden by more than, s;", "a lost mission is longer than any")
+    figure.supxlabel(_GAPS[columns].join(words),
                      fontsize=SMALLEST + 0.5, color=INK)  # fmt: skip
     most = max(panels.values(), key=len)
     shown = grid.flat[[*panels.values()].index(most)]

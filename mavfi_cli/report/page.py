@@ -11,19 +11,16 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavfi_cli.campaigns.specification import Spec
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import require_output
 from mavfi_cli.report.paper import DETECTOR_TITLES
-from mavfi_cli.stats.shares import Interval, Share
-
-if TYPE_CHECKING:
-    pass
+from mavfi_cli.report.table import percent, rate, with_ends
+from mavfi_cli.stats.shares import Interval
 
 _FOLDER = Path(__file__).parent
-_NONE = "\N{EN DASH}"
 
 
 def require_page(path: Path) -> None:
@@ -64,25 +61,14 @@ def _unbroken(value: Any) -> Any:
 # Numbers as words ---------------------------------------------------------------------------------
 
 
-def _percent(value: float | None, digits: int = 0, sign: str = "") -> str:
-    if value is None or not math.isfinite(value):
-        return _NONE
-    return f"{100 * value:{sign}z.{digits}f} %"
-
-
-def _ends(share: Interval | Share, scale: float = 100.0, digits: int = 0) -> str:
-    return f"{scale * share.low:z.{digits}f} to {scale * share.high:z.{digits}f}"
-
-
-def _effect(effect: Interval | None, unit: str) -> str:
+def _effect(effect: Interval, unit: str) -> str:
     """An effect with its interval, in per cent or in points of a success rate."""
-    if effect is None:
-        return _NONE
+    parts = (effect.value, effect.low, effect.high)
     if unit == "number":
-        return f"{effect.value:.2f} ({_ends(effect, 1.0, 2)})"
-    digits = _digits(max(abs(effect.low), abs(effect.high)))
-    value = f"{100 * effect.value:{'+' if unit == 'points' else ''}z.{digits}f}"
-    return f"{value} {'points' if unit == 'points' else '%'} ({_ends(effect, digits=digits)})"
+        return with_ends(parts, "z.2f")
+    ends = f"z.{_digits(max(abs(effect.low), abs(effect.high)))}f"
+    shape = f"+{ends}" if unit == "points" else ends
+    return with_ends(parts, shape, ends, scale=100.0, unit=_UNITS[unit])
 
 
 def _digits(largest: float) -> int:
@@ -105,7 +91,7 @@ _UNITS = {"points": " points", "percent": " %"}
 
 def _p_value(chance: float | None) -> str:
     if chance is None:
-        return _NONE
+        return "-"
     return "< 0.001" if chance < 0.001 else f"{chance:.2g}"
 
 
@@ -114,11 +100,12 @@ def _link(text: str) -> str:
 
 
 FILTERS: Mapping[str, Callable[..., Any]] = {
-    "percent": _percent, "ends": _ends, "effect": _effect, "p": _p_value, "range": _range,
+    "percent": percent, "rate": rate, "ends": with_ends, "effect": _effect, "p": _p_value,
+    "range": _range,
     "link": _link, "toml": Spec.to_toml,
     "detector": lambda name: DETECTOR_TITLES.get(name, name) if name else "none",
     "missions": lambda count: f"{math.ceil(count):,}" if math.isfinite(count) else "",
-    "hourly": lambda rates: "{:.2g} ({:.2g} to {:.2g})".format(*rates),
+    "hourly": lambda rates: with_ends(rates, ".2g"),
     "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
 }  # fmt: skip
 """By the names that page.html uses."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
-from mavfi_cli.report.table import FORMATS, Table
+from mavfi_cli.report.table import FORMATS, Table, number, with_ends
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.shares import Share
 
@@ -70,17 +70,17 @@ class PaperColumn:
     ends: int | None = None
     sign: bool = False
 
-    def told(self, value: float, digits: int | None = None) -> str:
+    def told(self, value: float) -> str:
         """A number in the column's form; a dash if there is none."""
-        shape = f"{'+' if self.sign else ''}.{self.digits if digits is None else digits}f"
-        return f"{value:{shape}}" if math.isfinite(value) else "-"
+        return number(value, self._shape(self.digits))
 
     def ours(self, cell: PaperCell) -> str:
         """A number of ours with its interval."""
-        value = self.told(cell.value)
-        if math.isnan(cell.low) or math.isnan(cell.high):
-            return value
-        return f"{value} ({self.told(cell.low, self.ends)} to {self.told(cell.high, self.ends)})"
+        ends = self._shape(self.digits if self.ends is None else self.ends)
+        return with_ends((cell.value, cell.low, cell.high), self._shape(self.digits), ends)
+
+    def _shape(self, digits: int) -> str:
+        return f"{'+' if self.sign else ''}.{digits}f"
 
     def printed(self, paper: Printed) -> str:
         """A number of the paper in its own form."""

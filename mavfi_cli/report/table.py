@@ -250,16 +250,37 @@ def percent(share: float, shape: str = ".1f") -> str:
     return number(share, shape, 100.0, " %")
 
 
+def with_ends(
+    estimate: tuple[float, float, float],
+    shape: str = "z.0f",
+    ends: str = "",
+    *,
+    scale: float = 1.0,
+    unit: str = "",
+    chance: float | None = None,
+) -> str:
+    """Format a value with the ends of its interval and a p-value if there are any.
+
+    Args:
+        estimate: value, low, high.
+        shape: of the value.
+        ends: shape of the ends; empty means that of the value.
+    """
+    value, low, high = (scale * part for part in estimate)
+    if not math.isfinite(value):
+        return "-"
+    more = [] if math.isnan(low) else [f"{low:{ends or shape}} to {high:{ends or shape}}"]
+    more += [] if chance is None else [p_value(chance)]
+    return f"{value:{shape}}{unit}" + (f" ({', '.join(more)})" if more else "")
+
+
 def rate(share: Share | Row, digits: int = 1, ends: int = 0) -> str:
     """Format a share as per cent with its interval.
 
     Args:
         ends: digits of the ends of the interval.
     """
-    value, low, high = _parts(share, "share")
-    if math.isnan(value):
-        return "-"
-    return f"{100 * value:.{digits}f} % ({100 * low:.{ends}f} to {100 * high:.{ends}f})"
+    return with_ends(_parts(share, "share"), f".{digits}f", f".{ends}f", scale=100.0, unit=" %")
 
 
 def spread(
@@ -270,13 +291,8 @@ def spread(
     chance: float | None = None,
 ) -> str:
     """Format a value with its interval and p-value if there are any."""
-    if math.isnan(_parts(value, "value")[0]):
-        return "-"
     shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
-    middle, low, high = (f"{scale * end:{shape}}" for end in _parts(value, "value"))
-    more = [] if math.isnan(_parts(value, "value")[1]) else [f"{low} to {high}"]
-    more += [] if chance is None else [p_value(chance)]
-    return f"{middle} ({', '.join(more)})" if more else middle
+    return with_ends(_parts(value, "value"), shape, scale=scale, chance=chance)
 
 
 def _parts(estimate: Share | Interval | Row, name: str) -> tuple[Any, Any, Any]:

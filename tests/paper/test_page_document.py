@@ -8,11 +8,19 @@ from made_flights import export_table, flights, row
 
 from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Fate, Flights
-from mavfi_cli.paper.answers import REASONS, delay_sentence, delays, disagreements, protections
-from mavfi_cli.paper.claims import CLAIMS
+from mavfi_cli.paper.answers import (
+    REASONS,
+    delay_sentence,
+    delays,
+    disagreements,
+    protections,
+    reason_of,
+)
+from mavfi_cli.paper.claims import CLAIMS, judged
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.sources import CampaignSource, Evidence
-from mavfi_cli.paper.verdicts import Verdict
+from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Judgement, Verdict
+from mavfi_cli.stats.shares import Interval
 
 LOST = {"outcome": "timeout"}
 
@@ -38,16 +46,16 @@ def told():
     return document(evidence(rows, problems=["something is missing."]), 2.0)
 
 
-def effect_of(judged, stack="mavbench"):
+def effect_of(claim, stack="mavbench"):
     """The effect of all faults; None without one."""
-    by_fate = judged.judgements.get(stack, {})
+    by_fate = claim.judgements.get(stack, {})
     return by_fate[Fate.ALL].effect if by_fate else None
 
 
 def test_the_answer_counts_what_is_judged(told):
     assert told.extent == "30 missions judge 4 of 69 claims."
-    judged = {each.claim.name for each in told.claims if effect_of(each)}
-    assert judged == {"table4-golden-dense", "table4-dense", "fig12-dense", "fig13-planning"}
+    names = {each.claim.name for each in told.claims if effect_of(each)}
+    assert names == {"table4-golden-dense", "table4-dense", "fig12-dense", "fig13-planning"}
     assert re.match(r"(Yes|No|Only in part|Not known yet): of the 4 claims", told.answer)
     assert sum(map(int, re.findall(r"(\d+) (?:is|are)", told.answer))) == 4
     counts = told.verdicts()["mavbench"]
@@ -229,3 +237,36 @@ def test_reasons_are_of_claims_and_grouped(told):
         each.claim.name for each in told.claims
         if each.verdict("mavbench") is Verdict.CONTRADICTED
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "stack", "verdict", "effect", "explained"),
+    [
+        ("table4-gad", "mavbench", Verdict.CONTRADICTED, -0.1, True),
+        ("table4-gad", "mavbench", Verdict.CONTRADICTED, -0.5, False),
+        ("table4-gad", "mavbench", Verdict.UNDECIDED, -0.1, False),
+        ("table4-gad", "hardened", Verdict.CONTRADICTED, -0.1, False),
+        ("fig6-octomap", "hardened", Verdict.CONTRADICTED, -0.147, True),
+        ("fig6-octomap", "hardened", Verdict.CONTRADICTED, -0.4, False),
+    ],
+)
+def test_a_reason_stands_only_beside_the_effect_that_it_explains(
+    name, stack, verdict, effect, explained
+):
+    claim = next(each for each in CLAIMS if each.name == name)
+    interval = Interval(value=effect, low=effect, high=effect, count=9)
+    place = ISOLATED if claim.isolated else stack
+    judgement = Judgement(verdict=verdict, effect=interval)
+    contradicted = JudgedClaim(claim=claim, judgements={place: {Fate.ALL: judgement}})
+    assert bool(reason_of(contradicted, stack)) is explained
+
+
+@pytest.mark.slow
+def test_every_contradiction_of_the_published_missions_has_its_reason():
+    results = Path(__file__).parents[2] / "docs" / "results"
+    found = Evidence.gather([results / "paper-mavbench.parquet", results / "kernels.json"])
+    flown = found.flights("mavbench").chosen(as_paper=True, at=(None, "random"))
+    claims = judged({"mavbench": flown}, found.isolated)
+    contradicted = disagreements(claims, "mavbench")
+    assert sum(len(each.claims) for each in contradicted) == 20
+    assert all(each.reason for each in contradicted)

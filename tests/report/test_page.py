@@ -84,15 +84,14 @@ def test_every_lost_mission_has_its_command(told, page):
 
 
 def test_numbers_as_words():
-    percent, ends, p_value, hourly, effect = (
-        FILTERS[name] for name in ("percent", "ends", "p", "hourly", "effect")
+    percent, rate, p_value, hourly, effect = (
+        FILTERS[name] for name in ("percent", "rate", "p", "hourly", "effect")
     )
     share = wilson(3, 98)
     assert share.counts == "3 of 98"
-    assert percent(share.share, 1) == "3.1 %"
-    assert percent(-0.0) == "0 %"
-    assert percent(None) == percent(float("nan")) == "\N{EN DASH}"
-    assert ends(share) == "1 to 9"
+    assert percent(share.share) == "3.1 %"
+    assert percent(float("nan")) == rate(wilson(0, 0)) == "-"
+    assert rate(share, 0) == "3 % (1 to 9)"
     assert p_value(0.0004) == "< 0.001"
     assert p_value(0.0123) == "0.012"
     assert hourly((0.17, 0.11, 0.2501)) == "0.17 (0.11 to 0.25)"
