@@ -81,6 +81,7 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
     if not yes + no + open_:
         return "Nothing here decides a claim of the paper."
     begin = "Only in part" if yes and no else "Yes" if yes else "No" if no else "Not known yet"
+    begin += ", as far as it is decided" if open_ and bool(yes) is not bool(no) else ""
     return (
         f"{begin}: of the {yes + no + open_} claims that are judged, {yes} {_are(yes)} reproduced, "
         f"{no} {_are(no)} contradicted, and {open_} {_are(open_)} undecided at this number of "
@@ -245,12 +246,12 @@ class _Against:
         """On the same faults, by McNemar's test; None without pairs."""
         if not balance.pairs:
             return None
-        counts = (
-            f"{balance.undone:,} of {balance.before:,} undone, {balance.caused:,} caused; "
-            f"{balance.pairs:,} pairs"
-        )
-        ill = balance.before + balance.caused
+        before, caused, pairs = balance.before, balance.caused, balance.pairs
+        counts = f"{balance.undone:,} of {before:,} undone, {caused:,} caused; {pairs:,} pairs"
+        ill = before + caused
         proven = balance.p_value < LEVEL
+        if not ill:
+            counts = f"no harm in {pairs:,} pairs"
         return cls(effect=_effect(ill, balance.undone > balance.caused, proven), counts=counts)
 
     @classmethod

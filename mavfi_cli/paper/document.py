@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.analysis.pairs import Flights
-from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.paper.answers import (
@@ -51,12 +49,11 @@ from mavfi_cli.paper.items import (
     ITEMS,
     LEFT_OUT,
     STACKS,
-    FlightsPlan,
     Item,
     Source,
     printed_name,
 )
-from mavfi_cli.paper.layouts import of_flights
+from mavfi_cli.paper.layouts import of_flights, of_kind
 from mavfi_cli.paper.sources import CampaignSource, Evidence, KernelSource
 from mavfi_cli.paper.status import of_kernels, of_model
 from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Verdict
@@ -442,10 +439,8 @@ def _flight_picture(run: Path) -> str:
 # Tables and figures, from all flights that are of the same kind as an item's missions -------------
 
 _NEED_RUNS = ("fig11", "fig13")  # their figures read kept run folders
-_GOLDEN_ONLY = ("fig11",)
 _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "fault_bits",
             "detector", "protect")  # fmt: skip
-_SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
 def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_ShownItem]:
@@ -478,8 +473,8 @@ def _drawn(item: Item, place: str, table: PaperTable) -> _ItemPart:
 
 
 def _flown(item: Item, stack: str, flights: Flights, evidence: Evidence) -> _ItemPart | None:
-    mine = _of_kind(item, stack, flights)
-    if not any(mine["level"]) and not (len(mine) and item.name in _GOLDEN_ONLY):
+    mine = of_kind(item, stack, flights)
+    if not len(mine):
         return None
     table = of_flights(item.name, mine)
     drawn = _with_runs(item, stack, evidence) if item.name in _NEED_RUNS else mine
@@ -500,7 +495,7 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
     """The item's flights in the first campaign that has kept the run folders of all of them."""
     several = (Flights.pooled([source.flights], stack) for source in evidence.campaigns)
-    own = (_of_kind(item, stack, flights) for flights in several)
+    own = (of_kind(item, stack, flights) for flights in several)
     return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)
 
 
@@ -514,13 +509,3 @@ def _over_own(flights: Flights) -> Iterator[dict[str, Any]]:
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
     for row, ratio in zip(rows, flights.timed.ratios, strict=True):
         yield {**{name: row[name] for name in varying}, "over_golden": f"{ratio:.4f}"}
-
-
-def _of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """The flights that differ from the item's missions on a stack in _SEEDS only."""
-    kinds = {
-        kind_of(changes_of(mission.config), _SEEDS)
-        for mission in FlightsPlan(items=[item], stack=stack).kinds()
-    }
-    changes = map(json.loads, flights["changes"])
-    return flights.where([kind_of(each, _SEEDS) in kinds for each in changes])

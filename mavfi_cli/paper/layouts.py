@@ -7,6 +7,7 @@ and notes.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.analysis.pairs import EVERY_STAGE, PERCENT, STAGES, Flights
+from mavfi_cli.campaigns.missions import changes_of, kind_of
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
-from mavfi_cli.paper.items import BY_NAME, printed
+from mavfi_cli.paper.items import BY_NAME, FlightsPlan, Item, printed
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable, Printed
 from mavfi_cli.stats.paired import OWN, WorstCase
 
@@ -38,12 +40,41 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
     if name in _ONLY_COMPARABLE:
         flights = flights.comparable
     rows = [*OF_FLIGHTS[name](flights)]
-    notes = _unknown_costs(flights) if name == "table5" else []
+    notes = [*_unpaired(flights), *(_unknown_costs(flights) if name == "table5" else [])]
     table = BY_NAME[name].table(rows, flights.worlds, notes)
     return replace(table, result=_RESULTS[name](table))
 
 
+_SEEDS = ("seed", "world_seed", "time_limit_s")
+
+
+def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
+    """The flights that differ from the item's missions on a stack in _SEEDS only.
+
+    None if all that differ so are golden, unless the item needs no other.
+    """
+    kinds = {
+        kind_of(changes_of(mission.config), _SEEDS)
+        for mission in FlightsPlan(items=[item], stack=stack).kinds()
+    }
+    changes = map(json.loads, flights["changes"])
+    mine = flights.where([kind_of(each, _SEEDS) in kinds for each in changes])
+    return (
+        mine if any(mine["level"]) or item.name in _GOLDEN_ONLY else mine.where([False] * len(mine))
+    )
+
+
+_GOLDEN_ONLY = ("fig11",)
 _ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part of the stages
+
+
+def _unpaired(flights: Flights) -> list[str]:
+    """Why flights with a fault show no effect of it."""
+    struck = flights.where(level is not None for level in flights["level"])
+    alone = list(struck["own_lost"]).count(None)
+    if not alone:
+        return []
+    return [f"{alone:,} of {len(struck):,} flights with a fault: no golden flight of their mission"]
 
 
 def _row(*labels: object, cells: Iterable[PaperCell]) -> PaperRow:

@@ -276,6 +276,12 @@ def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     for each in told[1:]:
         if found := version_differences(told[0].versions, each.versions):
             yield f"{each.path} and {told[0].path} were flown by other builds: {', '.join(found)}."
+    unnamed = [each.path.name for each in campaigns if not each.versions and len(each.flights)]
+    if unnamed:
+        yield (
+            f"{', '.join(unnamed)}: the export does not name the builds that flew it, so nothing "
+            "shows whether it mixes several."
+        )
     here = installed_versions()
     if told and (found := version_differences(told[0].versions, here)):
         yield (

@@ -27,7 +27,7 @@ from mavfi_cli.paper.items import (
     items_named,
     printed,
 )
-from mavfi_cli.paper.layouts import of_flights
+from mavfi_cli.paper.layouts import of_flights, of_kind
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.report.setting_table import SettingColumns
 from mavfi_cli.stats.shares import wilson
@@ -42,13 +42,14 @@ _SETTINGS = "settings"  # name of the table of a user's own campaign
 def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
     """The one table of a campaign, and the flights that its figure needs; None if it needs none.
 
-    It is the table of the named item, or of the preset's item. Without one, a reproduction has the
+    It is the table of the named item, or of the preset's item. An export has those items whose kind
+    of flights it holds. Without an item, a reproduction has the
     table of its items, and another campaign that of its settings.
 
     Raises:
         UnknownName: the campaign flies no item of this name.
         ConfigError: the paper has it, but it is no experiment.
-        RecordError: the kernels were not run.
+        RecordError: the kernels were not run, or an export holds no flight of the item.
     """
     item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
     if item is None:
@@ -56,8 +57,24 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
     if item.source is not Source.FLIGHTS:
         return _unflown(item, ledger.folder.parent), None
     table = Flights.of(flights(ledger))
-    mine = table if plan is None else _flights_of(item, plan, table)
+    if plan is not None:
+        mine = _flights_of(item, plan, table)
+    elif ledger.export is None:
+        mine = table
+    else:
+        mine = _of_export(item, table, ledger.folder)
     return of_flights(item.name, mine), mine
+
+
+def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
+    """The flights of an item in an export, which holds no plan: those of the item's kind."""
+    parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
+    flown = [part for part in parts if len(part)]
+    if len(flown) > 1:
+        raise RecordError(f"{path}: holds {item.paper} on several stacks; export each by itself")
+    if not flown:
+        raise RecordError(f"{path}: holds no flight like those of {item.paper}")
+    return flown[0]
 
 
 def _item_of(ledger: Ledger, name: str | None) -> Item | None:
@@ -67,7 +84,7 @@ def _item_of(ledger: Ledger, name: str | None) -> Item | None:
     if name is None:
         return min(own, key=lambda item: item.name != preset, default=None)
     (found,) = items_named([name])
-    known = own if FlightsPlan.stored(ledger) is None else ITEMS
+    known = own if FlightsPlan.stored(ledger) is None and ledger.export is None else ITEMS
     if found not in known:
         raise UnknownName("item of this campaign", name, [each.name for each in known] or ["none"])
     return found

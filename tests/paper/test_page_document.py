@@ -56,7 +56,10 @@ def test_the_answer_counts_what_is_judged(told):
     assert told.extent == "30 missions judge 4 of 69 claims."
     names = {each.claim.name for each in told.claims if effect_of(each)}
     assert names == {"table4-golden-dense", "table4-dense", "fig12-dense", "fig13-planning"}
-    assert re.match(r"(Yes|No|Only in part|Not known yet): of the 4 claims", told.answer)
+    assert re.match(
+        r"(Yes|No|Only in part|Not known yet)(, as far as it is decided)?: of the 4 claims",
+        told.answer,
+    )
     assert sum(map(int, re.findall(r"(\d+) (?:is|are)", told.answer))) == 4
     counts = told.verdicts()["mavbench"]
     assert sum(counts.values()) - counts["not decidable"] == 4
@@ -140,7 +143,10 @@ def test_a_protection_helps_or_harms_beyond_chance(lost, saved, effect):
     undone, caused = (lost, 0) if saved else (0, lost)
     before = lost if saved else 0
     assert cell.effect == effect
-    assert cell.counts == f"{undone} of {before} undone, {caused} caused; 10 pairs"
+    if lost:
+        assert cell.counts == f"{undone} of {before} undone, {caused} caused; 10 pairs"
+    else:
+        assert cell.counts == "no harm in 10 pairs"
     assert gad.against["a fault in an instruction, silent"] is None
 
 

@@ -6,9 +6,11 @@ import shutil
 import signal
 from collections import namedtuple
 
+import pyarrow.parquet as pq
 import pytest
+from made_flights import export_table, row
 
-from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
@@ -180,3 +182,50 @@ def test_a_full_disk_is_told_before_the_flights(tmp_path, monkeypatch):
     with pytest.raises(RecordError, match="GB are free"):
         flown(plan(tmp_path, "fig16"))
     assert over(plan(tmp_path)) == 24  # which the forecast is from
+
+
+def exported(tmp_path, rows):
+    """The ledger of an export with these rows, which has no plan."""
+    path = tmp_path / "some.parquet"
+    pq.write_table(export_table(rows), path)
+    return ExportedLedger(path)
+
+
+def in_dense(*arguments, **changes):
+    return row(*arguments, config={"world": "dense"}, **changes)
+
+
+def test_an_export_has_the_items_whose_flights_it_holds(tmp_path):
+    rows = [in_dense(), in_dense("planning", instruction=True)]
+    with exported(tmp_path, rows) as ledger:
+        table, flights = shown(ledger, "table4")
+        assert len(flights) == 2
+        assert [line.count for line in table.rows] == ["1", "1", "0", "0"]
+        with pytest.raises(RecordError, match="holds no flight like those of Table III"):
+            shown(ledger, "table3")
+
+
+def test_an_export_without_pairs_has_a_note_and_no_effect(tmp_path):
+    rows = [in_dense("planning", instruction=True, seed=seed) for seed in (1, 2)]
+    with exported(tmp_path, rows) as ledger:
+        table, _ = shown(ledger, "fig12")
+    assert table.notes[-2].startswith("2 of 2 flights with a fault: no golden flight")
+    assert {line.count for line in table.rows} == {"0"}
+
+
+def test_golden_flights_alone_are_no_item_with_faults(tmp_path):
+    with (
+        exported(tmp_path, [in_dense()]) as ledger,
+        pytest.raises(RecordError, match=r"holds no flight like those of Fig\. 14"),
+    ):
+        shown(ledger, "fig14")
+
+
+def test_an_item_of_two_stacks_is_refused(tmp_path):
+    stacks = [{"world": "dense", "stack": stack} for stack in ("mavbench", "hardened")]
+    rows = [row("planning", instruction=True, config=config) for config in stacks]
+    with (
+        exported(tmp_path, rows) as ledger,
+        pytest.raises(RecordError, match="Table IV on several stacks"),
+    ):
+        shown(ledger, "table4")
