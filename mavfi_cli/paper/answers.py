@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -59,14 +60,14 @@ class Family:
         """The paper's name of it, such as `Fig. 6`."""
         return printed_name(self.name)
 
-
-def families(claims: Sequence[JudgedClaim]) -> list[Family]:
-    """The claims by figure, table or section, in order."""
-    found = []
-    for name, members in groupby(claims, lambda judged: judged.claim.item):
-        title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
-        found.append(Family(name=name, title=printed_name(name) + title, claims=[*members]))
-    return found
+    @classmethod
+    def of(cls, claims: Sequence[JudgedClaim]) -> list[Self]:
+        """The claims by figure, table or section, in order."""
+        found = []
+        for name, members in groupby(claims, lambda judged: judged.claim.item):
+            title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
+            found.append(cls(name=name, title=printed_name(name) + title, claims=[*members]))
+        return found
 
 
 # Does it reproduce the paper? ---------------------------------------------------------------------
@@ -211,22 +212,24 @@ class DetectorBalance:
     harmed: Balance
     lost: Balance
 
-
-def detector_balances(stack: str, flights: Flights) -> Iterator[DetectorBalance]:
-    """A balance for each level, computer, detector and fate of which pairs were flown."""
-    watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
-    for level, computer, detector in sorted(watched.by("level", "platform", "detector"), key=str):
-        for fate in Fate if level == "instruction" else (Fate.ALL,):
-            where = {"level": level, "platform": computer}
-            harmed, lost = (
-                flights.of_fate(fate).balance(detector, column=column, **where)
-                for column in ("harmed", "lost")
-            )
-            if harmed.pairs:
-                yield DetectorBalance(
-                    stack=stack, level=level, computer=computer, detector=detector, fate=fate,
-                    harmed=harmed, lost=lost,
-                )  # fmt: skip
+    @classmethod
+    def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
+        """A balance for each level, computer, detector and fate of which pairs were flown."""
+        watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
+        for level, computer, detector in sorted(
+            watched.by("level", "platform", "detector"), key=str
+        ):
+            for fate in Fate if level == "instruction" else (Fate.ALL,):
+                where = {"level": level, "platform": computer}
+                harmed, lost = (
+                    flights.of_fate(fate).balance(detector, column=column, **where)
+                    for column in ("harmed", "lost")
+                )
+                if harmed.pairs:
+                    yield cls(
+                        stack=stack, level=level, computer=computer, detector=detector, fate=fate,
+                        harmed=harmed, lost=lost,
+                    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -346,32 +349,32 @@ class Delays:
     added_s: Mapping[str | None, FloatArray]
     golden_s: float
 
-
-def delays(stack: str, flights: Flights) -> Iterator[Delays]:
-    """The delays at each level, of the faults that were flown with every detector."""
-    hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
-    for level in ("source", "instruction"):
-        mine = hit.chosen(level=level)
-        by_detector = {
-            name: those
-            for name in (None, *DETECTOR_TITLES)
-            if len(those := mine.chosen(detector=name))
-        }
-        if None not in by_detector:
-            continue
-        shared = set.intersection(*(set(those.faults) for those in by_detector.values()))
-        added = {
-            name: np.sort([
-                np.inf if lost else added
-                for fault, lost, added in zip(
-                    those.faults, those["lost"], those.numbers("added_s"), strict=True
-                )
-                if fault in shared
-            ])
-            for name, those in by_detector.items()
-        }  # fmt: skip
-        golden_s = float(np.nanmean(mine.numbers("own_flight_time_s")))
-        yield Delays(stack=stack, level=level, added_s=added, golden_s=golden_s)
+    @classmethod
+    def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
+        """The delays at each level, of the faults that were flown with every detector."""
+        hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
+        for level in ("source", "instruction"):
+            mine = hit.chosen(level=level)
+            by_detector = {
+                name: those
+                for name in (None, *DETECTOR_TITLES)
+                if len(those := mine.chosen(detector=name))
+            }
+            if None not in by_detector:
+                continue
+            shared = set.intersection(*(set(those.faults) for those in by_detector.values()))
+            added = {
+                name: np.sort([
+                    np.inf if lost else added
+                    for fault, lost, added in zip(
+                        those.faults, those["lost"], those.numbers("added_s"), strict=True
+                    )
+                    if fault in shared
+                ])
+                for name, those in by_detector.items()
+            }  # fmt: skip
+            golden_s = float(np.nanmean(mine.numbers("own_flight_time_s")))
+            yield cls(stack=stack, level=level, added_s=added, golden_s=golden_s)
 
 
 def delay_sentence(parts: Sequence[Delays]) -> str:

@@ -23,10 +23,7 @@ from mavfi_cli.paper.answers import (
     answer,
     crash_sentence,
     delay_sentence,
-    delays,
-    detector_balances,
     disagreements,
-    families,
     judgement_of,
     protections,
     reason_of,
@@ -214,7 +211,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         for source in evidence.campaigns
         if (found := arms(source.flights.comparable))
     }
-    added = [*delays(stacks[0], flights[stacks[0]])]
+    added = [*Delays.of(stacks[0], flights[stacks[0]])]
     step("drawing the figures")
     return Document(
         version=__version__,
@@ -224,11 +221,11 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         extent=_extent(flights, kernels, claims),
         problems=evidence.problems,
         claims=claims,
-        families=families(claims),
+        families=Family.of(claims),
         forest=_forest(claims, stacks),
         disagreements=disagreements(claims, stacks[0]),
         protections=protections(flights),
-        balances=[row for stack in stacks for row in detector_balances(stack, flights[stack])],
+        balances=[row for stack in stacks for row in DetectorBalance.of(stack, flights[stack])],
         delays=_delay_picture(added),
         delay_sentence=delay_sentence(added),
         spreads=[part for stack in stacks if (part := _spread(stack, flights[stack]))],
@@ -330,7 +327,7 @@ def _spread(stack: str, flights: Flights) -> Picture | None:
         return None
     panels = {
         world: panel(
-            (title, name, hit.chosen(world=world, detector=name))
+            (title, name, hit.chosen(world=world, detector=name), None)
             for name, title in _DETECTORS.items()
         )
         for world, _ in places

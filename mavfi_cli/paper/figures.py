@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OVER_GOLDEN = "flight time over the golden flight of the same mission, %"
-_Row = tuple[str, str | None, Flights]  # of a panel: label, detector, flights
-_Panels = Mapping[str, Sequence[Strip]]
+_Row = tuple[
+    str, str | None, Flights, float | None
+]  # label, detector, flights, the paper's longest
+_Drawing = Callable[[Flights, str], "Figure"]
 _STYLES = {None: 1, "gad": 2, "aad": 3}  # of the detectors
 _NOTHING = "nothing to draw: no mission of the figure has flown yet"
 
@@ -39,8 +41,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
     """Draw the figure of an item from its flights, or the dots of its table.
 
     Args:
-        flights: None of what was not flown. `fig13` needs
-            their kept run folders, of one campaign.
+        flights: None of what was not flown. `fig13` needs their kept run folders, of one campaign.
         columns: width, `one` or `two`.
 
     Raises:
@@ -53,20 +54,12 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
     return DRAWN[table.name](flights, columns)
 
 
-def panel(rows: Iterable[_Row], paper: float | None = None) -> list[Strip]:
-    """Distributions of flights over their golden ones.
-
-    Args:
-        paper: the largest increase without a detector.
-    """
+def panel(rows: Iterable[_Row]) -> list[Strip]:
+    """Distributions of flights over their golden ones."""
     return [
-        _strip(label, detector, flights, None if detector else paper)
-        for label, detector, flights in rows
+        Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
+        for label, detector, flights, paper in rows
     ]
-
-
-def _strip(label: str, detector: str | None, flights: Flights, paper: float | None) -> Strip:
-    return Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
 
 
 def _number(name: str, *keys: object) -> float | None:
@@ -74,9 +67,9 @@ def _number(name: str, *keys: object) -> float | None:
     return found if isinstance(found, float) else None
 
 
-def _strips(panels: Callable[[Flights], _Panels]) -> Callable[[Flights, str], Figure]:
+def _strips(panels: Callable[[Flights], Mapping[str, list[_Row]]]) -> _Drawing:
     def draw_panels(flights: Flights, columns: str) -> Figure:
-        found = panels(flights)
+        found = {title: panel(rows) for title, rows in panels(flights).items()}
         if not any(found.values()):
             raise RecordError(_NOTHING)
         return draw_strips(found, OVER_GOLDEN, columns)
@@ -84,53 +77,54 @@ def _strips(panels: Callable[[Flights], _Panels]) -> Callable[[Flights, str], Fi
     return draw_panels
 
 
-def _fig7(flights: Flights) -> _Panels:
-    level = "instruction"
-    rows = (
-        (title, None, flights.faulty(fault_target=node, planner=planner, level=level))
+def _fig7(flights: Flights) -> dict[str, list[_Row]]:
+    struck = flights.faulty(level="instruction")
+    return {"fault in": [
+        (title, None, struck.chosen(fault_target=node, planner=planner), None)
         for title, (node, planner) in KERNELS_FLOWN.items()
+    ]}  # fmt: skip
+
+
+def _by_value(column: str) -> _Drawing:
+    return _strips(
+        lambda flights: {
+            "fault in": [
+                (str(x), None, mine, None) for (x,), mine in flights.faulty().by(column).items()
+            ]
+        }
     )
-    return {"fault in": panel(rows)}
 
 
-def _by_value(column: str) -> Callable[[Flights], _Panels]:
-    def panels(flights: Flights) -> _Panels:
-        groups = flights.faulty().by(column)
-        return {"fault in": panel((str(value), None, x) for (value,), x in groups.items())}
-
-    return panels
-
-
-def _beside_detectors(flights: Flights, paper: float | None) -> list[Strip]:
-    rows: list[_Row] = [("fault", None, flights.faulty())]
-    rows += [(f"fault, {name.upper()}", name, flights.faulty(name)) for name in DETECTOR_TITLES]
-    return panel(rows, paper)
+def _beside_detectors(flights: Flights, paper: float | None) -> list[_Row]:
+    return [
+        ("fault", None, flights.faulty(), paper),
+        *((f"fault, {x.upper()}", x, flights.faulty(x), None) for x in DETECTOR_TITLES),
+    ]
 
 
-def _fig12(flights: Flights) -> _Panels:
+def _fig12(flights: Flights) -> dict[str, list[_Row]]:
+    alike = flights.comparable
     return {
         world: _beside_detectors(
-            flights.comparable.chosen(world=world),
-            _number("fig12", "worst_increase_percent", world),
+            alike.chosen(world=world), _number("fig12", "worst_increase_percent", world)
         )
-        for world in flights.comparable.worlds
+        for world in alike.worlds
     }
 
 
-def _fig14(flights: Flights) -> _Panels:
+def _fig14(flights: Flights) -> dict[str, list[_Row]]:
     """The paper gives shares of the worst increase that are recovered, which give what is left."""
-    panels = {}
+    panels: dict[str, list[_Row]] = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
         worst = _number("fig12", "worst_increase_percent", world)
-        strips = panel([("no protection", None, here.faulty())], worst)
+        panels[world] = [("no protection", None, here.faulty(), worst)]
         for name in DETECTOR_TITLES:
             for stages in PROTECTED:
                 share = _number("fig14", "recovered_percent", name, world, stages)
                 left = worst * (1.0 - share / PERCENT) if worst and share else None
                 mine = here.faulty(name, protect=stages)
-                strips.append(_strip(f"{name.upper()} {_short(stages)}", name, mine, left))
-        panels[world] = strips
+                panels[world].append((f"{name.upper()} {_short(stages)}", name, mine, left))
     return panels
 
 
@@ -141,10 +135,13 @@ def _short(stages: str) -> str:
     return "".join(stage[0].upper() for stage in stages.split("+"))
 
 
-def _fig16(flights: Flights) -> _Panels:
-    ratios = {x: _number("fig16", "worst_ratio", x) for (x,) in flights.by("platform")}
-    worst = {x: None if ratio is None else PERCENT * (ratio - 1.0) for x, ratio in ratios.items()}
-    return {x: _beside_detectors(flights.chosen(platform=x), worst[x]) for x in ratios}
+def _fig16(flights: Flights) -> dict[str, list[_Row]]:
+    panels = {}
+    for (platform,), mine in flights.by("platform").items():
+        ratio = _number("fig16", "worst_ratio", platform)
+        worst = None if ratio is None else PERCENT * (ratio - 1.0)
+        panels[platform] = _beside_detectors(mine, worst)
+    return panels
 
 
 def _fig11(flights: Flights, columns: str) -> Figure:
@@ -169,10 +166,10 @@ def _fig13(flights: Flights, columns: str) -> Figure:
     return figure
 
 
-DRAWN: Mapping[str, Callable[[Flights, str], Figure]] = {
+DRAWN: Mapping[str, _Drawing] = {
     "fig7": _strips(_fig7),
-    "fig8": _strips(_by_value("fault_target")),
-    "fig9": _strips(_by_value("fault_field")),
+    "fig8": _by_value("fault_target"),
+    "fig9": _by_value("fault_field"),
     "fig11": _fig11,
     "fig12": _strips(_fig12),
     "fig13": _fig13,

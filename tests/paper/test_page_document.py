@@ -10,8 +10,8 @@ from mavfi_cli.analysis.flights import COSTS
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.paper.answers import (
     REASONS,
+    Delays,
     delay_sentence,
-    delays,
     disagreements,
     protections,
     reason_of,
@@ -112,7 +112,7 @@ def test_added_time_is_that_of_the_same_faults():
         lost = {"outcome": "timeout"} if seed == 3 else {}
         rows.append(row("planning", seed=seed, time_s=time_s, **lost))
     rows += [row("planning", seed=seed, detector="gad", time_s=22.0) for seed in (1, 2)]
-    (delay,) = delays("mavbench", flights(rows))
+    (delay,) = Delays.of("mavbench", flights(rows))
     assert [*delay.added_s[None]] == [0.0, pytest.approx(3.0)]  # seed 3 has no flight with GAD
     assert [*delay.added_s["gad"]] == [pytest.approx(2.0)] * 2
     assert delay.golden_s == pytest.approx(20.0)
@@ -123,7 +123,7 @@ def test_added_time_is_that_of_the_same_faults():
 
 
 def test_a_lost_mission_is_longer_than_any():
-    (delay,) = delays("mavbench", flights([row(seed=1), row("planning", seed=1, **LOST)]))
+    (delay,) = Delays.of("mavbench", flights([row(seed=1), row("planning", seed=1, **LOST)]))
     assert [*delay.added_s[None]] == [float("inf")]
 
 
