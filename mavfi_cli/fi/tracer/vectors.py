@@ -398,23 +398,23 @@ def _packed(form: _VectorForm) -> None:
     elif match := _SIGNS.match(name):
         last.reads &= _signs({"pd": 64, "ps": 32, "b": 8}[match[1]])
     elif rule := _CONTROLS.get(form.bare):
-        form.touched[form.source(rule[0])].reads &= _each(rule[1], rule[2](width))
+        form.touched[form.source(rule[0])].reads &= _repeated(rule[1], rule[2](width))
     elif match := _TWO_TABLES.match(name):
         element = _ELEMENT.get(match[2]) or {"ps": 32, "pd": 64}[match[2]]
         control = form.target if match[1] == "i" else form.first
-        form.touched[control].reads &= _each(element, 2 * width // element - 1)
+        form.touched[control].reads &= _repeated(element, 2 * width // element - 1)
     elif _SHIFT.match(name) and form.is_vector(form.last) and form.immediate is None:
         last.reads &= low(64)
     form.write(low(form.widths[form.last] // 2 if _NARROWS.match(name) else width))
 
 
-def _each(element: int, mask: int) -> int:
+def _repeated(element: int, mask: int) -> int:
     """Return the same bits of every element."""
     return sum(mask << place for place in range(0, 512, element))
 
 
 def _signs(element: int) -> int:
-    return _each(element, 1 << element - 1)
+    return _repeated(element, 1 << element - 1)
 
 
 # Operands that select elements: the width of their elements, and the bits that are used.
