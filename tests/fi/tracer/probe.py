@@ -18,13 +18,12 @@ from elftools.elf.elffile import ELFFile
 from native_programs import all_registers
 
 from mavfi_cli.fi.tracer import linux
-from mavfi_cli.fi.tracer.decode import decode
+from mavfi_cli.fi.tracer.decode import GENERAL, decode
 from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.registers import (
     _SLOT,
     AVX,
     FLAGS,
-    GENERAL,
     NT_PRSTATUS,
     NT_X86_XSTATE,
     OPMASK,
