@@ -58,7 +58,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
             plan,
             Options(jobs=options["jobs"] or 0),
             view,
-            lambda forecast: view.on_note(forecast.told),
+            lambda forecast: view.on_note(forecast.summary),
         )
     if as_json:
         summary = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,

@@ -1,4 +1,4 @@
-"""The answers on top of the page: does it reproduce the paper, where not and why, what helps."""
+"""The answers on the first screen: is the paper reproduced, where not and why, what helps."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
 
 
 def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
-    """How far verdicts and lost missions rest on nodes that die; empty if no fault tells."""
+    """How many reproduced claims and lost missions depend on dead nodes; empty without a fault."""
     parts = []
     pairs = [
         (of_all, silent)
@@ -165,10 +165,10 @@ def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreemen
 
 
 def reason_of(judged: JudgedClaim, stack: str) -> str:
-    """Why a claim is contradicted on a stack; empty if that is not known, or it is not.
+    """Why a claim is contradicted on a stack; empty if it is not, or if no reason is known.
 
-    A reason was written about an effect. It stands only beside effects within the interval of that
-    one, on the stack of the paper and of isolated kernels.
+    A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
+    for an effect that lies in the interval of that one.
     """
     words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
     judgement = judgement_of(judged, stack)
@@ -214,7 +214,7 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """A balance for each level, computer, detector and fate of which pairs were flown."""
+        """The balances of all levels, computers, detectors and fates with flown pairs."""
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(
             watched.by("level", "platform", "detector"), key=str
@@ -278,7 +278,7 @@ def _effect(ill: int, better: bool, proven: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Safeguard:
-    """What a detector, or another stack, does against each kind of fault, and its cost.
+    """The effect of a detector, or of another stack, against each kind of fault, and its cost.
 
     Attributes:
         against: by the kind of fault; None where it was not flown.
@@ -351,7 +351,7 @@ class Delays:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """The delays at each level, of the faults that were flown with every detector."""
+        """The delays at both levels, of the faults that were flown with every detector."""
         hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
         for level in ("source", "instruction"):
             mine = hit.chosen(level=level)

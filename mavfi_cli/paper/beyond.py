@@ -1,4 +1,4 @@
-"""What the paper does not ask of its flights.
+"""Questions that the paper does not ask of its flights.
 
 From the kernel to the mission, where a bit hurts, failures an hour, and what each mechanism saves.
 """
@@ -21,8 +21,8 @@ from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
 Row = Mapping[str, Any]  # one flight
 
-# What a struck kernel did, as far as the flight shows it. After `same flight`, the fault was read,
-# and every measure of the flight is that of the golden one.
+# What a struck kernel did, as far as the flight shows it. `same flight`: the fault was read, and
+# every measure equals that of the golden flight.
 FATES = ("never read", "same flight", "changed flight", "crashed", "hung")
 _UNREAD, _SAME, _CHANGED, _CRASH, _HANG = FATES
 _MEASURES = (
@@ -146,7 +146,7 @@ def _class(flight: Row) -> str:
     name = str(flight["struck_state"]).split(";")[0]
     highest = max(bit for bits in flight["struck_bits"] for bit in bits)
     kinds = _BITS[BY_NAME[name].dtype if name in BY_NAME else DType.FLOAT64]
-    return next(each for each, lowest in kinds if highest >= lowest)
+    return next(name for name, lowest in kinds if highest >= lowest)
 
 
 # Failures a flight hour ---------------------------------------------------------------------------
@@ -269,8 +269,8 @@ def _arm_of(flight: Row) -> str:
     base, _, changes = flight["stack"].partition(":")
     if base not in (_BASE, f"{_BASE}-protected"):
         return ""
-    told = _WORDS["stacks"].get(changes, changes)
-    name = told if base == _BASE else "all four checks" + (f", {told}" if changes else "")
+    change = _WORDS["stacks"].get(changes, changes)
+    name = change if base == _BASE else "all four checks" + (f", {change}" if changes else "")
     detector = (flight["detector"] or "").upper()
     if not detector:
         return name
@@ -288,13 +288,13 @@ _APART = ("fault", "instruction", "detector", "isolate", "stack")
 
 
 def _lost(flights: Sequence[Row]) -> Share:
-    return wilson(sum(each["lost"] for each in flights), len(flights))
+    return wilson(sum(flight["lost"] for flight in flights), len(flights))
 
 
 def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
-    found: dict[str, list[Row]] = {}
-    for each in flights:
-        target = str(each["fault_target"])
-        found.setdefault(_WORDS["sites"].get(target, target), []).append(each)
-    order = dict.fromkeys((*_WORDS["sites"].values(), *sorted(found)))
-    return {name: _lost(found[name]) for name in order if name in found}
+    by_site: dict[str, list[Row]] = {}
+    for flight in flights:
+        target = str(flight["fault_target"])
+        by_site.setdefault(_WORDS["sites"].get(target, target), []).append(flight)
+    order = dict.fromkeys((*_WORDS["sites"].values(), *sorted(by_site)))
+    return {name: _lost(by_site[name]) for name in order if name in by_site}

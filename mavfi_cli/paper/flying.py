@@ -1,4 +1,4 @@
-"""Flies the missions that items need and runs the kernels of Fig. 6, and tells the cost before."""
+"""Forecasts and flies the missions that items need, and runs the kernels of Fig. 6."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
 _MEASURED = 12  # missions that a forecast is from, if no more are over
-_OF_A_KIND = 4  # the least of them of each kind
+_OF_A_KIND = 4  # at least so many of each kind
 _NEWEST = 2000  # the most that are read
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
 
@@ -52,7 +52,7 @@ class Forecast:
     runs: int = 0
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """The forecast in one line."""
         left = self.missions - self.over
         parts = [f"{self.missions} missions, {self.over} of them flown"] if self.missions else []
@@ -78,7 +78,7 @@ def reproduce(
     """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
 
     Args:
-        on_forecast: hears what is left before it begins, after a little of it is measured.
+        on_forecast: is called with the forecast, after a few missions and runs, before the rest.
 
     Raises:
         ConfigError: the folder holds another stack, more missions, or another campaign.
@@ -97,8 +97,8 @@ def reproduce(
             wanted = frozenset(plan.numbers(ledger))
             kept = frozenset(plan.kept(ledger))
             options = replace(options, only=wanted, planned=wanted, kept=kept)
-            told = _measured(ledger, wanted, options, spectator)
-            whole = _with_flights(left, ledger, wanted, options, told)
+            measured = _measured(ledger, wanted, options, spectator)
+            whole = _with_flights(left, ledger, wanted, options, measured)
             on_forecast(whole)
             _require_room(plan.out, whole)
             fly_missing(ledger, options, _Ahead(spectator, left.seconds))
@@ -167,9 +167,9 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """The missions that a forecast is from. A few are flown of each kind of which few are over.
+    """The missions that a forecast uses. It flies a few of each kind of which few are over.
 
-    The first missions also fly the golden flights of others, so the ones after them tell.
+    The first ones also fly the golden flights of others, so the forecast uses those after them.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
@@ -180,18 +180,18 @@ def _measured(
     for number, kind in sorted(missing.items()):
         kinds.setdefault(kind, []).append(number)
     rare = [numbers for kind, numbers in kinds.items() if known[kind] < _OF_A_KIND]
-    first, told = list[int](), list[int]()
+    first, measured = list[int](), list[int]()
     for place, numbers in enumerate(sorted(rare, key=len)):
         last = min(len(numbers), len(ledger.cells())) - 1  # of the first repetition
-        count = -(-(_MEASURED - len(told)) // (len(rare) - place))
+        count = -(-(_MEASURED - len(measured)) // (len(rare) - place))
         places = range(0, last, max(2, last // count))[:count]
         first += [numbers[place] for place in places]
-        told += [numbers[place + 1] for place in places]
-    if told:
-        spectator.on_note(f"measuring {len(told)} missions")
-    for part in (first, told):
+        measured += [numbers[place + 1] for place in places]
+    if measured:
+        spectator.on_note(f"measuring {len(measured)} missions")
+    for part in (first, measured):
         fly_missing(ledger, replace(options, only=frozenset(part)), Spectator())
-    return over + told
+    return over + measured
 
 
 def _kind(instruction: object, fault: object) -> str:
@@ -201,7 +201,7 @@ def _kind(instruction: object, fault: object) -> str:
 
 def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
     """Kind and wall time of missions that are over."""
-    configs = [(each.mission.config, each.wall_s) for each in results]
+    configs = [(result.mission.config, result.wall_s) for result in results]
     return [(_kind(config.instruction, config.fault), wall_s) for config, wall_s in configs]
 
 
@@ -216,7 +216,7 @@ def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int
     times: dict[str, list[float]] = {}
     for kind, wall_s in measured:
         times.setdefault(kind, []).append(wall_s)
-    every = [wall_s for each in times.values() for wall_s in each] or [0.0]
+    every = [wall_s for own in times.values() for wall_s in own] or [0.0]
     return sum(count * fmean(times.get(kind, every)) for kind, count in missing.items())
 
 
@@ -225,16 +225,16 @@ def _with_flights(
     ledger: Ledger,
     wanted: frozenset[int],
     options: Options,
-    told: Sequence[int],
+    measured: Sequence[int],
 ) -> Forecast:
-    """A forecast with what the missing missions take beside it, by the missions that are told."""
+    """A forecast that includes the missing missions, estimated from the measured ones."""
     missing = _missing(ledger, wanted)
-    flown = list(ledger.results(told))
+    flown = list(ledger.results(measured))
     left_s = remaining_s(_kinds(flown), Counter(missing.values()))
-    losses = sum(each.outcome != "success" for each in flown) / max(1, len(flown))
+    losses = sum(result.outcome != "success" for result in flown) / max(1, len(flown))
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
     row_bytes = rows / ledger.over() if flown else _ROW_BYTES
-    runs = [each for each in (ledger.folder / RUNS).glob("*") if each.is_dir()][-20:]
+    runs = [run for run in (ledger.folder / RUNS).glob("*") if run.is_dir()][-20:]
     run_bytes = sum(map(_size, runs)) / len(runs) if runs else _FOLDER_BYTES
     kept = len(missing.keys() & options.kept) + losses * len(missing)
     return replace(
@@ -252,7 +252,7 @@ def _size(folder: Path) -> int:
 
 
 def _require_room(out: Path, forecast: Forecast) -> None:
-    place = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    place = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     free = shutil.disk_usage(place).free
     if forecast.disk_bytes > free:
         raise RecordError(
@@ -296,7 +296,7 @@ class _KernelRuns:
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
-        done = {each["kernel"]: each["runs"] for each in kernel_summary(path)["kernels"]}
+        done = {part["kernel"]: part["runs"] for part in kernel_summary(path)["kernels"]}
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     def forecast_s(self) -> float:
@@ -331,7 +331,7 @@ class _KernelRuns:
         whole, missing = self.runs * len(names), self.missing()
 
         def show(name: str, done: int) -> None:
-            """Tell the runs of the kernel, and the time left from the forecast."""
+            """Report the runs of the kernel, and the time left from the forecast."""
             place = names.index(name)
             left = min(1.0, (whole - place * self.runs - done) / missing)
             text = f"kernel {place + 1} of {len(names)}, {name}: {done}/{self.runs} runs"

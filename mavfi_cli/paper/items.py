@@ -98,21 +98,21 @@ def printed(item: str, *keys: object) -> Printed:
     return float(found)
 
 
-def _item(name: str, told: Mapping[str, Any]) -> Item:
-    drawn = f"; {told['unprinted']}: drawn only" if "unprinted" in told else ""
+def _item(name: str, entry: Mapping[str, Any]) -> Item:
+    drawn = f"; {entry['unprinted']}: drawn only" if "unprinted" in entry else ""
     return Item(
         name=name,
-        title=told["title"],
-        labels=tuple(told["labels"]),
-        columns=tuple(PaperColumn(**each) for each in told["columns"]),
-        notes=tuple(_PAPER["notes"].get(each, each) for each in told["notes"]),
-        origin=f"paper: {told['source']}{drawn}",
-        preset=told.get("preset", ""),
-        source=Source(told.get("computed_from", "flights")),
+        title=entry["title"],
+        labels=tuple(entry["labels"]),
+        columns=tuple(PaperColumn(**each) for each in entry["columns"]),
+        notes=tuple(_PAPER["notes"].get(each, each) for each in entry["notes"]),
+        origin=f"paper: {entry['source']}{drawn}",
+        preset=entry.get("preset", ""),
+        source=Source(entry.get("computed_from", "flights")),
     )
 
 
-ITEMS = tuple(_item(name, told) for name, told in _PAPER.items() if "title" in told)
+ITEMS = tuple(_item(name, entry) for name, entry in _PAPER.items() if "title" in entry)
 BY_NAME = {item.name: item for item in ITEMS}
 LEFT_OUT: Mapping[str, str] = _PAPER["left_out"]
 """Figures and tables of the paper that are no experiment, and why."""
@@ -123,7 +123,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 
     Raises:
         UnknownName: there is no such item. Suggests the nearest.
-        ConfigError: the paper has it, but it is no experiment; says what it is.
+        ConfigError: the paper has it, but it is no experiment. The message names what it is.
     """
     for name in names:
         if name in LEFT_OUT:
@@ -166,14 +166,14 @@ class FlightsPlan:
     @property
     def meta(self) -> dict[str, str]:
         """What the ledger of the flights stores of the plan."""
-        asked = {"stack": self.stack, "scale": self.scale}
-        return {"name": self.folder.name, _META: json.dumps(asked)}
+        stored = {"stack": self.stack, "scale": self.scale}
+        return {"name": self.folder.name, _META: json.dumps(stored)}
 
     @property
     def command(self) -> str:
         """The command that flies the plan's stack for all items."""
-        asked = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
-        return shlex.join(["mavfi", "reproduce", *asked])
+        options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
+        return shlex.join(["mavfi", "reproduce", *options])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
         """The missions, repetition by repetition, so that all items grow together.

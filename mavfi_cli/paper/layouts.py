@@ -51,7 +51,7 @@ _SEEDS = ("seed", "world_seed", "time_limit_s")
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
     """The flights that differ from the item's missions on a stack in _SEEDS only.
 
-    None if all that differ so are golden, unless the item needs no other.
+    Empty if all of these are golden and the item needs flights with a fault.
     """
     kinds = {
         kind_of(changes_of(mission.config), _SEEDS)
@@ -116,7 +116,7 @@ def _fig7(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
-    """Faults by the values of a column, and what the paper says of each."""
+    """Faults by the values of a column, with the paper's word for each value."""
 
     def rows(flights: Flights) -> Iterator[PaperRow]:
         yield _row(_GOLDEN, "", cells=_effects(flights.golden))
@@ -155,7 +155,7 @@ def _table3(flights: Flights) -> Iterator[PaperRow]:
 def _table4(flights: Flights) -> Iterator[PaperRow]:
     """Success in each world: golden, with faults, with each detector."""
     settings = [(_GOLDEN, "golden", flights.golden), ("injection", "none", flights.faulty())]
-    settings += [(f"{told}-based", x, flights.faulty(x)) for x, told in DETECTOR_TITLES.items()]
+    settings += [(f"{title}-based", x, flights.faulty(x)) for x, title in DETECTOR_TITLES.items()]
     for title, key, those in settings:
         cells = (
             _success(those.chosen(world=world), printed("table4", "success_percent", key, world))
@@ -423,7 +423,7 @@ def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> Paper
 
 
 def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
-    """What a protection recovers of the worst case, in per cent or in points.
+    """The part of the worst case that a protection recovers, in per cent or in points.
 
     The worst case is that of the faults that were flown with the protection, too: of more flights
     the longest is longer.

@@ -75,13 +75,13 @@ def test_the_forecast_is_one_line():
     forecast = Forecast(
         missions=100, over=10, seconds=3700, disk_bytes=2.5e6, measured=10, jobs=2, runs=7
     )
-    assert forecast.told == (
+    assert forecast.summary == (
         "100 missions, 10 of them flown; 7 runs of kernels; what is left takes about 1:01:40 h on "
         "this machine (2 at a time, from 10 missions) and 2 MB"
     )
     early = Forecast(missions=100, over=1, disk_bytes=2.5e6)
-    assert early.told == "100 missions, 1 of them flown; what is left takes about 2 MB"
-    assert Forecast(missions=8, over=8).told == "8 missions, 8 of them flown"
+    assert early.summary == "100 missions, 1 of them flown; what is left takes about 2 MB"
+    assert Forecast(missions=8, over=8).summary == "8 missions, 8 of them flown"
 
 
 def test_unknown_items_are_usage_errors(mavfi, tmp_path):
