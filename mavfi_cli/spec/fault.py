@@ -185,7 +185,7 @@ class FaultConfig:
                 raise UnknownName("state of control's queue", target, _QUEUED)
             if self.trigger().when is When.INVOCATION:
                 raise FaultSpecError(
-                    f"{self.target}: at must not be an invocation, which only messages have"
+                    f"{self.target}: at must be anything but an invocation, got {self.at}"
                 )
         return draw_fault(
             target,
