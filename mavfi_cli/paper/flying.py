@@ -14,6 +14,7 @@ from statistics import fmean
 from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
+from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
 from mavfi_cli.campaigns.missions import MissionResult
@@ -301,13 +302,8 @@ class _KernelRuns:
 
     def forecast_s(self) -> float:
         """Wall time of the missing runs, from a few runs of the quickest kernel."""
-        from mavfi_cli.mission.kernel_inputs import (  # loads the mission
-            kernel_flight,
-            kernel_targets,
-        )
-
         with ScratchFolder("kernels") as scratch:
-            targets = kernel_targets(select([_QUICKEST]), kernel_flight(), scratch)
+            targets = _targets([_QUICKEST], scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
         run_s = (measured.wall_s - measured.prepare_s) / _QUICK_RUNS
         of_each = self.missing() / len(select(()))
@@ -320,13 +316,8 @@ class _KernelRuns:
         Raises:
             MavfiError: as `attack.campaign.run_campaign`.
         """
-        from mavfi_cli.mission.kernel_inputs import (  # loads the mission
-            kernel_flight,
-            kernel_targets,
-        )
-
         plan = Plan(runs=self.runs, seed=_SEED)
-        targets = kernel_targets(select(()), kernel_flight(), self.folder)
+        targets = _targets((), self.folder)
         names, begun = [target.name for target in targets], time.monotonic()
         whole, missing = self.runs * len(names), self.missing()
 
@@ -348,3 +339,9 @@ class _KernelRuns:
             notice=lambda text: spectator.on_note(f"warning: {text}"),
         )
         save_runs(self.folder, summarise(plan, campaign), campaign)
+
+
+def _targets(names: Sequence[str], folder: Path) -> list[KernelTarget]:
+    from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets  # loads the mission
+
+    return kernel_targets(select(names), kernel_flight(), folder)

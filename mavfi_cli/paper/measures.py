@@ -51,6 +51,13 @@ def _difference(shares: Sequence[Share], counts: str) -> Finding:
     return Finding(effect=first.minus(second), counts=counts)
 
 
+def _harm_gap(groups: Mapping[str, Flights], what: str) -> Finding:
+    """Share of harmed missions in the first of two groups minus that in the second."""
+    shares = {name: _clustered(flights, "harmed") for name, flights in groups.items()}
+    counts = "; ".join(f"{name} {share.counts}" for name, share in shares.items())
+    return _difference([*shares.values()], f"{what}: {counts}")
+
+
 def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
     """The mean of a value over clusters of flights; NaN is left out."""
     clusters: dict[tuple[str, int], list[float]] = {}
@@ -122,9 +129,7 @@ def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
 
 def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of harmful faults in the first of two groups minus that in the second."""
-    shares = [_clustered(flights.struck(**where), "harmed") for where in groups.values()]
-    counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
-    return _difference(shares, f"harmful: {'; '.join(counts)}")
+    return _harm_gap({name: flights.struck(**x) for name, x in groups.items()}, "harmful")
 
 
 def _harmful(flights: Flights, **where: Any) -> Finding:
@@ -157,10 +162,8 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
     """Share of longer flights that succeed in the first of two groups minus that in the second."""
-    timed = [flights.struck(**where).timed for where in groups.values()]
-    shares = [_clustered(those, "harmed") for those in timed]
-    counts = (f"{name} {each.counts}" for name, each in zip(groups, shares, strict=True))
-    return _difference(shares, f"over 10 % longer: {'; '.join(counts)}")
+    timed = {name: flights.struck(**where).timed for name, where in groups.items()}
+    return _harm_gap(timed, "over 10 % longer")
 
 
 def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: Any) -> Finding:
@@ -248,15 +251,9 @@ def _undone_difference(
 
 
 def _density_gap(flights: Flights, detector: str, dense: str, free: str, **where: Any) -> Finding:
-    """Share of protected missions lost beyond golden in a dense world minus that in a free one."""
-    gaps = []
-    for world in (dense, free):
-        seen = flights.protected(detector, world=world, **where)
-        if not len(seen):
-            return NOT_FLOWN
-        gaps.append(_clustered(seen, "harmed"))
-    return _difference(gaps, f"harmed with the detector: {dense} {gaps[0].counts}, "
-                             f"{free} {gaps[1].counts}")  # fmt: skip
+    """Share of protected missions harmed in a dense world minus that in a free one."""
+    worlds = {name: flights.protected(detector, world=name, **where) for name in (dense, free)}
+    return _harm_gap(worlds, "harmed with the detector")
 
 
 def _autoencoder_better(flights: Flights, **where: Any) -> Finding:
