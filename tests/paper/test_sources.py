@@ -101,6 +101,12 @@ def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
     assert "is 1.0" in problem
 
 
+def test_an_export_that_names_no_build_is_told(tmp_path):
+    pq.write_table(export_table([row()]), tmp_path / "merged.parquet")
+    (problem,) = Evidence.gather([tmp_path]).problems
+    assert problem.startswith("merged.parquet: the export does not name the builds")
+
+
 def test_a_build_that_is_not_this_one_is_told(campaign):
     (problem,) = Evidence.gather([campaign("old", 1, 1, {"ompl": "0.1"})]).problems
     assert "another build than this one" in problem
