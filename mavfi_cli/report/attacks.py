@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.analysis.kernels import KERNELS
 from mavfi_cli.attack.campaign import Plan, TargetRuns
 from mavfi_cli.attack.kernels import catalogue
+from mavfi_cli.attack.kernels.catalogue import Kernel
 from mavfi_cli.attack.kernels.target import KernelTarget
+from mavfi_cli.attack.null_runs import NullRuns
 from mavfi_cli.attack.target import RunOutcome, signal_name
 from mavfi_cli.core.files import write_json, write_text
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
-from mavfi_cli.report.table import WIDTH, Table
-from mavfi_cli.stats.shares import Cluster, clustered_share, unseen_share
+from mavfi_cli.report.table import WIDTH, Table, percent, rate
+from mavfi_cli.stats.shares import Cluster, Share, clustered_share, unseen_share
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,75 +39,43 @@ KERNEL_COLUMNS = (
 PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".split()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunShare:
-    """A share of runs with its 95 % interval; a share of nothing is None."""
+def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> Share:
+    """The share of hits in the injected runs, or in all.
 
-    count: int
-    of: int
-    share: float | None
-    wilson95: list[float]
-
-    @classmethod
-    def of_hits(cls, runs: TargetRuns, hits: Sequence[bool], *, of_all: bool = False) -> RunShare:
-        """The share of hits in the injected runs, or in all.
-
-        Where windows are sampled, the spread between them widens the interval.
-        """
-        chosen: list[bool] = []
-        windows: list[Cluster | None] = []
-        for run, (hit, entry) in enumerate(zip(hits, runs.records, strict=True)):
-            if of_all or entry["outcome"] != RunOutcome.NOT_INJECTED.value:
-                number = runs.input_of(run)
-                profile = runs.profiles[number]
-                window = None if profile is None else profile.window_of(entry)
-                windows.append(window and ((number, window[0]), window[1]))
-                chosen.append(hit)
-        sampled = {
-            (number, stratum): count
-            for number, profile in enumerate(runs.profiles)
-            if profile is not None
-            for stratum, count in profile.sampled.items()
-        }
-        share = clustered_share(chosen, windows, sampled)
-        return cls(
-            count=share.count,
-            of=share.total,
-            share=_finite(share.share),
-            wilson95=[share.low, share.high],
-        )
-
-    @property
-    def cell(self) -> str:
-        """The share and its interval in per cent."""
-        if self.share is None:
-            return "-"
-        low, high = (100.0 * end for end in self.wilson95)
-        return f"{100.0 * self.share:.1f} % ({low:.1f} to {high:.1f})"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NullRunCounts:
-    """The null runs of a target.
-
-    Attributes:
-        runs, counting: how many were equal, and by which methods of counting.
-        unused: methods that change the output.
-        differing95: upper bound of the share that differs without a flip.
+    Where windows are sampled, the spread between them widens the interval.
     """
+    chosen: list[bool] = []
+    windows: list[Cluster | None] = []
+    for run, (hit, entry) in enumerate(zip(hits, runs.records, strict=True)):
+        if of_all or entry["outcome"] != RunOutcome.NOT_INJECTED.value:
+            number = runs.input_of(run)
+            profile = runs.profiles[number]
+            window = None if profile is None else profile.window_of(entry)
+            windows.append(window and ((number, window[0]), window[1]))
+            chosen.append(hit)
+    sampled = {
+        (number, stratum): count
+        for number, profile in enumerate(runs.profiles)
+        if profile is not None
+        for stratum, count in profile.sampled.items()
+    }
+    return clustered_share(chosen, windows, sampled)
 
-    runs: int
-    counting: dict[str, int]
-    unused: list[str]
-    differing95: float
+
+def _share_entry(share: Share) -> dict[str, Any]:
+    """A share as in `kernels.json`, where a share of nothing is None."""
+    return {
+        "count": share.count, "of": share.total, "share": _finite(share.share),
+        "wilson95": [share.low, share.high],
+    }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetCounts:
     """The counts of one target; shares are those of the *injected* runs."""
 
-    null_runs: _NullRunCounts
-    outcomes: dict[str, RunShare]
+    null_runs: NullRuns
+    outcomes: dict[str, Share]
     crashes: dict[str, int]
     not_injected: dict[str, int]
     activation: dict[str, int]
@@ -112,19 +83,14 @@ class TargetCounts:
     @classmethod
     def of(cls, runs: TargetRuns) -> TargetCounts:
         """Count the runs of a target."""
-        records, null_runs = runs.records, runs.null_runs
+        records = runs.records
         reasons = (entry["not_injected_reason"] for entry in records)
         return cls(
-            null_runs=_NullRunCounts(
-                runs=null_runs.reached,
-                counting=dict(sorted(null_runs.counting.items())),
-                unused=[*null_runs.unused],
-                differing95=unseen_share(null_runs.reached),
-            ),
+            null_runs=runs.null_runs,
             outcomes={
-                outcome.value: RunShare.of_hits(
+                outcome.value: _share(
                     runs,
-                    [entry["outcome"] == outcome.value for entry in records],
+                    (entry["outcome"] == outcome.value for entry in records),
                     of_all=outcome is RunOutcome.NOT_INJECTED,
                 )
                 for outcome in RunOutcome
@@ -134,12 +100,32 @@ class TargetCounts:
             activation=_counted(entry["activation"]["activation"] for entry in records),
         )
 
+    @property
+    def differing(self) -> float:
+        """Upper 95 % bound of the share that differs without a flip."""
+        return unseen_share(self.null_runs.reached)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as in `kernels.json`."""
+        null_runs = self.null_runs
+        return {
+            "null_runs": {
+                "runs": null_runs.reached, "counting": dict(sorted(null_runs.counting.items())),
+                "unused": [*null_runs.unused], "differing95": self.differing,
+            },
+            "outcomes": {name: _share_entry(share) for name, share in self.outcomes.items()},
+            "crashes": self.crashes,
+            "not_injected": self.not_injected,
+            "activation": self.activation,
+        }  # fmt: skip
+
     def lines(self, indent: str) -> Iterator[str]:
         """Null runs, crashes, reasons and activations as text."""
         null_runs = self.null_runs
+        counting = _listed(dict(sorted(null_runs.counting.items())))
         yield (
-            f"{indent}null runs: {null_runs.runs} equal ({_listed(null_runs.counting)}); without a "
-            f"flip at most {100 * null_runs.differing95:.1f} % differ (95 % bound)"
+            f"{indent}null runs: {null_runs.reached} equal ({counting}); without a "
+            f"flip at most {100 * self.differing:.1f} % differ (95 % bound)"
         )
         if null_runs.unused:
             yield f"{indent}not used, because it changes the output: {', '.join(null_runs.unused)}"
@@ -153,52 +139,92 @@ class TargetCounts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _InputCounts:
-    """One input of a kernel: how much of its run was profiled, and what became of its runs."""
-
-    population: str
-    complete: bool | None
-    instructions: float | None
-    instructions95: list[float | None] | None
-    golden: dict[str, str | float]
-    outcomes: dict[str, int]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class KernelCounts:
-    """The runs of a kernel.
+    """The runs of a kernel with their counts.
 
     Attributes:
-        counts: its counts; they have no level of their own in JSON.
-        sdc_relative: median and largest relative size of silent corruptions, and the number of
-            those without a size.
-        noticeable, tolerance: the share of runs with a silent corruption beyond the kernel's own
-            tolerance.
-        sdc_parts: of each part of silent corruptions the number of runs that have it, and its
-            median and largest size.
-        within_tolerance: benign runs with another output.
+        noticeable: the share of runs with a silent corruption beyond the kernel's own tolerance.
+        sdc: relative sizes of silent corruptions, None without one.
+        parts: sizes of each part of silent corruptions, from the smallest.
     """
 
-    kernel: str
-    title: str
-    runs: int
-    scope: list[str]
-    inputs: list[_InputCounts]
+    kernel: Kernel
+    runs: TargetRuns
     counts: TargetCounts
-    sdc_relative: dict[str, float | None]
-    noticeable: RunShare
-    tolerance: str
-    sdc_parts: dict[str, dict[str, float | None]]
-    within_tolerance: int
-    prepare_s: float
-    wall_s: float
-    injections_per_core_hour: float | None
+    noticeable: Share
+    sdc: list[float | None]
+    parts: dict[str, list[float]]
+
+    @classmethod
+    def of(cls, runs: TargetRuns) -> KernelCounts:
+        """Count the runs of a kernel."""
+        assert isinstance(runs.target, KernelTarget)
+        sizes = [entry["magnitude"] for entry in _with(runs.records, RunOutcome.SDC)]
+        parts: dict[str, list[float]] = {}
+        for magnitude in sizes:
+            for name, size in magnitude["parts"].items():
+                parts.setdefault(name, []).extend([abs(size)] if size else [])
+        sdc = RunOutcome.SDC.value
+        noticeable = (e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in runs.records)
+        return cls(
+            kernel=catalogue.find(runs.target.kernel),
+            runs=runs,
+            counts=TargetCounts.of(runs),
+            noticeable=_share(runs, noticeable),
+            sdc=[magnitude["relative"] for magnitude in sizes],
+            parts={name: sorted(own) for name, own in parts.items()},
+        )
+
+    @property
+    def comparable(self) -> list[float]:
+        """Relative sizes of silent corruptions that have one, from the smallest."""
+        return sorted(size for size in self.sdc if size is not None)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as in `kernels.json`."""
-        values = asdict(self)
-        noticeable = {"tolerance": values.pop("tolerance"), **values.pop("noticeable")}
-        return {**values.pop("counts"), **values, "sdc_noticeable": noticeable}
+        runs, records = self.runs, self.runs.records
+        run_s = sum(entry["run_s"] for entry in records)
+        return {
+            **self.counts.as_dict(),
+            "kernel": runs.target.name,
+            "title": self.kernel.title,
+            "runs": len(records),
+            "scope": runs.context["scope"],
+            "inputs": [_input(runs, number) for number in range(len(runs.goldens))],
+            "sdc_relative": {
+                **_sizes(self.comparable), "incomparable": self.sdc.count(None)
+            },
+            "sdc_parts": {
+                name: {"runs": len(part), **_sizes(part)} for name, part in self.parts.items()
+            },
+            "within_tolerance": sum(bool(entry["within_tolerance"]) for entry in records),
+            "prepare_s": runs.prepare_s,
+            "wall_s": runs.wall_s,
+            "injections_per_core_hour": 3600.0 * len(records) / run_s if run_s else None,
+            "sdc_noticeable": {
+                "tolerance": self.kernel.tolerance, **_share_entry(self.noticeable)
+            },
+        }  # fmt: skip
+
+    def lines(self) -> Iterator[str]:
+        """The notes on the runs as text."""
+        yield f"{self.kernel.title}: scope {', '.join(self.runs.context['scope'])}"
+        for number in range(len(self.runs.goldens)):
+            yield f"  input {number}: {_population(self.runs, number)}"
+        yield from self.counts.lines("  ")
+        if sizes := self.comparable:
+            yield (
+                f"  SDC, relative size: median {_median(sizes):.2g}, largest {sizes[-1]:.2g}; "
+                f"{self.sdc.count(None)} of another shape or not a number"
+            )
+        if self.counts.outcomes[RunOutcome.SDC.value].count:
+            yield f"  SDC beyond {self.kernel.tolerance}: {rate(self.noticeable, ends=1)}"
+        if self.parts:
+            parts = (
+                f"{name} in {len(part)}" + (f" (median {_median(part):.2g})" if part else "")
+                for name, part in self.parts.items()
+            )
+            yield f"  SDC by part: {', '.join(parts)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,8 +248,8 @@ class KernelsSummary:
         """A table with one row per kernel, and notes."""
         head = ["kernel", "runs", *(outcome.title for outcome in RunOutcome)]
         rows = [
-            [kernel.title, str(kernel.runs),
-             *(kernel.counts.outcomes[outcome.value].cell for outcome in RunOutcome)]
+            [kernel.kernel.title, str(len(kernel.runs.records)),
+             *(rate(kernel.counts.outcomes[outcome.value], ends=1) for outcome in RunOutcome)]
             for kernel in self.kernels
         ]  # fmt: skip
         lines = [
@@ -234,91 +260,72 @@ class KernelsSummary:
             "widened by the spread between windows where windows are sampled",
             f"inputs: {self.plan['flight']}; tolerance {self.plan['tolerance']:g}",
         ]
-        for kernel in self.kernels:
-            lines += _notes(kernel)
-        return "\n".join(lines)
+        return "\n".join([*lines, *(line for kernel in self.kernels for line in kernel.lines())])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramSummary:
-    """A campaign on a program.
+    """A campaign on a program, with its counts."""
 
-    Attributes:
-        target: entries of every record about the program, such as its `scope`.
-        counts: its counts; neither has a level of its own in JSON.
-    """
-
-    target: Mapping[str, Any]
+    runs: TargetRuns
     sampling: str
     seed: int
-    runs: int
-    executed_in_scope: int | None
-    profile_complete: bool | None
-    windows: str | None
-    counted: bool
-    not_reached: float | None
-    profile_s: float | None
-    golden_wall_s: float
-    wall_s: float
     counts: TargetCounts
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as `--json` prints them."""
-        values = asdict(self)
-        return {**values.pop("target"), **values.pop("counts"), **values}
+        runs, profile = self.runs, self.runs.profile
+        part = partial(getattr, profile) if profile is not None else lambda _name: None
+        return {
+            **runs.context,
+            **self.counts.as_dict(),
+            "sampling": self.sampling,
+            "seed": self.seed,
+            "runs": len(runs.records),
+            "executed_in_scope": part("executed"),
+            "profile_complete": part("complete"),
+            "windows": part("windows"),
+            "counted": part("counted") is not None,
+            "not_reached": part("not_reached"),
+            "profile_s": part("cost_s"),
+            "golden_wall_s": runs.golden.wall_s,
+            "wall_s": runs.wall_s,
+        }
 
     def text(self) -> str:
         """A table with one row per outcome, and notes."""
         lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
-        for name, row in self.counts.outcomes.items():
-            share = "-" if row.share is None else f"{100 * row.share:.1f} %"
-            low, high = (100 * end for end in row.wilson95)
-            title = RunOutcome(name).title
-            lines.append(f"{title:<14}{row.count:>7}{share:>9}   {low:.1f} to {high:.1f} %")
+        for name, share in self.counts.outcomes.items():
+            lines.append(
+                f"{RunOutcome(name).title:<14}{share.count:>7}{percent(share.share):>9}   "
+                f"{100 * share.low:.1f} to {100 * share.high:.1f} %"
+            )
             if name == RunOutcome.SDC.value:
-                bound = 100 * self.counts.null_runs.differing95
-                lines[-1] += f"   (without a flip: 0.0 to {bound:.1f} %)"
-        lines.append(f"sampling: {self.sampling}; scope: {', '.join(self.target['scope'])}")
-        if self.executed_in_scope is not None:
-            how = f"windows stepped: {self.windows}"
-            if self.counted and self.not_reached is not None:
-                missed = 100 * self.not_reached
+                lines[-1] += f"   (without a flip: 0.0 to {100 * self.counts.differing:.1f} %)"
+        lines.append(f"sampling: {self.sampling}; scope: {', '.join(self.runs.context['scope'])}")
+        if (profile := self.runs.profile) is not None:
+            how = f"windows stepped: {profile.windows}"
+            if profile.counted is not None and profile.not_reached is not None:
+                missed = 100 * profile.not_reached
                 how = f"counted by callgrind; {missed:.2g} % of the executions are not reached"
-            lines.append(f"{self.executed_in_scope} executed instructions in scope, {how}")
+            lines.append(f"{profile.executed} executed instructions in scope, {how}")
         return "\n".join([*lines, *self.counts.lines("")])
 
 
 def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> KernelsSummary | ProgramSummary:
     """Summarise a campaign on kernels or on a program."""
-    if isinstance(campaign[0].target, KernelTarget):
-        return KernelsSummary(
-            plan=plan.to_json(campaign[0].target),
-            sampling=plan.strategy().name,
-            kernels=[_kernel(runs) for runs in campaign],
-        )
-    runs = campaign[0]
-    profile = runs.profile
+    sampling, first = plan.strategy().name, campaign[0]
+    if isinstance(first.target, KernelTarget):
+        kernels = [KernelCounts.of(runs) for runs in campaign]
+        return KernelsSummary(plan=plan.to_json(first.target), sampling=sampling, kernels=kernels)
     return ProgramSummary(
-        target=runs.context,
-        sampling=plan.strategy().name,
-        seed=plan.seed,
-        runs=len(runs.records),
-        executed_in_scope=None if profile is None else profile.executed,
-        profile_complete=None if profile is None else profile.complete,
-        windows=None if profile is None else profile.windows,
-        counted=profile is not None and profile.counted is not None,
-        not_reached=None if profile is None else profile.not_reached,
-        profile_s=None if profile is None else profile.cost_s,
-        golden_wall_s=runs.golden.wall_s,
-        wall_s=runs.wall_s,
-        counts=TargetCounts.of(runs),
+        runs=first, sampling=sampling, seed=plan.seed, counts=TargetCounts.of(first)
     )
 
 
 def _counted(names: Iterable[str]) -> dict[str, int]:
     """Count each name, the most frequent first."""
-    counts = Counter(names)
-    return {name: counts[name] for name in sorted(counts, key=lambda n: (-counts[n], n))}
+    return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
 
 def _listed(counts: Mapping[str, int]) -> str:
@@ -341,81 +348,34 @@ def _finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _kernel(runs: TargetRuns) -> KernelCounts:
-    target, records = runs.target, runs.records
-    assert isinstance(target, KernelTarget)
-    kernel = catalogue.find(target.kernel)
-    sizes = [entry["magnitude"]["relative"] for entry in _with(records, RunOutcome.SDC)]
-    finite = [size for size in sizes if size is not None]
-    run_s = sum(entry["run_s"] for entry in records)
-    sdc = RunOutcome.SDC.value
-    noticeable = [e["outcome"] == sdc and e["magnitude"]["noticeable"] for e in records]
-    return KernelCounts(
-        kernel=target.name,
-        title=kernel.title,
-        runs=len(records),
-        scope=runs.context["scope"],
-        inputs=[_input(runs, number) for number in range(len(runs.goldens))],
-        counts=TargetCounts.of(runs),
-        sdc_relative={**_sizes(finite), "incomparable": len(sizes) - len(finite)},
-        noticeable=RunShare.of_hits(runs, noticeable),
-        tolerance=kernel.tolerance,
-        sdc_parts=_parts(records),
-        within_tolerance=sum(bool(entry["within_tolerance"]) for entry in records),
-        prepare_s=runs.prepare_s,
-        wall_s=runs.wall_s,
-        injections_per_core_hour=3600.0 * len(records) / run_s if run_s else None,
-    )
-
-
-def _input(runs: TargetRuns, number: int) -> _InputCounts:
-    profile, golden = runs.profiles[number], runs.goldens[number]
-    length = None if profile is None else profile.instructions
-    return _InputCounts(
-        population="moments of one call" if profile is None else profile.describe(),
-        complete=None if profile is None else profile.complete,
-        instructions=None if length is None else length.value,
-        instructions95=None if length is None else [length.low, _finite(length.high)],
-        golden={"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
-        outcomes=_counted(entry["outcome"] for entry in runs.records_of(number)),
-    )
+def _median(sizes: Sequence[float]) -> float:
+    return sizes[len(sizes) // 2]
 
 
 def _sizes(sizes: Sequence[float]) -> dict[str, float | None]:
-    """The median and the largest of some sizes."""
-    median = sorted(sizes)[len(sizes) // 2] if sizes else None
-    return {"median": median, "largest": max(sizes, default=None)}
+    """The median and the largest of sizes from the smallest."""
+    largest = sizes[-1] if sizes else None
+    return {"median": _median(sizes) if sizes else None, "largest": largest}
 
 
-def _parts(records: Sequence[FaultRecord]) -> dict[str, dict[str, float | None]]:
-    """The parts of silent corruptions: the number of runs that have one, and its size."""
-    sizes: dict[str, list[float]] = {}
-    for entry in _with(records, RunOutcome.SDC):
-        for name, size in entry["magnitude"]["parts"].items():
-            sizes.setdefault(name, [])
-            sizes[name] += [abs(size)] if size else []
-    return {name: {"runs": len(own), **_sizes(own)} for name, own in sizes.items()}
+def _population(runs: TargetRuns, number: int) -> str:
+    """How much of an input's run was profiled."""
+    profile = runs.profiles[number]
+    return "moments of one call" if profile is None else profile.describe()
 
 
-def _notes(kernel: KernelCounts) -> Iterator[str]:
-    yield f"{kernel.title}: scope {', '.join(kernel.scope)}"
-    yield from (f"  input {n}: {own.population}" for n, own in enumerate(kernel.inputs))
-    yield from kernel.counts.lines("  ")
-    sdc = kernel.sdc_relative
-    if sdc["median"] is not None:
-        yield (
-            f"  SDC, relative size: median {sdc['median']:.2g}, largest {sdc['largest']:.2g}; "
-            f"{sdc['incomparable']} of another shape or not a number"
-        )
-    if kernel.counts.outcomes[RunOutcome.SDC.value].count:
-        yield f"  SDC beyond {kernel.tolerance}: {kernel.noticeable.cell}"
-    if kernel.sdc_parts:
-        parts = ", ".join(
-            f"{name} in {part['runs']}"
-            + (f" (median {part['median']:.2g})" if part["runs"] else "")
-            for name, part in kernel.sdc_parts.items()
-        )
-        yield f"  SDC by part: {parts}"
+def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
+    """An input of a kernel: how much of its run was profiled, and what became of its runs."""
+    profile, golden = runs.profiles[number], runs.goldens[number]
+    length = None if profile is None else profile.instructions
+    return {
+        "population": _population(runs, number),
+        "complete": None if profile is None else profile.complete,
+        "instructions": None if length is None else length.value,
+        "instructions95": None if length is None else [length.low, _finite(length.high)],
+        "golden": {"sha256": golden.sha256, "cpu_s": golden.cpu_s, "wall_s": golden.wall_s},
+        "outcomes": _counted(entry["outcome"] for entry in runs.records_of(number)),
+    }
 
 
 # Files --------------------------------------------------------------------------------------------
@@ -487,12 +447,12 @@ def _kernel_figure(summary: KernelsSummary) -> Figure:
     return figure
 
 
-def _bar(axes: Axes, place: int, outcomes: Mapping[str, RunShare]) -> None:
+def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
     """Stack the segments from below. All but the last have an interval at their upper edge."""
     base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]
-        share = 100.0 * (row.share or 0.0)
+        share = 100.0 * row.share if row.total else 0.0
         axes.bar(place, share, bottom=base, width=_WIDTH, color=colour)
         if share >= _ROOM:
             axes.text(
@@ -505,7 +465,7 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, RunShare]) -> None:
                 place + _WIDTH / 2 + 0.03, below, _small(share), color=_DARKER[name],
                 fontsize=7.5, ha="left", va="center",
             )  # fmt: skip
-        low, high = (100.0 * edge for edge in row.wilson95)
+        low, high = 100.0 * row.low, 100.0 * row.high
         if row.count and name != "benign" and high - low >= _VISIBLE:
             axes.errorbar(
                 place + 0.03 + 0.1 * number, base + share, [[share - low], [high - share]],
@@ -519,8 +479,7 @@ def _small(share: float) -> str:
 
 
 def _tick(kernel: KernelCounts) -> str:
-    injected = kernel.counts.outcomes["benign"].of
-    return f"{kernel.title}\nn = {injected}"
+    return f"{kernel.kernel.title}\nn = {kernel.counts.outcomes['benign'].total}"
 
 
 def _caption(summary: KernelsSummary) -> str:

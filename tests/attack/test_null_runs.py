@@ -36,7 +36,7 @@ def test_every_counting_method_is_tried_and_the_bound_stands_beside_the_sdc(targ
     assert set(runs.null_runs.counting) == {NEAR, BREAKPOINT}
     assert min(runs.null_runs.counting.values()) >= 5
     summary = summarise(plan, [runs])
-    assert summary.counts.null_runs.runs == NULL_RUNS == 20
+    assert summary.counts.null_runs.reached == NULL_RUNS == 20
     lines = summary.text().splitlines()
     (sdc,) = (line for line in lines if line.startswith("SDC"))
     assert sdc.endswith("(without a flip: 0.0 to 13.9 %)")
