@@ -347,7 +347,7 @@ def _joined(
         for row in rows(table):
             if row.cells:
                 c, s, n = (
-                    [table.told(row, place, unit) for place in range(len(row.cells))]
+                    [table.beside(row, place, unit) for place in range(len(row.cells))]
                     for unit in (" %", " s", "")
                 )
                 parts.append(form.format(*row.labels, c=c, s=s, n=n, last=c[-1], **titles))
@@ -368,8 +368,8 @@ def _worst_told(table: PaperTable) -> str:
         return _NOTHING
     lowest = min(struck, key=lambda row: row.cells[0].value)
     told = (
-        f"longest flight {table.told(longest[0], 2)} over its own golden one "
-        f"({longest[0].labels[0]}); lowest success {table.told(lowest, 0)} ({lowest.labels[0]})"
+        f"longest flight {table.beside(longest[0], 2)} over its own golden one "
+        f"({longest[0].labels[0]}); lowest success {table.beside(lowest, 0)} ({lowest.labels[0]})"
     )
     worst, lost = (printed("fig7", x) for x in ("worst_increase_percent", "success_lost_points"))
     paper = f"; paper: up to +{worst} % and -{lost} points"

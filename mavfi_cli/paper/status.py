@@ -163,7 +163,7 @@ def of_model() -> PaperTable:
         )
         rows[scheme] = PaperRow(labels=(scheme,), cells=tuple(cells))
     table = item.table([*rows.values()])
-    times = (f"{name} {table.told(rows['tmr'], place, '')}" for place, name in enumerate(names))
+    times = (f"{name} {table.beside(rows['tmr'], place, '')}" for place, name in enumerate(names))
     return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
 
 

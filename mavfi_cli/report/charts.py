@@ -54,7 +54,7 @@ class Picture:
         cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
     ) -> Picture:
         """The picture of a figure, and of one for narrow screens, in the page's look."""
-        wide, small = (_markup(each) if each else "" for each in (figure, narrow))
+        wide, small = (_markup(part) if part else "" for part in (figure, narrow))
         return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
 
 

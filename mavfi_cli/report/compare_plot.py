@@ -107,17 +107,17 @@ def _setting_ticks(axes: Axes, settings: Sequence[str]) -> None:
 def _times(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
     settings = comparison.plan.settings
     places, width = _places(comparison, settings)
-    shown: dict[tuple[str, str], list[float]] = {}
+    times_s: dict[tuple[str, str], list[float]] = {}
     for flight in comparison.flights:
         if flight["counted"] and flight["outcome"] == "success":
             place = flight["platform"], flight["setting"]
-            shown.setdefault(place, []).append(flight["flight_time_s"])
-    flown = [*itertools.chain(*shown.values())] or [1.0]
+            times_s.setdefault(place, []).append(flight["flight_time_s"])
+    flown = [*itertools.chain(*times_s.values())] or [1.0]
     room = 0.16 * max(max(flown) - min(flown), 0.1 * max(flown))
     for row in comparison.settings:
         key = row.platform, row.setting
         x, colour = places[key], colours[row.platform]
-        times = shown.get(key, [])
+        times = times_s.get(key, [])
         _foot(axes, x, row, len(times), colour)
         if not times:
             continue
@@ -329,9 +329,9 @@ def _draw_timeline(comparison: PlatformComparison) -> Figure:
         panels[0].set_axis_off()
         panels[0].text(0.5, 0.5, "no flight answered a depth frame", ha="center", color=NOTE)
         return figure
-    shown = rows[0].shown_s
+    window = rows[0].shown_s
     for axes, row in zip(panels, rows, strict=True):
-        _panel(axes, row, known[row.platform], shown)
+        _panel(axes, row, known[row.platform], window)
     panels[-1].set_xlabel("simulated time since the depth frame, s", fontsize=9)
     figure.supxlabel(_timeline_caption(comparison), fontsize=7.5, color=NOTE)
     return figure
@@ -345,9 +345,9 @@ def _timeline_caption(comparison: PlatformComparison) -> str:
     )
 
 
-def _panel(axes: Axes, row: Timeline, platform: PlatformSummary, shown: Span) -> None:
-    width_s = shown[1] - shown[0]
-    axes.set_xlim(*shown)
+def _panel(axes: Axes, row: Timeline, platform: PlatformSummary, window: Span) -> None:
+    width_s = window[1] - window[0]
+    axes.set_xlim(*window)
     for lane, (kernel, (_, strong, pale)) in enumerate(_LANES.items()):
         axes.axhspan(lane - 0.5, lane + 0.5, color="#f7f8fa" if lane % 2 else "white", zorder=0)
         _others(axes, lane, row.lanes_s[kernel], pale, width_s)

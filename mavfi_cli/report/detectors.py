@@ -30,7 +30,7 @@ from mavfi_cli.report.drawing import (
     open_frame,
     whisker,
 )
-from mavfi_cli.report.table import Table, number, percent, rate, spread
+from mavfi_cli.report.table import Table, number, percent, rate, spread, with_ends
 from mavfi_cli.stats.shares import Share
 
 if TYPE_CHECKING:
@@ -131,9 +131,12 @@ def _recovery_rows(rows: Sequence[FaultRow]) -> Iterator[list[str]]:
     yield ["", "success", "missions recovered", "harm undone", "added", "worst, recovered"]
     for row in rows:
         bare = row.detector == NONE
+        mixed = (row.protected["share"], row.protected["low"], row.protected["high"])
         yield [
             row.detector,
-            rate(row.unprotected if bare else row.protected),
+            rate(row.unprotected)
+            if bare
+            else with_ends(mixed, ".1f", ".0f", scale=100.0, unit=" %"),
             "" if bare else _share(row.recovered),
             "" if bare else _share(row.undone),
             "" if bare else _fraction(row.added),

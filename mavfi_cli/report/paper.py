@@ -70,7 +70,7 @@ class PaperColumn:
     ends: int | None = None
     sign: bool = False
 
-    def told(self, value: float) -> str:
+    def formatted(self, value: float) -> str:
         """A number in the column's form; a dash if there is none."""
         return number(value, self._shape(self.digits))
 
@@ -85,7 +85,7 @@ class PaperColumn:
     def printed(self, paper: Printed) -> str:
         """A number of the paper in its own form."""
         if isinstance(paper, float):
-            return self.told(paper)
+            return self.formatted(paper)
         return paper or ""
 
 
@@ -129,11 +129,13 @@ class PaperTable:
         """Whether the paper prints anything in a column."""
         return any(row.cells[place].paper is not None for row in self.rows)
 
-    def told(self, row: PaperRow, place: int, unit: str = " %") -> str:
+    def beside(self, row: PaperRow, place: int, unit: str = " %") -> str:
         """Our number in a row and a column, with the paper's in brackets if it prints one."""
         column, cell = self.columns[place], row.cells[place]
         paper = column.printed(cell.paper)
-        return f"{column.told(cell.value)}{unit}" + (f" (paper {paper}{unit})" if paper else "")
+        return f"{column.formatted(cell.value)}{unit}" + (
+            f" (paper {paper}{unit})" if paper else ""
+        )
 
     def ranked(self, place: int) -> list[PaperRow]:
         """The rows with a number in a column, the largest first."""
@@ -213,7 +215,7 @@ def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
     Args:
         table: at least one row.
     """
-    shown = [
+    places = [
         place
         for place in range(len(table.columns))
         if any(math.isfinite(row.cells[place].value) for row in table.rows)
@@ -221,16 +223,16 @@ def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
     whole = (", ".join(label for label in row.labels if label) for row in table.rows)
     names = [textwrap.fill(name, _NAME) for name in whole]
     row_in = _LINE_IN + _NEXT_LINE_IN * max(name.count("\n") for name in names)
-    titles = [table.columns[place].title for place in shown]
+    titles = [table.columns[place].title for place in places]
     figure, panels = _panels(titles, names, columns, 0.62 + row_in * max(2, len(names)), 0.25)
-    for panel, place in zip(panels, shown, strict=True):
+    for panel, place in zip(panels, places, strict=True):
         panel.margins(x=0.08)
         for y, row in enumerate(table.rows):
             _dot(panel, y, row.cells[place])
     ours = panels[0].plot(
         [], [], "o-", color=PALETTE[0], markersize=4, linewidth=1.2, label="ours, 95 % interval"
     )
-    _explain(figure, ours, "paper" if any(map(table.printed_in, shown)) else "", "lower")
+    _explain(figure, ours, "paper" if any(map(table.printed_in, places)) else "", "lower")
     return figure
 
 
@@ -249,18 +251,18 @@ def _panels(
         names: of the rows.
         panel_in, more_in: height of a panel, and of what the figure has beside panels.
     """
-    told = list(titles)
-    across = min(len(told), 4 if columns == "two" else 2)
-    down = math.ceil(len(told) / across)
+    panels = list(titles)
+    across = min(len(panels), 4 if columns == "two" else 2)
+    down = math.ceil(len(panels) / across)
     figure = new_figure(WIDTHS_IN[columns], down * panel_in + more_in)
     grid = figure.subplots(down, across, squeeze=False, sharey=True, sharex=sharex)
-    for axes, title in zip(grid.flat, told, strict=False):
+    for axes, title in zip(grid.flat, panels, strict=False):
         print_axes(axes, title)
-    for axes in grid.flat[len(told) :]:
+    for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     grid[0, 0].set_yticks(range(len(names)), names, fontsize=SMALLEST)
     grid[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    return figure, list(grid.flat[: len(told)])
+    return figure, list(grid.flat[: len(panels)])
 
 
 def _dot(axes: Axes, y: int, cell: PaperCell) -> None:
@@ -392,7 +394,7 @@ def draw_histograms(
     figure = new_figure(WIDTHS_IN[columns], 0.35 + 0.95 * len(rows))
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (name, *both), panels in zip(rows, grid, strict=True):
-        spans = [float(np.abs(each).max()) if len(each) else 1.0 for each in both]
+        spans = [float(np.abs(part).max()) if len(part) else 1.0 for part in both]
         for kind, values, axes in zip(("value", "delta"), both, panels, strict=True):
             print_axes(axes, f"{name}: {kind}")
             axes.hist(values, bins=61, range=(-max(spans), max(spans)), color=PALETTE[0])

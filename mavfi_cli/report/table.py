@@ -9,7 +9,6 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Self
 
 from mavfi_cli.core.errors import printable
@@ -237,8 +236,6 @@ def _latex(text: str) -> str:
 
 # Numbers ------------------------------------------------------------------------------------------
 
-Row = Mapping[str, Any]
-
 
 def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") -> str:
     """Format a value with its unit; a dash if it is not finite."""
@@ -274,17 +271,19 @@ def with_ends(
     return f"{value:{shape}}{unit}" + (f" ({', '.join(more)})" if more else "")
 
 
-def rate(share: Share | Row, digits: int = 1, ends: int = 0) -> str:
+def rate(share: Share, digits: int = 1, ends: int = 0) -> str:
     """Format a share as per cent with its interval.
 
     Args:
         ends: digits of the ends of the interval.
     """
-    return with_ends(_parts(share, "share"), f".{digits}f", f".{ends}f", scale=100.0, unit=" %")
+    return with_ends(
+        (share.share, share.low, share.high), f".{digits}f", f".{ends}f", scale=100.0, unit=" %"
+    )
 
 
 def spread(
-    value: Interval | Row,
+    value: Interval,
     digits: int,
     scale: float = 1.0,
     sign: str = "",
@@ -292,13 +291,7 @@ def spread(
 ) -> str:
     """Format a value with its interval and p-value if there are any."""
     shape = f"{sign or 'z'}.{digits}f"  # the sign of -0.00 shows its side of zero
-    return with_ends(_parts(value, "value"), shape, scale=scale, chance=chance)
-
-
-def _parts(estimate: Share | Interval | Row, name: str) -> tuple[Any, Any, Any]:
-    """Value, low and high of an estimate, which may come from JSON."""
-    part = estimate.get if isinstance(estimate, Mapping) else partial(getattr, estimate)
-    return part(name), part("low"), part("high")
+    return with_ends((value.value, value.low, value.high), shape, scale=scale, chance=chance)
 
 
 def p_value(chance: float) -> str:

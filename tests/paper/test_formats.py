@@ -106,8 +106,8 @@ def test_a_latex_table_takes_the_place_that_it_needs(columns, place, size):
 
 def test_a_maximum_has_no_interval_and_nothing_is_a_dash():
     column = PaperColumn(title="worst, %", sign=True)
-    assert column.told(3.04) == "+3.0"
-    assert column.told(float("nan")) == "-"
+    assert column.formatted(3.04) == "+3.0"
+    assert column.formatted(float("nan")) == "-"
     assert column.printed(PaperCell(paper=73.8).paper) == "+73.8"
     assert column.printed("< 0.1") == "< 0.1"
     assert column.printed(None) == ""

@@ -20,9 +20,9 @@ def require_viewer(path: Path | None) -> None:
     """Check that flights can be written to a file of this name, or shown if it is None.
 
     Raises:
-        ConfigError: The name has another suffix.
-        MavfiError: A package is not installed, or there is no display. Says what to do.
-        RecordError: There is no such folder.
+        ConfigError: the name has another suffix.
+        MavfiError: a package is not installed, or there is no display.
+        RecordError: the folder does not exist.
     """
     suffix = None if path is None else path.suffix.lower()
     if suffix not in _NEEDED:
@@ -43,9 +43,9 @@ def save(flights: Sequence[ViewedFlight], path: Path | None) -> None:
     None opens rerun's viewer, which stays open.
 
     Raises:
-        ConfigError: The name has another suffix.
-        RecordError: The file could not be written.
-        MavfiError: A package is not installed. Says how to install it.
+        ConfigError: the name has another suffix.
+        RecordError: the file cannot be written.
+        MavfiError: a package is not installed.
     """
     require_viewer(path)
     if path is not None and path.suffix.lower() == ".mcap":

@@ -87,7 +87,7 @@ def _write(
             writer.add_message(channels[topic], time_ns, _encoded(message), time_ns)
     for name, values in metadata.items():
         texts = {
-            key: each if isinstance(each, str) else _json(each) for key, each in values.items()
+            key: value if isinstance(value, str) else _json(value) for key, value in values.items()
         }
         writer.add_metadata(name, texts)
     writer.finish()
@@ -117,7 +117,7 @@ def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
     """
     names = [flight.name for flight in flights]
     topics = ["/world/obstacles", "/world/goal"]
-    topics += [f"/{name}/{each}" for name in names for each in _SHOWN]
+    topics += [f"/{name}/{topic}" for name in names for topic in _SHOWN]
     panels: dict[str, Any] = {
         "3D!world": {
             "followTf": _WORLD,
@@ -139,7 +139,7 @@ def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
             "xAxisVal": "timestamp",
             "isSynced": True,
             "paths": [
-                {"value": each, "enabled": True, "timestampMethod": "receiveTime"} for each in paths
+                {"value": path, "enabled": True, "timestampMethod": "receiveTime"} for path in paths
             ],
         }
     places = [*panels]

@@ -54,7 +54,9 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
     for flight in flights:
         body = rr.Boxes3D(half_sizes=[_BODY_M], colors=[to_rgb(flight.colour)], fill_mode="solid")
         recording.log(f"{flight.name}/vehicle", body, static=True)
-    _log_entries(recording, entries_of(flights), {f"{each.name}/states": each for each in flights})
+    _log_entries(
+        recording, entries_of(flights), {f"{flight.name}/states": flight for flight in flights}
+    )
 
 
 def _log_entries(
@@ -75,8 +77,8 @@ def _log_entries(
             recording.log(path, archetype)
     for path, ticks in numbers.items():
         for name in ticks[0].data:
-            told = [(tick.stamp_s, tick.data[name]) for tick in ticks]
-            known = [(stamp_s, float(value)) for stamp_s, value in told if value is not None]
+            cells = [(tick.stamp_s, tick.data[name]) for tick in ticks]
+            known = [(stamp_s, float(value)) for stamp_s, value in cells if value is not None]
             if known:
                 stamps, values = zip(*known, strict=True)
                 flight = drawn[path]
@@ -92,28 +94,28 @@ def _log_entries(
 def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
     """What rerun logs of an entry, with the path of each part."""
     data, colours = entry.data, [to_rgb(entry.colour)] if entry.colour else None
-    shown: Any
+    archetype: Any
     match entry.kind:
         case "boxes":
-            shown = rr.Boxes3D(
+            archetype = rr.Boxes3D(
                 centers=data, half_sizes=entry.size_m / 2.0, colors=colours, fill_mode="solid"
             )
         case "marks":
-            shown = rr.Points3D(data, radii=[entry.size_m], colors=colours)
+            archetype = rr.Points3D(data, radii=[entry.size_m], colors=colours)
         case "points":
-            shown = rr.Points3D(data, radii=[0.03], colors=colours)
+            archetype = rr.Points3D(data, radii=[0.03], colors=colours)
         case "line":
-            shown = rr.LineStrips3D([data], radii=[entry.size_m / 2.0], colors=colours)
+            archetype = rr.LineStrips3D([data], radii=[entry.size_m / 2.0], colors=colours)
         case "pose":
             turn = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=data[1])
-            shown = rr.Transform3D(translation=data[0], rotation=turn)
+            archetype = rr.Transform3D(translation=data[0], rotation=turn)
         case "note":
             level = "WARN" if entry.urgent else "INFO"
-            shown = rr.TextLog(f"{data['kind']}: {data['text']}", level=level)
+            archetype = rr.TextLog(f"{data['kind']}: {data['text']}", level=level)
         case "depth":
             yield from _camera(entry)
             return
-    yield entry.path, shown
+    yield entry.path, archetype
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
