@@ -173,6 +173,20 @@ class Document:
         """The stack whose verdicts are shown first."""
         return self.stacks[0]
 
+    @property
+    def advice(self) -> str:
+        """What a designer should do: a sentence for each kind of fault that did harm."""
+        sentences = []
+        for kind in self.protections[0].against if self.protections else ():
+            effects = {each.name: cell.effect for each in self.protections
+                       if (cell := each.against[kind])}  # fmt: skip
+            helping = [name for name, effect in effects.items() if effect == "helps"]
+            if helping:
+                sentences.append(f"Against {kind}, this helps: {' and '.join(helping)}.")
+            elif {*effects.values()} - {"nothing to undo"}:
+                sentences.append(f"Against {kind}, nothing flown here is proven to help.")
+        return " ".join(sentences)
+
     def reason(self, judged: JudgedClaim) -> str:
         """Why a claim is contradicted; empty if it is not, or that is not known."""
         return reason_of(judged, self.stack)

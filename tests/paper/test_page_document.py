@@ -164,6 +164,19 @@ def test_another_stack_is_compared_in_the_same_scenes():
     assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10, not 10 of 10")
 
 
+@pytest.mark.parametrize(
+    ("lost", "advice"),
+    [(8, "Against a wrong value in a state, this helps: Gaussian detector."),
+     (2, "Against a wrong value in a state, nothing flown here is proven to help."), (0, "")],
+)  # fmt: skip
+def test_the_advice_names_what_helps(lost, advice):
+    rows = [row(seed=seed) for seed in range(1, 11)]
+    for seed in range(1, 11):
+        rows.append(row("planning", seed=seed, **(LOST if seed <= lost else {})))
+        rows.append(row("planning", seed=seed, detector="gad"))
+    assert document(evidence(rows)).advice == advice
+
+
 def test_nothing_judged_is_said():
     found = document(evidence([row(config={"world": "nowhere"})]))
     assert found.answer == "Nothing here decides a claim of the paper."
