@@ -150,6 +150,7 @@ class Document:
     forest: Picture | None
     disagreements: Sequence[Disagreement]
     protections: Sequence[Safeguard]
+    advice: str
     balances: Sequence[DetectorBalance]
     delays: Picture | None
     delay_sentence: str
@@ -172,20 +173,6 @@ class Document:
     def stack(self) -> str:
         """The stack whose verdicts are shown first."""
         return self.stacks[0]
-
-    @property
-    def advice(self) -> str:
-        """What a designer should do: a sentence for each kind of fault that did harm."""
-        sentences = []
-        for kind in self.protections[0].against if self.protections else ():
-            effects = {each.name: cell.effect for each in self.protections
-                       if (cell := each.against[kind])}  # fmt: skip
-            helping = [name for name, effect in effects.items() if effect == "helps"]
-            if helping:
-                sentences.append(f"Against {kind}, this helps: {' and '.join(helping)}.")
-            elif {*effects.values()} - {"nothing to undo"}:
-                sentences.append(f"Against {kind}, nothing flown here is proven to help.")
-        return " ".join(sentences)
 
     def reason(self, judged: JudgedClaim) -> str:
         """Why a claim is contradicted; empty if it is not, or that is not known."""
@@ -226,6 +213,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         if (found := arms(source.flights.comparable))
     }
     added = [*Delays.of(stacks[0], flights[stacks[0]])]
+    guards = protections(flights)
     step("drawing the figures")
     return Document(
         version=__version__,
@@ -238,7 +226,8 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         families=Family.of(claims),
         forest=_forest(claims, stacks),
         disagreements=disagreements(claims, stacks[0]),
-        protections=protections(flights),
+        protections=guards,
+        advice=_advice(guards),
         balances=[row for stack in stacks for row in DetectorBalance.of(stack, flights[stack])],
         delays=_delay_picture(added),
         delay_sentence=delay_sentence(added),
@@ -257,6 +246,19 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         kernel_sources=evidence.kernels,
         missions=[*_missions(evidence.campaigns)],
     )
+
+
+def _advice(guards: Sequence[Safeguard]) -> str:
+    """What a designer should do: a sentence for each kind of fault that did harm."""
+    sentences = []
+    for kind in guards[0].against if guards else ():
+        effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
+        helping = [name for name, effect in effects.items() if effect == "helps"]
+        if helping:
+            sentences.append(f"Against {kind}, this helps: {' and '.join(helping)}.")
+        elif {*effects.values()} - {"nothing to undo"}:
+            sentences.append(f"Against {kind}, nothing flown here is proven to help.")
+    return " ".join(sentences)
 
 
 def _extent(
