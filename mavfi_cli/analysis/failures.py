@@ -6,14 +6,13 @@ Every injected fault counts if the golden flight of its mission succeeds, even i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, KernelSummary
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical
@@ -62,8 +61,8 @@ def setting_failures(
         RecordError: the folder does not exist or cannot be read.
         ConfigError: the kernels were attacked with other faults, or the rate is negative.
     """
-    alone = None if kernels is None else kernel_summary(kernels / KERNELS)
-    silent = {part["kernel"]: part["outcomes"]["sdc"] for part in alone["kernels"]} if alone else {}
+    alone = None if kernels is None else KernelSummary.read(kernels / KERNELS)
+    silent = {own.name: own.outcomes["sdc"] for own in alone.kernels} if alone else {}
     succeeds = [group.codes("pair")[group.counted & group.succeeded]
                 for group in groups if group.golden and not group.watched]  # fmt: skip
     golden = np.concatenate([np.zeros(0, dtype=np.int64), *succeeds])
@@ -78,10 +77,10 @@ def setting_failures(
         numbers = group.codes("number")[places].tolist()
         configs = list(ledger.configs(numbers)) if alone else []
         kernel, layers = _kernel(configs), None
-        if kernels is not None and alone is not None and kernel in silent:
-            _require_same_faults(configs[0], alone["plan"], kernels / KERNELS)
+        if alone is not None and kernel in silent:
+            _require_same_faults(configs[0], alone)
             sdc = silent[kernel]
-            layers = cross_layer(sdc["count"], sdc["of"], failed, struck, confidence)
+            layers = cross_layer(sdc.count, sdc.total, failed, struck, confidence)
         rows.append(
             SettingFailures(
                 labels=group.labels,
@@ -108,17 +107,16 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
     return nodes.pop() if len(nodes) == 1 else None
 
 
-def _require_same_faults(config: MissionConfig, plan: Mapping[str, Any], path: Path) -> None:
+def _require_same_faults(config: MissionConfig, alone: KernelSummary) -> None:
     from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
 
     fault = config.instruction
     assert fault is not None
     drawn = mission_strategy(fault)
     ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
-    theirs = {name: plan[name] for name in ours}
-    if ours != theirs:
+    if ours != alone.faults:
         raise ConfigError(
             f"faults must be drawn as in the campaign, by {canonical(ours)}, "
-            f"got {canonical(theirs)}",
-            path=path,
+            f"got {canonical(alone.faults)}",
+            path=alone.path,
         )

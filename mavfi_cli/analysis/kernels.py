@@ -5,36 +5,83 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from mavfi_cli.core.errors import RecordError, lack_of
 from mavfi_cli.stats.shares import Share
 
 KERNELS = "kernels.json"
+OUTCOMES = ("benign", "sdc", "crash", "hang")
 
 
-def kernel_summary(path: Path) -> Mapping[str, Any]:
-    """Read a summary of `mavfi kernels`; RecordError if the file is missing or is no summary."""
-    try:
-        summary: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        summary["plan"]["rule"], summary["plan"]["compat"], summary["plan"]["model"]
-        for kernel in summary["kernels"]:
-            sdc = kernel["outcomes"]["sdc"]
-            kernel["kernel"], sdc["count"], sdc["of"]
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack_of(error)})") from None
-    return summary
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IsolatedKernel:
+    """The runs of an isolated kernel, with one fault each.
 
-
-def outcome_share(kernel: Mapping[str, Any], outcome: str) -> Share:
-    """The share of an outcome in a kernel of a summary, with the interval of the summary.
-
-    It is wider than that of independent runs, because runs on one input are correlated.
+    Attributes:
+        name, title: the kernel's name, and its name in tables.
+        outcomes: the share of each of OUTCOMES. Its interval is wider than that of independent
+            runs, because runs on one input are correlated.
     """
-    entry = kernel["outcomes"][outcome]
+
+    name: str
+    title: str
+    runs: int
+    outcomes: Mapping[str, Share]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelSummary:
+    """A summary of attacked kernels.
+
+    Attributes:
+        faults: how they were drawn: `rule`, `compat` and `model`.
+        seed: of the faults.
+        flight: the flight whose inputs the kernels had.
+    """
+
+    path: Path
+    kernels: tuple[IsolatedKernel, ...]
+    faults: Mapping[str, object]
+    seed: int
+    flight: str
+
+    @property
+    def runs(self) -> int:
+        """Runs of all kernels."""
+        return sum(kernel.runs for kernel in self.kernels)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a summary; RecordError if the file is missing or is no summary."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            plan = data["plan"]
+            return cls(
+                path=path,
+                faults={name: plan[name] for name in ("rule", "compat", "model")},
+                kernels=tuple(
+                    IsolatedKernel(
+                        name=str(part["kernel"]),
+                        title=str(part["title"]),
+                        runs=int(part["runs"]),
+                        outcomes={name: _share(part["outcomes"][name]) for name in OUTCOMES},
+                    )
+                    for part in data["kernels"]
+                ),
+                seed=int(plan["seed"]),
+                flight=str(plan["flight"]),
+            )
+        except OSError as error:
+            raise RecordError(f"{path}: {error.strerror or error}") from None
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            lack = lack_of(error)
+            raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack})") from None
+
+
+def _share(entry: Any) -> Share:
     low, high = entry["wilson95"]
-    share = math.nan if entry["share"] is None else entry["share"]
+    share = math.nan if entry["share"] is None else float(entry["share"])
     return Share(count=entry["count"], total=entry["of"], share=share, low=low, high=high)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavfi_cli.analysis.kernels import IsolatedKernel, KernelSummary
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.core.installed import __version__
 from mavfi_cli.mission.run_folder import RunFolder
@@ -51,7 +52,7 @@ from mavfi_cli.paper.items import (
     printed_name,
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
-from mavfi_cli.paper.sources import CampaignSource, Evidence, KernelSource
+from mavfi_cli.paper.sources import CampaignSource, Evidence
 from mavfi_cli.paper.status import of_kernels, of_model
 from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Verdict
 from mavfi_cli.report.charts import (
@@ -166,7 +167,7 @@ class Document:
     arms: Mapping[str, Sequence[Arm]]
     arm_pictures: Mapping[str, Picture]
     sources: Sequence[CampaignSource]
-    kernel_sources: Sequence[KernelSource]
+    kernel_sources: Sequence[KernelSummary]
     missions: Sequence[_CampaignMissions]
 
     @property
@@ -200,8 +201,8 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
     as_paper = {stack: flown[stack].chosen(as_paper=True) for stack in stacks}
     flights = {stack: those.chosen(at=(None, "random")) for stack, those in as_paper.items()}
     kernels = evidence.isolated
-    sdc = {name: part["outcomes"]["sdc"] for name, part in kernels.items()}
-    silent = {name: (share["count"], share["of"]) for name, share in sdc.items()}
+    sdc = {name: kernel.outcomes["sdc"] for name, kernel in kernels.items()}
+    silent = {name: (share.count, share.total) for name, share in sdc.items()}
     step("judging the claims")
     claims = judged(flights, kernels)
     step("counting what protects")
@@ -262,11 +263,13 @@ def _advice(guards: Sequence[Safeguard]) -> str:
 
 
 def _extent(
-    flights: Mapping[str, Flights], kernels: Mapping[str, Any], claims: Sequence[JudgedClaim]
+    flights: Mapping[str, Flights],
+    kernels: Mapping[str, IsolatedKernel],
+    claims: Sequence[JudgedClaim],
 ) -> str:
     """How many claims are judged, and by what."""
     missions = sum(map(len, flights.values()))
-    runs = sum(part["runs"] for part in kernels.values())
+    runs = sum(kernel.runs for kernel in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
     places = (*flights, ISOLATED)
     count = sum(
@@ -470,8 +473,8 @@ def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator
         elif item.source is Source.MODEL:
             parts = {"performance model": _drawn(item, "performance model", of_model())}
         else:
-            kernels = [*evidence.isolated.values()]
-            table = of_kernels({"kernels": kernels}) if kernels else None
+            kernels = evidence.isolated.values()
+            table = of_kernels(kernels) if kernels else None
             parts = {ISOLATED: None if table is None else _drawn(item, ISOLATED, table)}
         yield _ShownItem(
             item=item,

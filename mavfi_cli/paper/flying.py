@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
-from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, KernelSummary
 from mavfi_cli.attack.campaign import Plan, run_campaign
 from mavfi_cli.attack.kernels.catalogue import select
 from mavfi_cli.attack.kernels.target import KernelTarget
@@ -297,7 +297,7 @@ class _KernelRuns:
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
-        done = {part["kernel"]: part["runs"] for part in kernel_summary(path)["kernels"]}
+        done = {kernel.name: kernel.runs for kernel in KernelSummary.read(path).kernels}
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     def forecast_s(self) -> float:

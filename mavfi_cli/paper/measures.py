@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.analysis.flights import COSTS, known, numbers
-from mavfi_cli.analysis.kernels import outcome_share
+from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import EVERY_STAGE, LONGER, Flights
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.types import FloatArray
@@ -26,7 +26,7 @@ from mavfi_cli.stats.paired import net_share, paired_difference
 from mavfi_cli.stats.shares import Interval, Share
 
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
-Kernels = Mapping[str, Mapping[str, Any]]  # kernel -> its part of kernels.json
+Kernels = Mapping[str, IsolatedKernel]  # by name
 NOT_FLOWN = Finding(why="not flown")
 _DRAWS = 20_000  # of a rank correlation
 _FEWEST = 5  # kernels of a rank correlation, and hits of a share of hits
@@ -330,27 +330,27 @@ def _outcome_beside(
     if kernel not in kernels or not there:
         return NOT_FLOWN
     choose = max if extreme == "most" else min
-    other = choose(there, key=lambda each: outcome_share(kernels[each], outcome).share)
-    shares = {each: outcome_share(kernels[each], outcome) for each in (kernel, other)}
-    counts = (f"{kernels[each]['title']} {100 * x.share:.1f} %" for each, x in shares.items())
+    other = choose(there, key=lambda each: kernels[each].outcomes[outcome].share)
+    shares = {each: kernels[each].outcomes[outcome] for each in (kernel, other)}
+    counts = (f"{kernels[each].title} {100 * x.share:.1f} %" for each, x in shares.items())
     effect = shares[kernel].minus(shares[other])
     return Finding(effect=effect, counts=", ".join(counts))
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
     """The least share of benign runs of all kernels but one."""
-    shares = {each: outcome_share(kernels[each], "benign") for each in kernels if each != but}
+    shares = {each: kernels[each].outcomes["benign"] for each in kernels if each != but}
     if not shares:
         return NOT_FLOWN
     least = min(shares, key=lambda each: shares[each].share)
-    return _of_share(shares[least], f"benign in {kernels[least]['title']}, the least")
+    return _of_share(shares[least], f"benign in {kernels[least].title}, the least")
 
 
 def _benign(kernels: Kernels, kernel: str) -> Finding:
     """The share of benign runs of a kernel."""
     if kernel not in kernels:
         return NOT_FLOWN
-    return _of_share(outcome_share(kernels[kernel], "benign"), "benign")
+    return _of_share(kernels[kernel].outcomes["benign"], "benign")
 
 
 def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
@@ -369,7 +369,7 @@ def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
     if len({each.share for each in flown.values()}) == 1:
         return Finding(why="in flight all kernels do the same harm")
     rng = np.random.default_rng(1)
-    silent = {name: outcome_share(kernels[name], "sdc") for name in flown}
+    silent = {name: kernels[name].outcomes["sdc"] for name in flown}
     drawn = [
         np.stack([_posterior(each, rng) for each in those])
         for those in (silent.values(), flown.values())

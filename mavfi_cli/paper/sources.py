@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 
 from mavfi_cli.analysis.flights import flights, provenance, read_export
-from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, IsolatedKernel, KernelSummary
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.begin import stored_spec
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
@@ -22,7 +22,6 @@ from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.items import FlightsPlan
-from mavfi_cli.paper.status import of_kernels
 
 _EXPORT, _SPEC = ".parquet", ".toml"
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
@@ -68,28 +67,6 @@ class CampaignSource:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelSource:
-    """Attacked kernels.
-
-    Attributes:
-        path: of the summary that `mavfi kernels --out` writes.
-        kernels: a part of the summary for each kernel.
-        seed: of the faults.
-        flight: the flight whose inputs the kernels had.
-    """
-
-    path: Path
-    kernels: Sequence[Mapping[str, Any]]
-    seed: int
-    flight: str
-
-    @property
-    def runs(self) -> int:
-        """Runs of all kernels."""
-        return sum(part["runs"] for part in self.kernels)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """The campaigns and the summaries of kernels that were read.
 
@@ -98,7 +75,7 @@ class Evidence:
     """
 
     campaigns: Sequence[CampaignSource]
-    kernels: Sequence[KernelSource]
+    kernels: Sequence[KernelSummary]
     problems: Sequence[str]
 
     @classmethod
@@ -112,7 +89,7 @@ class Evidence:
             RecordError: a place does not exist, or nothing in them can be read.
         """
         campaigns: list[CampaignSource] = []
-        kernels: list[KernelSource] = []
+        kernels: list[KernelSummary] = []
         problems: list[str] = []
         for place in places:
             before = len(campaigns) + len(kernels) + len(problems)
@@ -139,9 +116,9 @@ class Evidence:
         return cls(campaigns=campaigns, kernels=kernels, problems=problems)
 
     @property
-    def isolated(self) -> Mapping[str, Mapping[str, Any]]:
+    def isolated(self) -> Mapping[str, IsolatedKernel]:
         """The summary of each attacked kernel; of several, that of the last source."""
-        return {part["kernel"]: part for source in self.kernels for part in source.kernels}
+        return {kernel.name: kernel for source in self.kernels for kernel in source.kernels}
 
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
@@ -170,12 +147,12 @@ def _inside_campaign(path: Path, place: Path) -> bool:
     return any((each / LEDGER).is_file() for each in above)
 
 
-def _read(path: Path) -> CampaignSource | KernelSource:
+def _read(path: Path) -> CampaignSource | KernelSummary:
     if path.name == LEDGER:
         return _from_ledger(path.parent)
     if path.suffix == _EXPORT:
         return _from_export(path)
-    return _from_summary(path)
+    return KernelSummary.read(path)
 
 
 def _from_ledger(folder: Path) -> CampaignSource:
@@ -185,17 +162,6 @@ def _from_ledger(folder: Path) -> CampaignSource:
     again = "" if spec is None else shlex.join(["mavfi", "campaign", "run", str(folder)])
     again = again if plan is None else plan.command
     return _campaign(folder, spec, table, origin, name=origin["name"] or folder.name, again=again)
-
-
-def _from_summary(path: Path) -> KernelSource:
-    summary = kernel_summary(path)
-    of_kernels(summary)  # needs all that the page shows of it
-    plan = summary["plan"]
-    source = KernelSource(
-        path=path, kernels=summary["kernels"], seed=plan["seed"], flight=plan["flight"]
-    )
-    source.runs + 0
-    return source
 
 
 def _from_export(path: Path) -> CampaignSource:
@@ -261,11 +227,10 @@ def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
             )
 
 
-def _repeated(kernels: Sequence[KernelSource]) -> Iterator[str]:
+def _repeated(kernels: Sequence[KernelSummary]) -> Iterator[str]:
     first: dict[str, Path] = {}
     for source in kernels:
-        for part in source.kernels:
-            name = part["kernel"]
+        for name in (kernel.name for kernel in source.kernels):
             if name in first:
                 yield f"{first[name]} and {source.path} both have {name}; the latter counts."
             first[name] = source.path

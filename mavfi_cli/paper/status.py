@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mavfi_cli.analysis.flights import flights
-from mavfi_cli.analysis.kernels import KERNELS, kernel_summary, outcome_share
+from mavfi_cli.analysis.kernels import KERNELS, OUTCOMES, IsolatedKernel, KernelSummary
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import groups
 from mavfi_cli.campaigns.ledger import Ledger
@@ -114,7 +113,6 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
 
 # Items that are not flown: Figs. 6 and 15 --------------------------------------------------------
 
-_OUTCOMES = ("benign", "sdc", "crash", "hang")
 _PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
 
 
@@ -124,22 +122,17 @@ def _unflown(item: Item, out: Path) -> PaperTable:
     path = out / KERNELS_FOLDER / KERNELS
     if not path.is_file():
         raise RecordError(f"{path.parent}: no runs of kernels (mavfi reproduce fig6)")
-    return of_kernels(kernel_summary(path))
+    return of_kernels(KernelSummary.read(path).kernels)
 
 
-def of_kernels(summary: Mapping[str, Any]) -> PaperTable:
-    """The table of Fig. 6.
-
-    Args:
-        summary: `kernels.json` of `mavfi kernels`.
-    """
+def of_kernels(kernels: Iterable[IsolatedKernel]) -> PaperTable:
+    """The table of Fig. 6."""
     rows = []
-    for kernel in summary["kernels"]:
-        name = kernel["kernel"]
-        paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(name, name))
-        shares = [outcome_share(kernel, outcome) for outcome in _OUTCOMES]
+    for kernel in kernels:
+        paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(kernel.name, kernel.name))
+        shares = [kernel.outcomes[outcome] for outcome in OUTCOMES]
         cells = (PaperCell.of_share(shares[0], paper), *map(PaperCell.of_share, shares[1:]))
-        rows.append(PaperRow(labels=(kernel["title"],), cells=cells))
+        rows.append(PaperRow(labels=(kernel.title,), cells=cells))
     table = BY_NAME["fig6"].table(rows)
     most = table.ranked(1)
     told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""

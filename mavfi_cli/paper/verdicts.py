@@ -11,8 +11,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
 
+from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.stats.paired import holm
 from mavfi_cli.stats.shares import Interval, wilson, z_of
@@ -87,7 +87,7 @@ class Claim:
     item: str
     words: str
     effect: str
-    find: Callable[[Flights, Mapping[str, Mapping[str, Any]]], Finding]
+    find: Callable[[Flights, Mapping[str, IsolatedKernel]], Finding]
     low: float
     high: float
     rule: str

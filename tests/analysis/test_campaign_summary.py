@@ -7,6 +7,7 @@ import re
 import pytest
 
 from mavfi_cli.analysis.failures import setting_failures
+from mavfi_cli.analysis.kernels import OUTCOMES
 from mavfi_cli.analysis.summary import METRICS, groups, qualities
 from mavfi_cli.campaigns.begin import stopped
 from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
@@ -301,7 +302,10 @@ def kernels_folder(tmp_path, **changes):
     plan = {
         "rule": "instruction-uniform", "compat": None, "model": FaultModel().to_json(), **changes
     }  # fmt: skip
-    kernels = [{"kernel": "octomap", "outcomes": {"sdc": {"count": 80, "of": 100}}}]
+    plan |= {"seed": 1, "flight": "golden"}
+    shares = {name: {"count": 0, "of": 100, "share": 0.0, "wilson95": [0, 1]} for name in OUTCOMES}
+    shares["sdc"] |= {"count": 80, "share": 0.8}
+    kernels = [{"kernel": "octomap", "title": "OctoMap", "runs": 100, "outcomes": shares}]
     text = json.dumps({"plan": plan, "kernels": kernels})
     (tmp_path / "kernels.json").write_text(text)
     return tmp_path

@@ -3,6 +3,7 @@
 import math
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from made_flights import flights, row
 
 from mavfi_cli.analysis.flights import COSTS
+from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import WORLDS, Fate, Flights
 from mavfi_cli.paper import claims, items
 from mavfi_cli.paper.claims import CLAIMS, ISOLATED, judged
@@ -206,15 +208,15 @@ def test_silent_faults_and_dead_nodes_are_judged_apart():
     assert dead.why == "none of the faults ends a node"
 
 
-def outcome(count):
-    found = wilson(count, 5000)
-    return {"count": count, "of": 5000, "share": found.share, "wilson95": [found.low, found.high]}
-
-
 def kernels(**shares):
     """Outcomes of 5,000 runs of each kernel: silent, benign."""
     return {
-        name: {"title": name, "outcomes": {"sdc": outcome(silent), "benign": outcome(benign)}}
+        name: IsolatedKernel(
+            name=name,
+            title=name,
+            runs=5000,
+            outcomes={"sdc": wilson(silent, 5000), "benign": wilson(benign, 5000)},
+        )
         for name, (silent, benign) in shares.items()
     }
 
@@ -229,7 +231,8 @@ def test_isolated_kernels():
     assert found["fig6-pid"] is Verdict.REPRODUCED
     assert found["fig6-rrtconnect"] is Verdict.NOT_DECIDABLE  # not run
     assert found["table4-dense"] is None
-    told["octomap"]["outcomes"]["sdc"]["wilson95"] = [0.1, 0.7]  # few inputs tell less
+    octomap = told["octomap"].outcomes
+    octomap["sdc"] = replace(octomap["sdc"], low=0.1, high=0.7)  # few inputs tell less
     assert verdict("fig6-octomap", NOTHING, told) is Verdict.UNDECIDED
 
 

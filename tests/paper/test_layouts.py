@@ -1,12 +1,12 @@
 """Layouts on hand-made tables whose answers are known."""
 
-import json
 import math
 from pathlib import Path
 
 import pytest
 from made_flights import flight, struck, table
 
+from mavfi_cli.analysis.kernels import KernelSummary
 from mavfi_cli.paper.items import ITEMS, Source, printed
 from mavfi_cli.paper.layouts import OF_FLIGHTS, of_flights
 from mavfi_cli.paper.status import of_kernels, of_model
@@ -185,7 +185,7 @@ def test_a_layout_takes_a_table_without_flights(name):
 
 
 def test_fig_6_reads_the_runs_of_kernels():
-    found = of_kernels(json.loads(KERNELS.read_text()))
+    found = of_kernels(KernelSummary.read(KERNELS).kernels)
     benign = cell(found, "OctoMap", "benign, %")
     assert (benign.count, benign.paper) == (5000, "< 25")
     assert benign.low < benign.value < benign.high

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mavfi_cli.analysis.kernels import KERNELS, kernel_summary
+from mavfi_cli.analysis.kernels import KERNELS, KernelSummary
 from mavfi_cli.attack.campaign import run_campaign
 from mavfi_cli.attack.kernels import catalogue
 from mavfi_cli.campaigns.progress import Spectator, duration
@@ -62,7 +62,7 @@ def test_runs_are_made_once_and_become_the_table(tmp_path):
     assert forecast.disk_bytes > 0
     assert texts[0].startswith(f"kernel 1 of 1, control: 0/{RUNS} runs, ")
     assert texts[-1] == f"kernel 1 of 1, control: {RUNS}/{RUNS} runs, 0:00 min to go"
-    (row,) = of_kernels(kernel_summary(tmp_path / "kernels" / KERNELS)).rows
+    (row,) = of_kernels(KernelSummary.read(tmp_path / "kernels" / KERNELS).kernels).rows
     assert row.cells[0].count <= RUNS
     assert (tmp_path / "kernels" / "kernels.svg").is_file()
     again, texts = made(plan(tmp_path))

@@ -157,7 +157,7 @@ def test_a_part_of_a_summary_of_kernels_is_told(tmp_path, campaign, lacks):
     found = Evidence.gather([tmp_path])
     assert len(found.campaigns) == 1
     (problem,) = found.problems
-    assert "kernels.json: damaged (" in problem
+    assert "kernels.json: not a summary of `mavfi kernels` (" in problem
 
 
 @pytest.mark.parametrize("value", [3, [1, 2], {"plan": 1}, None])
@@ -198,9 +198,9 @@ def test_a_kernel_in_two_places_counts_once(tmp_path):
         told["kernels"][0]["runs"] = 7
     found = Evidence.gather([tmp_path])
     (first, *_) = found.isolated.values()
-    assert first["runs"] == 7
+    assert first.runs == 7
     assert len(found.problems) == 2
-    assert found.problems[0].endswith(f"both have {first['kernel']}; the latter counts.")
+    assert found.problems[0].endswith(f"both have {first.name}; the latter counts.")
     fig6 = next(each for each in document(found).items if each.item.name == "fig6")
     assert [len(part.table.rows) for part in fig6.parts] == [2]
 
