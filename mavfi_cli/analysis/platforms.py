@@ -111,6 +111,12 @@ class ComparedPlan:
     stack: str
     settings: tuple[str, ...]
 
+    @property
+    def flip(self) -> str:
+        """What is flipped in each faulty flight; empty if no fault is flown."""
+        bits = "one bit" if self.field is None else f"one bit of the {self.field}"
+        return f"{bits} in {', '.join(self.inject)}" if self.inject else ""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredQuantity:

@@ -24,6 +24,7 @@ from mavfi_cli.report.drawing import (
     new_figure,
     note_at,
     open_frame,
+    scattered,
     whisker,
 )
 
@@ -41,7 +42,6 @@ _RATIOS = (
     ("energy_regression_j", "energy\n(regression)"),
     ("energy_propeller_j", "energy\n(propellers)"),
 )
-_TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 
 
 def _draw_comparison(comparison: PlatformComparison) -> Figure:
@@ -70,10 +70,7 @@ def _draw_comparison(comparison: PlatformComparison) -> Figure:
 
 def _caption(comparison: PlatformComparison) -> str:
     plan, share = comparison.plan, 100 * comparison.confidence
-    struck = "no faults"
-    if plan.inject:
-        bits = "one bit" if plan.field is None else f"one bit of the {plan.field}"
-        struck = f"{bits} in {', '.join(plan.inject)}"
+    struck = plan.flip or "no faults"
     return (
         f"{plan.missions} {'mission' if plan.missions == 1 else 'missions'} in "
         f"{plan.world} from seed {plan.first_seed} on, the "
@@ -121,7 +118,7 @@ def _times(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str
         _foot(axes, x, row, len(times), colour)
         if not times:
             continue
-        spread = [x + 0.62 * width * ((0.5 + n * _TURN) % 1.0 - 0.5) for n in range(len(times))]
+        spread = x + 0.62 * width * scattered(len(times))
         axes.plot(spread, times, "o", color=colour, markersize=4.2, alpha=0.45, markeredgewidth=0.0)
         middle = row.quantities["flight_time_s"].median
         axes.hlines(middle.value, x - 0.38 * width, x + 0.38 * width, color=INK, linewidth=1.8)

@@ -8,8 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mavfi_cli.core.files import require_output, write_atomically
 from mavfi_cli.core.terminal import cleaned
+from mavfi_cli.core.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,6 +25,7 @@ _STAMPS: dict[str, dict[str, str | None]] = {  # metadata that is the same at an
     "png": {"Software": "mavfi"},
 }
 _DPI = 300
+_TURN = 0.6180339887498949  # golden ratio
 
 INK = "#1d232b"
 NOTE = "#5b6573"
@@ -80,6 +84,11 @@ def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
     """Draw the legend above a figure, by default for all its labels."""
     shape = {"loc": "outside upper center", "ncols": 4, "frameon": False, "fontsize": 8}
     figure.legend(*what, **{**shape, **look})
+
+
+def scattered(count: int) -> FloatArray:
+    """Return offsets from -0.5 to 0.5 that spread dots evenly, the same at any time, (count,)."""
+    return (0.5 + np.arange(count, dtype=np.float64) * _TURN) % 1.0 - 0.5
 
 
 def whisker(axes: Axes, x: float, value: float, ends: tuple[float, float], **look: Any) -> None:

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.core.types import FloatArray
-from mavfi_cli.report.drawing import GRID, INK, NOTE, legend_above, new_figure, open_frame
+from mavfi_cli.report.drawing import (
+    GRID,
+    INK,
+    NOTE,
+    legend_above,
+    new_figure,
+    open_frame,
+    scattered,
+)
 from mavfi_cli.report.table import FORMATS, Table, number, with_ends
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.shares import Share
@@ -194,7 +202,6 @@ _PAPER: dict[str, Any] = {
     "marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
     "markeredgewidth": 0.9, "linestyle": "none",
 }  # fmt: skip
-_TURN = 0.6180339887498949  # golden ratio; spreads dots evenly and deterministically
 _OUTLIER, _LINEAR = 200.0, 20.0  # %; beyond the first the axis is logarithmic from the second on
 _LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
 _NAME = 36  # characters in a line of a row's name
@@ -347,7 +354,7 @@ def _strip(axes: Axes, y: int, strip: Strip) -> None:
     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
     axes.hlines(y, low, high, color=INK, linewidth=1.0)
     axes.vlines(middle, y - 0.3, y + 0.3, color=INK, linewidth=1.0)
-    heights = y + 0.56 * ((0.5 + np.arange(len(values)) * _TURN) % 1.0 - 0.5)
+    heights = y + 0.56 * scattered(len(values))
     axes.plot(
         values, heights, MARKERS[strip.style], color=colour, markersize=2.6, alpha=0.7,
         markeredgewidth=0.0,

@@ -83,11 +83,7 @@ def _few(settings: Sequence[SettingFlights]) -> list[str]:
 
 def _head(plan: ComparedPlan) -> list[str]:
     last = plan.first_seed + plan.missions - 1
-    faults = "none"
-    if plan.inject:
-        bits = "one bit" if plan.field is None else f"one bit of the {plan.field}"
-        struck = ", ".join(plan.inject)
-        faults = f"{bits} in {struck}: one a flight; fault seed {plan.seed}"
+    faults = f"{plan.flip}: one a flight; fault seed {plan.seed}" if plan.flip else "none"
     lines = [
         f"Missions    {plan.missions} in {plan.world}, seeds {plan.first_seed} to {last}, "
         "the same on each platform",

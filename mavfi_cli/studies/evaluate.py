@@ -45,9 +45,8 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies import fly
 
-SCHEMA = (
-    2  # of evaluation.json; version 1 counted harm from 5 % on, and where the golden flight fails
-)
+# Of evaluation.json; version 1 counted harm from 5 % on, and where the golden flight fails.
+SCHEMA = 2
 BARE, PROTECTED = "bare", "protected"
 WORLDS = ("sparse", "dense", "factory", "farm")
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
