@@ -220,6 +220,15 @@ def test_a_command_can_be_pasted_whatever_the_name_of_the_folder():
     assert mine.lost[0].command == "mavfi replay 'my flights.parquet' --mission 0"
 
 
+@pytest.mark.parametrize(
+    ("name", "place"), [("results/own", "results/own.parquet"), ("/results/own", "own.parquet")]
+)
+def test_a_command_names_the_relative_path_of_an_export(name, place):
+    """A published page does not show an absolute path of the machine that wrote it."""
+    (mine,) = document(evidence([row(outcome="crash")], name=name)).missions
+    assert mine.lost[0].command == f"mavfi replay {place} --mission 0"
+
+
 def test_a_kept_run_is_replayed_from_its_folder_as_long_as_it_is_there(tmp_path):
     rows = [row(), row("planning", outcome="crash", path=str(tmp_path))]
     rows.append(row("control", outcome="crash", path=str(tmp_path / "removed")))
