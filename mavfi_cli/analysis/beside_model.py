@@ -112,7 +112,7 @@ class FlownNumbers:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlownRatios:
+class _FlownRatios:
     """Geometric means over the missions in which both schemes succeeded."""
 
     pairs: int
@@ -137,8 +137,8 @@ class FlownScheme:
     mass_kg: float
     problem: str | None = None
     flown: FlownNumbers | None = None
-    over_none: FlownRatios | None = None
-    over_aad: FlownRatios | None = None
+    over_none: _FlownRatios | None = None
+    over_aad: _FlownRatios | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,7 +256,7 @@ class _Arm:
             alarms=_mean(numbers(won, "alarm_count")).value,
         )
 
-    def over(self, base: _Arm) -> FlownRatios:
+    def over(self, base: _Arm) -> _FlownRatios:
         """Ratios to another scheme on the same missions."""
         own, other = paired(flown(self.flights), flown(base.flights), PLACE)
         both = flags(own, "succeeded") & flags(other, "succeeded")
@@ -274,7 +274,7 @@ class _Arm:
             mine.velocity_mps / theirs.velocity_mps,
             *(numbers(table, "mean_speed_mps") for table in (other, own)),
         )
-        return FlownRatios(
+        return _FlownRatios(
             pairs=velocity.flights.count,
             velocity_ratio=velocity,
             flight_time_ratio=ratio(

@@ -18,7 +18,7 @@ _KEPT = "`mavfi campaign run --keep all` into another folder keeps them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnFlight:
+class _DrawnFlight:
     """One flight of a picture.
 
     Attributes:
@@ -36,7 +36,7 @@ class DrawnFlight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Panel:
+class _Panel:
     """The flights of one fault.
 
     Attributes:
@@ -45,7 +45,7 @@ class Panel:
     """
 
     title: str
-    flights: Sequence[DrawnFlight]
+    flights: Sequence[_DrawnFlight]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,7 @@ class MissionPicture:
         absent: one line per mission that is not in the picture, with the reason.
     """
 
-    panels: Sequence[Panel]
+    panels: Sequence[_Panel]
     absent: Sequence[str]
 
 
@@ -185,7 +185,7 @@ def _most_prolonged(ledger: Ledger, among: Collection[int]) -> int:
     return first[max(complete, key=lambda name: (increase.get(name, 0.0), -first[name]))]
 
 
-def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[Panel]:
+def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[_Panel]:
     golden = [flight for flight in flown if flight.golden]
     struck: dict[str, list[_Flown]] = {}
     for flight in flown:
@@ -199,15 +199,15 @@ def _panels(ledger: Ledger, flown: Sequence[_Flown]) -> list[Panel]:
     return panels or [_panel("", golden)]
 
 
-def _panel(title: str, flown: Sequence[_Flown]) -> Panel:
+def _panel(title: str, flown: Sequence[_Flown]) -> _Panel:
     ordered = sorted(
         flown, key=lambda flight: (flight.detector is not None, not flight.golden, flight.number)
     )
     often = Counter(flight.setting for flight in ordered)
-    return Panel(
+    return _Panel(
         title=title,
         flights=[
-            DrawnFlight(
+            _DrawnFlight(
                 number=flight.number,
                 name=", ".join(
                     [flight.setting, *(flight.treatment if often[flight.setting] > 1 else [])]
