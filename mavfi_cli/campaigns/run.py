@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 import time
-from collections import Counter, deque
+from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,11 +30,13 @@ from mavfi_cli.campaigns.missions import (
     ResultState,
     canonical,
     changes_of,
+    shared_flight,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.workers import (
     TASK,
+    Attempt,
     AttemptEnd,
     AttemptResult,
     CampaignStopped,
@@ -57,6 +59,8 @@ Row = tuple[str | None, str | None]  # outcome, what happened to the fault
 WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission that something outside ends
 LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
+SHARING = 16  # most missions that share a flight
+_AHEAD = 5000  # missions of the list that are searched for others of a flight
 _GIVE_UP = 5  # a campaign ends after this many missions that cannot begin, if none could
 _LOOK_S = 0.5
 
@@ -69,6 +73,7 @@ class Options:
         jobs: missions at the same time.
         limit_s: limit of a mission's wall time, s; longer missions are recorded as `hang`.
         task: module that flies a mission.
+        whole: fly every mission alone from its start, which gives the same records.
         errors: retry missions that could not begin.
         cluster: address of a dask.distributed scheduler; None for workers on this machine.
         cluster_key: folder of its keys (`cluster_keys.make_keys`) for a tls:// address.
@@ -85,6 +90,7 @@ class Options:
     keep: Keep = Keep.FAILURES
     limit_s: float = LIMIT_S
     task: str = TASK
+    whole: bool = False
     errors: bool = False
     cluster: str | None = None
     cluster_key: Path | None = None
@@ -235,6 +241,7 @@ class MissionQueue:
         stop: the stopping rule; None admits all missions.
         cells: setting of every mission, in the order of the list.
         over: number, outcome and fault's fate of every finished mission.
+        shares: whether missions may share a flight.
 
     Attributes:
         stopped: settings that the rule has ended.
@@ -246,9 +253,13 @@ class MissionQueue:
         stop: Stop | None,
         cells: Sequence[int] = (),
         over: Iterable[tuple[int, Row]] = (),
+        *,
+        shares: bool = False,
     ) -> None:
+        self._shares = shares
         self._missing, self._stop, self._cells = missing, stop, cells
-        self._held: dict[int, deque[MissingMission]] = {}  # by setting, in the order of the list
+        self._read: dict[int, OrderedDict[int, MissingMission]] = {}  # by setting
+        self._sharing: dict[MissionConfig, dict[int, int]] = {}  # number -> setting, by flight
         self._members: dict[int, list[int]] = {}
         self._place: list[int] = []
         for number, cell in enumerate(cells):
@@ -264,22 +275,49 @@ class MissionQueue:
 
     def next(self) -> MissingMission | None:
         """Return the next mission that may begin; None if there is none now."""
-        if self._stop is None:
-            return next(self._missing, None)
-        self._held = {
-            cell: held for cell, held in self._held.items() if held and cell not in self.stopped
-        }
-        ready = [held for held in self._held.values() if self._passes(held[0].number)]
-        if ready:
-            return min(ready, key=lambda held: held[0].number).popleft()
-        for mission in self._missing:
-            if self._passes(mission.number):
-                return mission
-            if mission.cell not in self.stopped:
-                self._held.setdefault(mission.cell, deque()).append(mission)
-        return None
+        while True:
+            heads = {next(iter(read)): cell for cell, read in self._read.items() if read}
+            ready = [number for number in heads if self._passes(number)]
+            if ready:
+                first = min(ready)
+                return self._take(first, heads[first])
+            if not self._read_one():
+                return None
+
+    def mates(self, mission: MissingMission, most: int) -> list[MissingMission]:
+        """Take further missions that may begin now and share a mission's flight."""
+        if not self._shares:
+            return []
+        while sum(map(len, self._read.values())) < _AHEAD and self._read_one():
+            pass
+        flight = shared_flight(mission.config)
+        waiting = {} if flight is None else self._sharing.get(flight, {})
+        ready = [number for number in sorted(waiting) if self._passes(number)]
+        return [self._take(number, waiting[number]) for number in ready[:most]]
+
+    def _read_one(self) -> bool:
+        """Read one mission of the list; return False at its end."""
+        mission = next(self._missing, None)
+        if mission is None:
+            return False
+        cell = mission.cell if self._stop else 0
+        if cell not in self.stopped:
+            self._read.setdefault(cell, OrderedDict())[mission.number] = mission
+            if self._shares and (flight := shared_flight(mission.config)) is not None:
+                self._sharing.setdefault(flight, {})[mission.number] = cell
+        return True
+
+    def _take(self, number: int, cell: int) -> MissingMission:
+        mission = self._read[cell].pop(number)
+        if self._shares and (flight := shared_flight(mission.config)) is not None:
+            del self._sharing[flight][number]
+            if not self._sharing[flight]:
+                del self._sharing[flight]
+        return mission
 
     def _passes(self, number: int) -> bool:
+        if self._stop is None:
+            return True
         cell = self._cells[number]
         return cell not in self.stopped and self._place[number] < self._open[cell]
 
@@ -295,6 +333,8 @@ class MissionQueue:
         while self._finished[cell] == self._open[cell] < len(self._members[cell]):
             if cell in self.stopped or self._narrow(cell, self._stop):
                 self.stopped.add(cell)
+                for number in list(self._read.get(cell, ())):
+                    self._take(number, cell)
                 return
             first = self._open[cell]
             self._open[cell] += self._stop.batch
@@ -321,7 +361,9 @@ class _Run:
         only = options.only
         missing = ledger.missing(errors=options.errors)
         wanted = (m for m in missing if only is None or m.number in only)
-        self._queue = MissionQueue(wanted, stop, ledger.cell_of_each() if stop else (), over())
+        cells = ledger.cell_of_each() if stop else ()
+        shares = options.task == TASK and not options.whole
+        self._queue = MissionQueue(wanted, stop, cells, over(), shares=shares)
         self._again: list[MissingMission] = []
         self._flying: dict[int, MissingMission] = {}
         self._attempts: Counter[int] = Counter()
@@ -364,6 +406,7 @@ class _Run:
                 self._spectator.on_progress(self._progress())
                 if interrupts and self._flying and not announced:
                     announced = True
+                    workers.halt()
                     self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
         if self._options.profiles is None and not self._sharing:
             shutil.rmtree(self.profiles, ignore_errors=True)  # an interruption may have left some
@@ -379,14 +422,25 @@ class _Run:
 
     def _fill(self, workers: LocalWorkers | Cluster, interrupts: Sequence[int]) -> None:
         while workers.free and not interrupts:
-            mission = self._again.pop() if self._again else self._queue.next()
-            if mission is None:
+            missions = self._next()
+            if not missions:
                 return
-            number, _, config = mission
-            config.require_firmware(*self._options.firmware)
-            self._attempts[number] += 1
-            self._flying[number] = mission
-            workers.start(number, changes_of(config), self._made(number), self._options.limit_s)
+            attempts = []
+            for mission in missions:
+                number, _, config = mission
+                config.require_firmware(*self._options.firmware)
+                self._attempts[number] += 1
+                self._flying[number] = mission
+                attempts.append(Attempt(number, changes_of(config), self._made(number)))
+            workers.start(attempts, self._options.limit_s)
+
+    def _next(self) -> list[MissingMission]:
+        """Return the missions of the next flight: one, or several that share it."""
+        if self._again:
+            return [self._again.pop()]
+        if (mission := self._queue.next()) is None:
+            return []
+        return [mission, *self._queue.mates(mission, SHARING - 1)]
 
     def _made(self, number: int) -> Path:
         out = self._out(number)
@@ -403,6 +457,11 @@ class _Run:
         mission = self._flying.pop(number)
         self._inside_s += ended.wall_s
         out = self._out(number)
+        if not ended.forked:
+            shutil.rmtree(out, ignore_errors=True)
+            self._attempts[number] -= 1
+            self._again.append(mission)
+            return
         verdict = ended.judge(out, mission.config, self._options.limit_s)
         last = self._attempts[number] >= ATTEMPTS
         if (verdict.state is None or verdict.doubtful) and not last:

@@ -1,10 +1,17 @@
-"""The work of a campaign's worker: fly one mission and write its run folder."""
+"""The work of a campaign's worker: fly a mission, or a flight from which several are forked."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from mavfi_cli.campaigns.missions import Changes
+from mavfi_cli.core.fork_server import Forks
+
+HALT = "halt"  # file in the folder of a shared flight, after which it forks no further mission
 
 
 def prepare() -> None:
@@ -34,3 +41,36 @@ def perform(changes: Changes, out: Path) -> Path:
 
     profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
     return fly_mission(structure(changes, MissionConfig), out, Watcher(), profiles=profiles).path
+
+
+def share(task: Mapping[str, Any], out: Path, forks: Forks) -> Path:
+    """Fly missions that share a flight; return the run folder of a fork in its own folder.
+
+    Args:
+        task: "limit_s", and "missions" as triples of number, `missions.changes_of` and folder.
+        out: folder of the shared flight, which keeps nothing.
+
+    Raises:
+        FlightShared: this process has flown the shared flight.
+        MavfiError: the missions could not begin, or a record could not be written.
+    """
+    from mavfi_cli.core.config import structure
+    from mavfi_cli.mission.progress import Watcher
+    from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.shared_flight import Branch, SharedFlight
+    from mavfi_cli.spec.mission import MissionConfig
+
+    branches = {
+        number: Branch(config=structure(changes, MissionConfig), out=Path(folder))
+        for number, changes, folder in task["missions"]
+    }
+
+    def fork(number: int) -> bool:
+        if (out / HALT).exists():
+            return False
+        with contextlib.suppress(OSError):  # no memory or process is left: it is flown alone
+            return forks.fork(number, branches[number].out, task["limit_s"])
+        return False
+
+    common = replace(next(iter(branches.values())).config, fault=None)
+    return fly_mission(common, out, Watcher(), shared=SharedFlight(branches, fork)).path

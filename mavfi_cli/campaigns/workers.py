@@ -17,15 +17,16 @@ import threading
 import time
 import uuid
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import Changes, ResultState
 from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.campaigns.task import HALT
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.files import ScratchFolder, inflate, own_folder, write_atomically
 from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
@@ -71,6 +72,7 @@ class AttemptEnd:
         timeout: true if the mission exceeded its wall time.
         report: the mission's last message: folder, or error and text, or traceback.
         lost: reason why its end is unknown.
+        forked: false if a shared flight ended before this mission was forked from it.
         wall_s: wall time of the whole attempt, the guard's work included, s.
     """
 
@@ -80,6 +82,7 @@ class AttemptEnd:
     timeout: bool = False
     report: Mapping[str, str] | None = None
     lost: str = "its guard was killed"
+    forked: bool = True
     wall_s: float = 0.0
 
     def judge(self, out: Path, config: MissionConfig, limit_s: float) -> AttemptResult:
@@ -120,52 +123,88 @@ TASK = "mavfi_cli.campaigns.task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 
+class Attempt(NamedTuple):
+    """An attempt at a mission: its number, what it changes, and the attempt's own folder."""
+
+    number: int
+    changes: Changes
+    out: Path
+
+
 class LocalWorkers:
-    """Keeps up to `jobs` missions flying."""
+    """Keeps up to `jobs` flights flying."""
 
     def __init__(self, jobs: int, module: str = TASK) -> None:
         self._jobs = jobs
         self._server = ForkServer(module)
         self._selector = selectors.DefaultSelector()
-        self._number: dict[socket.socket, int] = {}  # mission number by channel
+        self._flying: dict[socket.socket, list[int]] = {}  # missions without an end, by channel
+        self._shared: dict[socket.socket, Path] = {}  # folders of shared flights
 
     @property
     def free(self) -> int:
-        """Number of missions that can start now."""
-        return self._jobs - len(self._number)
+        """Number of flights that can start now."""
+        return self._jobs - len(self._flying)
 
-    def start(self, number: int, changes: Changes, out: Path, limit_s: float) -> None:
-        """Start a mission.
+    def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
+        """Start the flight of a mission, or of several that share it.
+
+        Args:
+            limit_s: limit of the wall time of each mission, s.
 
         Raises:
             MavfiError: the processes cannot be started.
         """
-        channel = self._server.start(changes, out, limit_s)
+        _, changes, out = attempts[0]
+        if len(attempts) == 1:
+            channel = self._server.start(changes, out, limit_s)
+        else:
+            folder = out.with_name(f"{out.name}-shared")
+            missions = [(number, changes, str(own)) for number, changes, own in attempts]
+            task = {"missions": missions, "limit_s": limit_s}
+            all_s = limit_s * (len(attempts) + 1)
+            channel = self._server.start(task, folder, all_s, forks=True)
+            self._shared[channel] = folder
         self._selector.register(channel, selectors.EVENT_READ)
-        self._number[channel] = number
+        self._flying[channel] = [attempt.number for attempt in attempts]
+
+    def halt(self) -> None:
+        """Let shared flights fork no further mission."""
+        for folder in self._shared.values():
+            with contextlib.suppress(OSError):
+                (folder / HALT).touch()
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """Wait for a guard's message or the time-out; return the ended missions."""
         ended = []
-        for key, _ in self._selector.select(timeout_s):
-            channel = key.fileobj
+        for selected, _ in self._selector.select(timeout_s):
+            channel = selected.fileobj
             assert isinstance(channel, socket.socket)
-            message = _next_message(channel) or {}
-            if "pid" not in message:  # not the begin of the worker
-                ended.append(AttemptEnd(number=self._number[channel], **message))
+            message = dict(_next_message(channel) or {})
+            flying = self._flying[channel]
+            if (number := message.pop("key", None)) is not None:
+                flying.remove(number)
+                ended.append(AttemptEnd(number=number, **message))
+            elif "pid" not in message:  # not the begin of the worker
+                if channel in self._shared:
+                    ended += [AttemptEnd(number=number, forked=False) for number in flying]
+                else:
+                    ended.append(AttemptEnd(number=flying[0], **message))
                 self._release(channel)
         return ended
 
     def _release(self, channel: socket.socket) -> None:
         self._selector.unregister(channel)
-        del self._number[channel]
+        del self._flying[channel]
+        if (folder := self._shared.pop(channel, None)) is not None:
+            shutil.rmtree(folder, ignore_errors=True)
         channel.close()
 
     def close(self) -> None:
         """Kill all running missions and wait until they have ended."""
-        for channel in self._number:
+        for channel in self._flying:
             channel.shutdown(socket.SHUT_WR)  # the guard ends its worker, and then itself
-        for channel in list(self._number):
+        for channel in list(self._flying):
             channel.settimeout(_STOP_S)
             while _next_message(channel) is not None:
                 pass
@@ -280,7 +319,7 @@ class Cluster:
         self._versions = installed_versions()
         self._token = uuid.uuid4().hex[:8]  # distinguishes this run's results from others
         self._submitted = 0
-        self._futures: dict[int, tuple[Future, Path]] = {}
+        self._futures: dict[int, tuple[Future, dict[int, Path]]] = {}  # by flight
         self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._threads, self._looked_s = 0, 0.0
         self._client = _connect(address, keys)
@@ -291,47 +330,47 @@ class Cluster:
 
     @property
     def free(self) -> int:
-        """Number of missions that can be sent now."""
+        """Number of flights that can be sent now."""
         if time.monotonic() - self._looked_s > _LOOK_S:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
 
-    def start(self, number: int, changes: Changes, out: Path, limit_s: float) -> None:
-        """Send a mission to the cluster."""
+    def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
+        """Send a flight to the cluster. The arguments are those of `LocalWorkers.start`."""
         self._submitted += 1
+        missions = [(attempt.number, attempt.changes) for attempt in attempts]
         future = self._client.submit(
-            _fly, number, changes, limit_s, self._keep.value, self._task, self._versions,
+            _fly, missions, limit_s, self._keep.value, self._task, self._versions,
             key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0,
         )  # fmt: skip
-        self._futures[number] = (future, out)
-        future.add_done_callback(lambda _future: self._done.put(number))
+        self._futures[self._submitted] = (
+            future,
+            {attempt.number: attempt.out for attempt in attempts},
+        )
+        future.add_done_callback(partial(_put, self._done, self._submitted))
+
+    def halt(self) -> None:
+        """Do nothing: flights on the cluster fly all their missions."""
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
         """Wait for a result or the time-out; return the ended missions."""
-        numbers = []
+        flights = []
         with contextlib.suppress(queue.Empty):
-            numbers.append(self._done.get(timeout=timeout_s))
+            flights.append(self._done.get(timeout=timeout_s))
             while True:
-                numbers.append(self._done.get_nowait())
-        return [self._taken(number) for number in numbers]
+                flights.append(self._done.get_nowait())
+        return [ended for flight in flights for ended in self._taken(flight)]
 
-    def _taken(self, number: int) -> AttemptEnd:
-        future, out = self._futures.pop(number)
+    def _taken(self, flight: int) -> list[AttemptEnd]:
+        future, outs = self._futures.pop(flight)
         if future.status != "finished":
-            return AttemptEnd(number=number, lost=f"lost by the cluster: {future.exception()}")
+            lost = f"lost by the cluster: {future.exception()}"
+            return [AttemptEnd(number=number, lost=lost) for number in outs]
         answer = future.result()
         if isinstance(answer, str):
             raise CampaignStopped(f"a worker has other versions: {answer}")
-        ended: AttemptEnd
-        ended, files = answer
-        for name, data in files.items():  # where the mission would have written them
-            path = out / name
-            if ".." in Path(name).parts or not path.is_relative_to(out):
-                return AttemptEnd(number=number, lost=f"a worker sent the file {name!r}")
-            write = partial(_write, inflate(data, _LARGEST_FILE))
-            write_atomically(own_folder(path.parent) / path.name, write)
-        return ended
+        return [_unpacked(ended, files, outs[ended.number]) for ended, files in answer]
 
     def close(self) -> None:
         """Cancel missions that have not begun; results of missions in flight are dropped."""
@@ -339,6 +378,21 @@ class Cluster:
             self._client.cancel([future for future, _ in self._futures.values()])
         self._futures.clear()
         self._client.close()
+
+
+def _put(done: queue.SimpleQueue[int], flight: int, _future: Future) -> None:
+    done.put(flight)
+
+
+def _unpacked(ended: AttemptEnd, files: Mapping[str, bytes], out: Path) -> AttemptEnd:
+    """Write a mission's files where the mission would have written them."""
+    for name, data in files.items():
+        path = out / name
+        if ".." in Path(name).parts or not path.is_relative_to(out):
+            return AttemptEnd(number=ended.number, lost=f"a worker sent the file {name!r}")
+        write = partial(_write, inflate(data, _LARGEST_FILE))
+        write_atomically(own_folder(path.parent) / path.name, write)
+    return ended
 
 
 def _write(data: bytes, file: BinaryIO) -> None:
@@ -385,36 +439,40 @@ def _worker_versions() -> dict[str, str]:
 
 
 def _fly(
-    number: int,
-    changes: Changes,
+    missions: Sequence[tuple[int, Changes]],
     limit_s: float,
     keep: str,
     task: str,
     versions: Mapping[str, str],
-) -> str | tuple[AttemptEnd, dict[str, bytes]]:
-    """Fly a mission; run folders that the campaign does not keep are sent without their traces.
+) -> str | list[tuple[AttemptEnd, dict[str, bytes]]]:
+    """Fly missions, which share a flight if they are several.
+
+    Run folders that the campaign does not keep are sent without their traces.
 
     Args:
         versions: the runner's versions.
 
     Returns:
-        Its end, and its compressed files by path in its folder; or, without flying, the differences
-        of this worker's versions from the runner's.
+        Their ends, with the compressed files of each by path in its folder; or, without flying, the
+        differences of this worker's versions from the runner's.
     """
     differing = version_differences(versions, _worker_versions())
     if differing:
         return "; ".join(differing)
-    place = _scratch().path / f"{number}-{threading.get_ident()}"
+    place = _scratch().path / str(threading.get_ident())
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
-    (place / ".profiles").symlink_to(_scratch().path / "profiles")
+    attempts = [Attempt(number, changes, place / str(number)) for number, changes in missions]
+    for attempt in attempts:
+        attempt.out.mkdir()
+        (attempt.out / ".profiles").symlink_to(_scratch().path / "profiles")
     try:
         workers = _workers(task)
-        workers.start(number, changes, place, limit_s)
+        workers.start(attempts, limit_s)
         ended: list[AttemptEnd] = []
-        while not ended:
-            ended = workers.wait(60.0)
-        return ended[0], _packed(place, number, Keep(keep))
+        while len(ended) < len(attempts):
+            ended += workers.wait(60.0)
+        return [(end, _packed(place / str(end.number), end.number, Keep(keep))) for end in ended]
     finally:
         shutil.rmtree(place, ignore_errors=True)
 

@@ -24,7 +24,7 @@ import functools
 import heapq
 import math
 import types
-from collections.abc import Callable, Coroutine, Generator, Sequence
+from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -212,6 +212,16 @@ class Executor:
         node.process = process or NodeProcess.fork(self.process_of(name))
         for mate in node.mates:
             mate.process = node.process
+
+    def isolate_late(self, name: str, fresh: Mapping[str, Callable[[Any, float], Any]]) -> None:
+        """Run a node that has already worked in a separate process, as `isolate`.
+
+        Args:
+            fresh: Kernels that have not worked, by node, from which the process is restarted.
+        """
+        self.isolate(name)
+        for node, kernel in fresh.items():
+            self.nodes[node].kernel = kernel
 
     # Turns
 

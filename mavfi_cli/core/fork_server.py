@@ -17,9 +17,11 @@ child that hangs outlives a killed client; every child imports the client's main
 nothing reaps the processes that a child leaves; and daemonic processes, such as dask's workers,
 may not use it.
 
-FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s"},
-with the descriptor of a channel. The guard sends {"pid"} on this channel at the start, and
-{"exit" | "signal" | "timeout", "report", "wall_s"} at the end.
+FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s",
+"forks"}, with the descriptor of a channel. The guard sends {"pid"} on this channel at the start,
+and {"exit" | "signal" | "timeout", "report", "wall_s"} at the end. A worker whose order has "forks"
+calls MODULE.share, which may fork the worker in the middle of its task (`Forks`). The worker waits
+for its fork as a guard does, and sends the same message with the fork's {"key"}.
 """
 
 from __future__ import annotations
@@ -76,6 +78,9 @@ class _Module(Protocol):
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
         """Do a task. Return the folder that it made in `folder`."""
 
+    def share(self, task: Mapping[str, Any], folder: Path, forks: Forks) -> Path:
+        """Do tasks that share a beginning. Return the folder that a fork made in its own."""
+
 
 # The client's side --------------------------------------------------------------------------------
 
@@ -88,16 +93,20 @@ class ForkServer:
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
 
-    def start(self, task: Mapping[str, Any], folder: Path, limit_s: float) -> socket.socket:
+    def start(
+        self, task: Mapping[str, Any], folder: Path, limit_s: float, *, forks: bool = False
+    ) -> socket.socket:
         """Start a worker for a task. Return the channel on which its guard reports.
 
         Args:
             folder: for the worker's results, its standard error and its temporary files.
+            forks: the worker may fork itself, and reports the ends of its forks too.
 
         Raises:
             MavfiError: the server cannot be started.
         """
-        order = json.dumps({"task": task, "folder": str(folder), "limit_s": limit_s}).encode()
+        parts = {"task": task, "folder": str(folder), "limit_s": limit_s, "forks": forks}
+        order = json.dumps(parts).encode()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, contextlib.ExitStack() as undo:
             undo.enter_context(ours)
@@ -186,28 +195,45 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
 
     def work() -> NoReturn:
         """Close the guard's ends of the channels and do the work."""
-        channel.close()
         os.close(reading)
-        _work(order, module, guard, writing)
+        forks = None
+        if order["forks"]:
+            forks = Forks(channel, writing)
+        else:
+            channel.close()
+        _work(order, module, guard, writing, forks)
 
     worker = fork(work)
     os.close(writing)
     with contextlib.suppress(OSError):  # the client is gone, so the guard ends too
         channel.send(json.dumps({"pid": worker}).encode())
-        late = _await(worker, channel, begun_s + float(order["limit_s"]))
-        _, status = os.waitpid(worker, 0)
-        _end_children()
-        end: dict[str, Any] = {"report": _report_of_worker(reading)}
-        if late:
-            end["timeout"] = True
-        elif os.WIFSIGNALED(status):
-            end["signal"] = os.WTERMSIG(status)
-        else:
-            end["exit"] = os.WEXITSTATUS(status)
+        end = _end_of(worker, reading, channel, begun_s + float(order["limit_s"]))
         end["wall_s"] = round(time.monotonic() - begun_s, 6)
         channel.send(json.dumps(end).encode())
     _end_children()
     return 0
+
+
+def _end_of(worker: int, reading: int, channel: socket.socket, deadline_s: float) -> dict[str, Any]:
+    """Wait for the end of a worker and of its descendants. Return how it ended, and its report.
+
+    Args:
+        reading: end of the pipe from which its report is read.
+
+    Raises:
+        ConnectionError: the client closed the channel.
+    """
+    late = _await(worker, channel, deadline_s)
+    _, status = os.waitpid(worker, 0)
+    _end_children()
+    end: dict[str, Any] = {"report": _report_of_worker(reading)}
+    if late:
+        end["timeout"] = True
+    elif os.WIFSIGNALED(status):
+        end["signal"] = os.WTERMSIG(status)
+    else:
+        end["exit"] = os.WEXITSTATUS(status)
+    return end
 
 
 def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
@@ -221,16 +247,19 @@ def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
     poller.register(process, select.POLLIN)
     poller.register(channel, select.POLLIN)
     late = False
-    while True:
-        left_s = math.inf if late else max(0.0, deadline_s - time.monotonic())
-        ready = {descriptor for descriptor, _ in poller.poll(1e3 * min(left_s, _LONGEST_WAIT_S))}
-        if channel.fileno() in ready:  # a client sends nothing, so this is its end
-            raise ConnectionError("the client closed the channel")
-        if process in ready:
-            return late
-        if left_s <= 0.0:
-            late = True
-            os.kill(worker, signal.SIGKILL)
+    try:
+        while True:
+            left_s = math.inf if late else max(0.0, deadline_s - time.monotonic())
+            ready = {ended for ended, _ in poller.poll(1e3 * min(left_s, _LONGEST_WAIT_S))}
+            if channel.fileno() in ready:  # a client sends nothing, so this is its end
+                raise ConnectionError("the client closed the channel")
+            if process in ready:
+                return late
+            if left_s <= 0.0:
+                late = True
+                os.kill(worker, signal.SIGKILL)
+    finally:
+        os.close(process)
 
 
 def _report_of_worker(reading: int) -> Any:
@@ -246,18 +275,20 @@ def _report_of_worker(reading: int) -> Any:
 # The worker ---------------------------------------------------------------------------------------
 
 
-def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -> NoReturn:
-    """Run a worker in a process group of its own."""
+def _work(
+    order: Mapping[str, Any], module: _Module, guard: int, writing: int, forks: Forks | None
+) -> NoReturn:
+    """Run a worker, or the rest of the work of its fork."""
     code, report = 1, {}
     try:
         _call_this_process(WORKER)
-        os.setsid()
-        die_with(guard)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
         folder = Path(order["folder"])
-        _isolate_streams(folder)
-        report = {"folder": module.perform(order["task"], folder).name}
+        _begin(folder, guard)
+        task = order["task"]
+        made = module.share(task, folder, forks) if forks else module.perform(task, folder)
+        report = {"folder": made.name}
         code = 0
     except MavfiError as error:
         report = {"error": type(error).__name__, "text": str(error)}
@@ -267,6 +298,57 @@ def _work(order: Mapping[str, Any], module: _Module, guard: int, writing: int) -
         with contextlib.suppress(OSError):
             os.write(writing, json.dumps(report).encode())
         os._exit(code)
+
+
+class Forks:
+    """Lets a worker fork itself in the middle of its task, so that several tasks share a beginning.
+
+    The worker waits while its fork works: one process works at a time, and memory holds two.
+    """
+
+    def __init__(self, channel: socket.socket, report: int) -> None:
+        self._channel, self._report = channel, report
+        self._since_s = time.monotonic()
+
+    def fork(self, key: int, folder: Path, limit_s: float) -> bool:
+        """Fork the worker. Return True in the fork; in the worker, return False after its end.
+
+        The fork ends by returning from `share`.
+
+        Args:
+            key: names the fork in the message about its end, which has the wall time since the
+                previous fork.
+            folder: as for `ForkServer.start`.
+            limit_s: limit of the fork's wall time, s.
+
+        Raises:
+            OSError: there is no memory or no process left for a fork.
+        """
+        worker = os.getpid()
+        _request(_PR_SET_CHILD_SUBREAPER, 1)
+        deadline_s = time.monotonic() + limit_s
+        reading, writing = os.pipe()
+        child = os.fork()
+        if not child:
+            os.dup2(writing, self._report)
+            for descriptor in (reading, writing, self._channel.detach()):
+                os.close(descriptor)
+            _begin(folder, worker)
+            return True
+        os.close(writing)
+        end = _end_of(child, reading, self._channel, deadline_s)
+        now_s = time.monotonic()
+        end |= {"key": key, "wall_s": round(now_s - self._since_s, 6)}
+        self._since_s = now_s
+        self._channel.send(json.dumps(end).encode())
+        return False
+
+
+def _begin(folder: Path, parent: int) -> None:
+    """Make this process one that dies with its parent, in a process group of its own."""
+    os.setsid()
+    die_with(parent)
+    _isolate_streams(folder)
 
 
 def _isolate_streams(folder: Path) -> None:

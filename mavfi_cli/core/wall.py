@@ -6,9 +6,14 @@ from time import perf_counter
 
 
 class WallClock:
-    """Host seconds by name: the total and the newest measurement."""
+    """Host seconds by name: the total and the newest measurement.
+
+    Attributes:
+        skipped_s: time that counts as no measurement, because the whole flight waited.
+    """
 
     def __init__(self) -> None:
+        self.skipped_s = 0.0
         self.totals: dict[str, float] = {}
         self.newest: dict[str, float] = {}
 
@@ -31,7 +36,8 @@ class _Measurement:
         self._clock, self._name = clock, name
 
     def __enter__(self) -> None:
-        self._begun = perf_counter()
+        self._begun = perf_counter() - self._clock.skipped_s
 
     def __exit__(self, *_: object) -> None:
-        self._clock.add(self._name, perf_counter() - self._begun)
+        clock = self._clock
+        clock.add(self._name, perf_counter() - clock.skipped_s - self._begun)

@@ -388,8 +388,8 @@ class MemoryInjector(Injector):
         place = self._memory[self.array]
         before = place.flat[self.element].item()
         change = _change_of(self.array, self.element, before, self._kind, self._pattern)
-        place.flat[self.element] = change.after
         self._record(moment, moment.tick, [change])
+        place.flat[self.element] = change.after
 
 
 class Activation(Enum):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -68,6 +69,17 @@ class _TlogWriter:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise self._error(error) from None
+
+    def continue_in(self, path: Path) -> None:
+        """Continue in a copy of the file, in a fork of the process that opened it."""
+        try:
+            shutil.copyfile(self._path, path)
+            if self._descriptor is not None:
+                os.close(self._descriptor)
+                self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND)
+        except OSError as error:
+            raise self._error(error) from None
+        self._path = path
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
         """Record frames at a stamp. They reach the file within a second or 64 KiB."""
@@ -142,6 +154,10 @@ class RecordedLink:
         self._tlog.open(path)
         with contextlib.closing(self._tlog):
             yield
+
+    def continue_in(self, path: Path) -> None:
+        """Continue the tlog in a copy, in a fork of the process. Raises as `recording`."""
+        self._tlog.continue_in(path)
 
     @property
     def rivals(self) -> str:

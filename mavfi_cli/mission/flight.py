@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
+from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import Companion, CompanionParts
 from mavfi_cli.companion.protection import NoProtection, Protection
@@ -202,6 +203,22 @@ class Flight:
             recorder.briefing = briefing
             self.companion.executor.on_start = recorder.on_start
         return self.companion
+
+    def take(self, config: MissionConfig, tlog: Path) -> None:
+        """Go on as another mission in a fork of the process, with another fault and tlog."""
+        self._config = config
+        self.link.continue_in(tlog)
+
+    def isolate_late(self, name: str) -> Executor:
+        """Run a node that has already worked in its own process; it restarts with fresh state."""
+        assert self.companion is not None
+        assert self._briefing is not None
+        fresh = Companion(
+            self._config, self._parts, self._briefing, WallClock(), NoInjection(), NoProtection()
+        )
+        executor = self.companion.executor
+        executor.isolate_late(name, fresh.executor.process_of(name))
+        return executor
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
         """Return a lower bound of the flight time from the take-over to the goal, s."""

@@ -40,6 +40,7 @@ from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
+from mavfi_cli.mission.shared_flight import SharedFlight
 from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -56,6 +57,7 @@ def fly_mission(
     profiles: Path | None = None,
     for_debugger: Callable[[int], None] | None = None,
     launch: StartVehicle = Vehicle.start,
+    shared: SharedFlight | None = None,
 ) -> RunFolder:
     """Fly one mission from start to end and write its run folder.
 
@@ -68,8 +70,10 @@ def fly_mission(
         profiles: folder of the profiles of instruction-level faults; None for one in `out`.
         for_debugger: called once the node waits for a debugger at the injected instruction.
         launch: starts the simulated vehicle.
+        shared: missions to be forked from this flight, which writes no record itself.
 
     Raises:
+        FlightShared: this process has flown the shared flight.
         MavfiError: the mission could not begin (unknown name, blocked start, no autopilot, ...), or
             its record could not be written.
     """
@@ -77,7 +81,7 @@ def fly_mission(
     parts = CompanionParts.of(config)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
-    injection = _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
+    injection = shared or _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
     with (
         contextlib.closing(injection),
         interruptible() as interrupt,
@@ -88,8 +92,15 @@ def fly_mission(
         folder = RunFolder.new(out, config.world if config.link is None else "link", config.seed)
         flight.injection.begin(folder.fault)
         flight_begun_s = time.perf_counter()
+        forked: dict[str, Any] = {}
+        if shared is not None:
+            shared.flight = flight
         with flight.isolated_nodes():
             crash = _fly(flight, folder.tlog)
+            if shared is not None:
+                config, folder = shared.end()
+                flight_begun_s += flight.wall.skipped_s
+                forked["forked_s"] = shared.forked_s
         flight_wall_s = time.perf_counter() - flight_begun_s
         if vehicle is not None and (failure := vehicle.end()):
             flight.explain(str(failure))
@@ -98,6 +109,7 @@ def fly_mission(
             "started": started.isoformat(timespec="seconds"),
             "startup_s": round(flight_begun_s - begun_s, 3),
             "flight_wall_s": round(flight_wall_s, 3),
+            **forked,
             **_host(config, flight, truth),
         }
         _write(config, flight, companion, folder, host, truth, crash)
