@@ -397,7 +397,7 @@ class _Run:
         with contextlib.closing(fleet) as workers:
             while len(interrupts) < 2:
                 self._fill(workers, interrupts)
-                if not self._flying:
+                if not workers.busy:
                     break
                 over = workers.wait(_LOOK_S)
                 self._fill(workers, interrupts)  # at once: the ledger is written while they fly

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 
 from mavfi_cli.campaigns.missions import Changes
 from mavfi_cli.core.fork_server import Forks
-
-HALT = "halt"  # file in the folder of a shared flight, after which it forks no further mission
 
 
 def prepare() -> None:
@@ -66,11 +63,7 @@ def share(task: Mapping[str, Any], out: Path, forks: Forks) -> Path:
     }
 
     def fork(number: int) -> bool:
-        if (out / HALT).exists():
-            return False
-        with contextlib.suppress(OSError):  # no memory or process is left: it is flown alone
-            return forks.fork(number, branches[number].out, task["limit_s"])
-        return False
+        return forks.fork(number, branches[number].out, task["limit_s"])
 
     common = replace(next(iter(branches.values())).config, fault=None)
     return fly_mission(common, out, Watcher(), shared=SharedFlight(branches, fork)).path

@@ -26,10 +26,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import Changes, ResultState
 from mavfi_cli.campaigns.specification import Keep
-from mavfi_cli.campaigns.task import HALT
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
 from mavfi_cli.core.files import ScratchFolder, inflate, own_folder, write_atomically
-from mavfi_cli.core.fork_server import ERRORS, PACKET, SCRATCH, ForkServer
+from mavfi_cli.core.fork_server import ERRORS, HALT, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.mission.measures import Record, record_of
@@ -145,6 +144,11 @@ class LocalWorkers:
     def free(self) -> int:
         """Number of flights that can start now."""
         return self._jobs - len(self._flying)
+
+    @property
+    def busy(self) -> bool:
+        """True if a flight has not ended, even if all its missions have."""
+        return bool(self._flying)
 
     def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
         """Start the flight of a mission, or of several that share it.
@@ -335,6 +339,11 @@ class Cluster:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
         return _BACKLOG * self._threads - len(self._futures)
+
+    @property
+    def busy(self) -> bool:
+        """True if a flight has not ended."""
+        return bool(self._futures)
 
     def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
         """Send a flight to the cluster. The arguments are those of `LocalWorkers.start`."""

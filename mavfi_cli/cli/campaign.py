@@ -88,6 +88,9 @@ def campaign() -> None:
             show_default=True,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
                  "`hang`.")  # fmt: skip
+@_execution("--whole", is_flag=True,
+            help="Fly every mission from its start. By default missions that differ only in their "
+                 "fault are forked from one flight; their records are the same.")  # fmt: skip
 @_output("--out", type=OUT, help="Folder of the campaign  [campaigns/NAME].")
 @_output("--keep", type=click.Choice(_KEEP),
          help="Run folders to keep  [the campaign's choice].")  # fmt: skip
@@ -112,6 +115,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
         keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
         limit_s=options["limit_s"],
         errors=options["retry_errors"],
+        whole=options["whole"],
         cluster=cluster,
         cluster_key=keys,
         firmware=spec.firmware(),

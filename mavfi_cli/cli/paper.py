@@ -30,6 +30,8 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
 @_execution("--jobs", type=JOBS,
             help="Number of parallel missions  [one per core].")  # fmt: skip
+@_execution("--whole", is_flag=True,
+            help="Fly every mission from its start, as for `mavfi campaign run`.")  # fmt: skip
 @_output("--out", type=OUT, default=Path("reproduction"),
          show_default=True, help="Parent of one folder per stack.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the tables and their folder as JSON.")
@@ -56,7 +58,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     with missions_view(quiet=quiet) as view:
         run(
             plan,
-            Options(jobs=options["jobs"] or 0),
+            Options(jobs=options["jobs"] or 0, whole=options["whole"]),
             view,
             lambda forecast: view.on_note(forecast.summary),
         )

@@ -50,7 +50,7 @@ from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import open_own
-from mavfi_cli.core.processes import PYTHON, fork
+from mavfi_cli.core.processes import PYTHON, fork, fork_here
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # Process names in ps.
@@ -65,6 +65,7 @@ ONE_THREAD = {
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 PACKET = 1 << 17  # largest order or report, bytes
 ERRORS, SCRATCH = "stderr.txt", "tmp"
+HALT = "halt"  # file in a worker's folder, after which it does not fork itself again
 _READY = b"ready"
 _STOP_S = 10.0  # time to end after `close`, before it is killed
 _TRACEBACK = 8000  # trailing characters of a traceback that are reported
@@ -198,7 +199,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
         os.close(reading)
         forks = None
         if order["forks"]:
-            forks = Forks(channel, writing)
+            forks = Forks(Path(order["folder"]), channel, writing)
         else:
             channel.close()
         _work(order, module, guard, writing, forks)
@@ -306,29 +307,34 @@ class Forks:
     The worker waits while its fork works: one process works at a time, and memory holds two.
     """
 
-    def __init__(self, channel: socket.socket, report: int) -> None:
-        self._channel, self._report = channel, report
+    def __init__(self, folder: Path, channel: socket.socket, report: int) -> None:
+        self._halt, self._channel, self._report = folder / HALT, channel, report
         self._since_s = time.monotonic()
 
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
         """Fork the worker. Return True in the fork; in the worker, return False after its end.
 
-        The fork ends by returning from `share`.
+        The fork ends by returning from `share`. There is none after HALT, or if there is no memory
+        or no process left.
 
         Args:
             key: names the fork in the message about its end, which has the wall time since the
                 previous fork.
             folder: as for `ForkServer.start`.
             limit_s: limit of the fork's wall time, s.
-
-        Raises:
-            OSError: there is no memory or no process left for a fork.
         """
+        if self._halt.exists():
+            return False
         worker = os.getpid()
         _request(_PR_SET_CHILD_SUBREAPER, 1)
         deadline_s = time.monotonic() + limit_s
         reading, writing = os.pipe()
-        child = os.fork()
+        try:
+            child = fork_here()
+        except OSError:
+            for descriptor in (reading, writing):
+                os.close(descriptor)
+            return False
         if not child:
             os.dup2(writing, self._report)
             for descriptor in (reading, writing, self._channel.detach()):

@@ -44,6 +44,11 @@ def fork(work: Callable[[], int], *, exact: bool = False) -> int:
         os._exit(code)
 
 
+def fork_here() -> int:
+    """Fork this process in the middle of its work. Return 0 in the fork, else its process id."""
+    return os.fork()
+
+
 def send(connection: socket.socket, value: Any) -> None:
     """Send one value."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)

@@ -1,0 +1,168 @@
+"""Missions forked from a shared flight have the records of missions flown alone."""
+
+import json
+import os
+import signal
+from dataclasses import replace
+from functools import partial
+
+import pytest
+from killing import processes
+from live_processes import none_left
+
+from mavfi_cli.campaigns.missions import MissingMission, PlannedMission, shared_flight
+from mavfi_cli.campaigns.progress import Spectator
+from mavfi_cli.campaigns.run import MissionQueue, Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep, Stop
+from mavfi_cli.core.fork_server import WORKER
+from mavfi_cli.spec.detector import DetectorConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
+
+GAD = DetectorConfig(name="gad")
+FAULTS = (
+    FaultConfig(target="waypoint_position", at="time=1", together=True, field="exponent", seed=1),
+    FaultConfig(target="command_vx", at="tick=40", persistence="stuck-at", duration_s=1.0, seed=2),
+    FaultConfig(target="time_to_collision", at="invocation=3", bits=2, seed=3),
+    FaultConfig(target="process.octomap", at="time=1.5"),
+    FaultConfig(target="process.planner", at="tick=10"),
+    FaultConfig(target="process.control", seed=4),
+    FaultConfig(target="planning", at="time=200"),  # never due
+)
+MISSIONS = [
+    {},
+    *({"fault": fault} for fault in FAULTS),
+    {"detector": GAD},
+    {"detector": GAD, "fault": FAULTS[0]},
+    {"detector": GAD, "fault": FaultConfig(target="detector", at="tick=5", seed=5)},
+    {"node_restart_s": 0.1, "fault": FAULTS[3]},
+    {"fault": FAULTS[0]},  # twice
+]
+
+
+@pytest.fixture(autouse=True)
+def _fake_task_is_importable():
+    """These flights are real."""
+
+
+def files_of(folder):
+    """Every file of a run folder; of the result, all but the host section."""
+    result = json.loads((folder / "result.json").read_text())
+    host = result.pop("host")
+    others = {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {**others, "result.json": result}, host
+
+
+def rows_of(ledger):
+    return [
+        (row.number, row.outcome, row.injected, {**row.result, "host": None})
+        for row in ledger.results()
+    ]
+
+
+@pytest.fixture
+def missions(short_config):
+    return [PlannedMission(config=replace(short_config, **changes)) for changes in MISSIONS]
+
+
+@pytest.mark.slow
+def test_a_forked_mission_is_that_flown_alone(missions, tmp_path):
+    flown = {}
+    for whole in (False, True):
+        options = Options(jobs=2, keep=Keep.ALL, whole=whole)
+        with run_campaign(missions, tmp_path / str(whole), options) as ledger:
+            flown[whole] = list(ledger.results())
+    assert [row.number for row in flown[False]] == list(range(len(missions)))
+    forked = 0
+    for row, alone in zip(flown[False], flown[True], strict=True):
+        files, host = files_of(row.path)
+        assert files == files_of(alone.path)[0], row.number
+        assert row.injected is alone.injected
+        forked += "forked_s" in host
+    assert forked == len(missions) - 1  # all but the one with another restart time
+
+
+class _KillsWorker(Spectator):
+    struck = False
+
+    def __init__(self, mark):
+        self._mark = mark
+
+    def on_progress(self, progress):
+        workers = processes(self._mark).get(WORKER, ())
+        if not self.struck and len(workers) > 1 and progress.over:  # the flight and its fork
+            os.kill(min(workers), signal.SIGKILL)
+            self.struck = True
+
+
+@pytest.mark.slow
+def test_a_killed_shared_flight_costs_no_mission(missions, tmp_path, monkeypatch):
+    mark = str(tmp_path)
+    monkeypatch.setenv("MAVFI_TEST_CAMPAIGN", mark)
+    monkeypatch.setattr("mavfi_cli.campaigns.run._LOOK_S", 0.02)
+    killer = _KillsWorker(mark)
+    with run_campaign(missions[:8], tmp_path / "killed", Options(jobs=1), killer) as ledger:
+        rows = rows_of(ledger)
+    assert killer.struck
+    with run_campaign(missions[:8], tmp_path / "whole", Options(jobs=1, whole=True)) as ledger:
+        assert rows == rows_of(ledger)
+    none_left(partial(processes, mark))
+
+
+def test_missions_that_may_begin_now_share_a_flight():
+    golden = MissionConfig()
+    configs = [
+        golden,
+        replace(golden, fault=FAULTS[0]),
+        replace(golden, seed=9),
+        replace(golden, fault=FAULTS[1], detector=GAD),
+        replace(golden, fault=FAULTS[2]),
+        replace(golden, fault=FAULTS[3]),
+    ]
+    listed = [MissingMission(number, 0, config) for number, config in enumerate(configs)]
+    queue = MissionQueue(iter(listed), None, shares=True)
+    flights = []
+    while (first := queue.next()) is not None:
+        flights.append([mission.number for mission in (first, *queue.mates(first, 2))])
+    assert flights == [[0, 1, 4], [2], [3], [5]]
+
+
+def test_a_stop_rule_admits_the_missions_of_a_flight():
+    faulty = [replace(MissionConfig(), fault=replace(FAULTS[0], seed=n)) for n in range(30)]
+    listed = [MissingMission(number, 0, config) for number, config in enumerate(faulty)]
+    queue = MissionQueue(iter(listed), Stop(margin=0.1, batch=10), [0] * 30, shares=True)
+    first = queue.next()
+    assert [mission.number for mission in queue.mates(first, 15)] == list(range(1, 10))
+    assert queue.next() is None
+    for number in range(10):
+        queue.record(number, ("success" if number % 2 else "collision", "active"))
+    assert queue.next().number == 10
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"instruction": InstructionConfig(target="control")},
+        {"isolate": ("control",)},
+        {"realtime": True},
+        {"link": "udpin:127.0.0.1:14550", "goal": (9.0, 0.0, 5.0)},
+        {"platform": "no such platform"},
+    ],
+)
+def test_missions_that_other_processes_affect_are_flown_alone(changes):
+    assert shared_flight(replace(MissionConfig(), **changes)) is None
+
+
+def test_a_flight_that_ends_after_its_missions_ends_no_campaign(
+    short_config, tmp_path, monkeypatch
+):
+    """All missions of a flight have ended before its process has; others of the list follow."""
+    monkeypatch.setattr("mavfi_cli.campaigns.run.SHARING", 2)
+    golden, fault = short_config, FAULTS[0]
+    configs = [replace(golden, fault=replace(fault, seed=seed)) for seed in range(4)]
+    with run_campaign(
+        [PlannedMission(config=config) for config in (golden, *configs)],
+        tmp_path / "several",
+        Options(jobs=1, keep=Keep.NONE),
+    ) as ledger:
+        assert [row.number for row in ledger.results()] == [0, 1, 2, 3, 4]
