@@ -7,7 +7,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from operator import attrgetter
 from pathlib import Path
@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.mission.measures import FlightRecord, Record, record_of
-from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
-from mavfi_cli.spec.platform import load_platform
+from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
 Labels = Mapping[str, Label]  # of a setting, by name
@@ -61,29 +60,6 @@ def _pair_of(shared: tuple[Any, ...]) -> str:
     """The digest of the golden mission with these values of _SHARED."""
     golden = MissionConfig(**dict(zip(_SHARED, shared, strict=True)))
     return hashlib.sha256(canonical(changes_of(golden)).encode()).hexdigest()[:16]
-
-
-def shared_flight(config: MissionConfig) -> MissionConfig | None:
-    """Return the flight from which a mission can be forked: the mission without its fault.
-
-    It is None for a mission whose flight other processes or the wall clock affect.
-    """
-    alone = (
-        config.instruction is not None
-        or config.isolate
-        or config.realtime
-        or config.link is not None
-        or config.autopilot != OWN_AUTOPILOT
-        or _is_measured(config.platform)
-    )
-    return None if alone else replace(config, fault=None)
-
-
-@functools.lru_cache(maxsize=256)
-def _is_measured(platform: str) -> bool:
-    with contextlib.suppress(MavfiError):  # flown alone, the mission reports it
-        return load_platform(platform).measured_factor is not None
-    return True
 
 
 def canonical(value: Any) -> str:

@@ -30,7 +30,6 @@ from mavfi_cli.campaigns.missions import (
     ResultState,
     canonical,
     changes_of,
-    shared_flight,
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
@@ -290,7 +289,7 @@ class MissionQueue:
             return []
         while sum(map(len, self._read.values())) < _AHEAD and self._read_one():
             pass
-        flight = shared_flight(mission.config)
+        flight = mission.config.shared_flight
         waiting = {} if flight is None else self._sharing.get(flight, {})
         ready = [number for number in sorted(waiting) if self._passes(number)]
         return [self._take(number, waiting[number]) for number in ready[:most]]
@@ -303,13 +302,13 @@ class MissionQueue:
         cell = mission.cell if self._stop else 0
         if cell not in self.stopped:
             self._read.setdefault(cell, OrderedDict())[mission.number] = mission
-            if self._shares and (flight := shared_flight(mission.config)) is not None:
+            if self._shares and (flight := mission.config.shared_flight) is not None:
                 self._sharing.setdefault(flight, {})[mission.number] = cell
         return True
 
     def _take(self, number: int, cell: int) -> MissingMission:
         mission = self._read[cell].pop(number)
-        if self._shares and (flight := shared_flight(mission.config)) is not None:
+        if self._shares and (flight := mission.config.shared_flight) is not None:
             del self._sharing[flight][number]
             if not self._sharing[flight]:
                 del self._sharing[flight]
@@ -425,13 +424,13 @@ class _Run:
             missions = self._next()
             if not missions:
                 return
-            attempts = []
+            attempts: list[Attempt] = []
             for mission in missions:
                 number, _, config = mission
                 config.require_firmware(*self._options.firmware)
                 self._attempts[number] += 1
                 self._flying[number] = mission
-                attempts.append(Attempt(number, changes_of(config), self._made(number)))
+                attempts.append((number, changes_of(config), self._made(number)))
             workers.start(attempts, self._options.limit_s)
 
     def _next(self) -> list[MissingMission]:

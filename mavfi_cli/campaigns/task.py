@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.campaigns.missions import Changes
 from mavfi_cli.core.fork_server import Forks
 
 
@@ -24,46 +23,37 @@ def prepare() -> None:
     VehicleInProcess.warm_up()
 
 
-def perform(changes: Changes, out: Path) -> Path:
-    """Fly a mission, given its `missions.changes_of`; return its run folder in `out`.
+def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> Path:
+    """Fly a mission, or several that share a flight; return the run folder in its own folder.
+
+    Args:
+        task: a mission's `missions.changes_of`. With `forks`: "limit_s", and "missions" as triples
+            of number, changes and folder.
+        out: folder of the mission, or of the shared flight, which keeps nothing.
 
     Raises:
+        SystemExit: this process has flown the shared flight.
         MavfiError: the mission could not begin, or its record could not be written.
     """
     from mavfi_cli.core.config import structure
     from mavfi_cli.mission.instruction import CACHE
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.shared_flight import SharedFlight
     from mavfi_cli.spec.mission import MissionConfig
 
-    profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
-    return fly_mission(structure(changes, MissionConfig), out, Watcher(), profiles=profiles).path
-
-
-def share(task: Mapping[str, Any], out: Path, forks: Forks) -> Path:
-    """Fly missions that share a flight; return the run folder of a fork in its own folder.
-
-    Args:
-        task: "limit_s", and "missions" as triples of number, `missions.changes_of` and folder.
-        out: folder of the shared flight, which keeps nothing.
-
-    Raises:
-        FlightShared: this process has flown the shared flight.
-        MavfiError: the missions could not begin, or a record could not be written.
-    """
-    from mavfi_cli.core.config import structure
-    from mavfi_cli.mission.progress import Watcher
-    from mavfi_cli.mission.run import fly_mission
-    from mavfi_cli.mission.shared_flight import Branch, SharedFlight
-    from mavfi_cli.spec.mission import MissionConfig
-
+    if forks is None:
+        config = structure(task, MissionConfig)
+        profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
+        return fly_mission(config, out, Watcher(), profiles=profiles).path
     branches = {
-        number: Branch(config=structure(changes, MissionConfig), out=Path(folder))
+        number: (structure(changes, MissionConfig), Path(folder))
         for number, changes, folder in task["missions"]
     }
 
     def fork(number: int) -> bool:
-        return forks.fork(number, branches[number].out, task["limit_s"])
+        return forks.fork(number, branches[number][1], task["limit_s"])
 
-    common = replace(next(iter(branches.values())).config, fault=None)
-    return fly_mission(common, out, Watcher(), shared=SharedFlight(branches, fork)).path
+    first, _ = next(iter(branches.values()))
+    shared = SharedFlight(branches, fork)
+    return fly_mission(replace(first, fault=None), out, Watcher(), shared=shared).path

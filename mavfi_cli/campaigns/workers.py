@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import Changes, ResultState
@@ -122,12 +122,7 @@ TASK = "mavfi_cli.campaigns.task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 
-class Attempt(NamedTuple):
-    """An attempt at a mission: its number, what it changes, and the attempt's own folder."""
-
-    number: int
-    changes: Changes
-    out: Path
+Attempt = tuple[int, Changes, Path]  # number of a mission, what it changes, own folder
 
 
 class LocalWorkers:
@@ -170,7 +165,7 @@ class LocalWorkers:
             channel = self._server.start(task, folder, all_s, forks=True)
             self._shared[channel] = folder
         self._selector.register(channel, selectors.EVENT_READ)
-        self._flying[channel] = [attempt.number for attempt in attempts]
+        self._flying[channel] = [number for number, _, _ in attempts]
 
     def halt(self) -> None:
         """Let shared flights fork no further mission."""
@@ -348,15 +343,13 @@ class Cluster:
     def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
         """Send a flight to the cluster. The arguments are those of `LocalWorkers.start`."""
         self._submitted += 1
-        missions = [(attempt.number, attempt.changes) for attempt in attempts]
+        missions = [(number, changes) for number, changes, _ in attempts]
         future = self._client.submit(
             _fly, missions, limit_s, self._keep.value, self._task, self._versions,
             key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0,
         )  # fmt: skip
-        self._futures[self._submitted] = (
-            future,
-            {attempt.number: attempt.out for attempt in attempts},
-        )
+        outs = {number: out for number, _, out in attempts}
+        self._futures[self._submitted] = future, outs
         future.add_done_callback(partial(_put, self._done, self._submitted))
 
     def halt(self) -> None:
@@ -471,10 +464,10 @@ def _fly(
     place = _scratch().path / str(threading.get_ident())
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
-    attempts = [Attempt(number, changes, place / str(number)) for number, changes in missions]
-    for attempt in attempts:
-        attempt.out.mkdir()
-        (attempt.out / ".profiles").symlink_to(_scratch().path / "profiles")
+    attempts = [(number, changes, place / str(number)) for number, changes in missions]
+    for _, _, out in attempts:
+        out.mkdir()
+        (out / ".profiles").symlink_to(_scratch().path / "profiles")
     try:
         workers = _workers(task)
         workers.start(attempts, limit_s)

@@ -20,7 +20,7 @@ may not use it.
 FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s",
 "forks"}, with the descriptor of a channel. The guard sends {"pid"} on this channel at the start,
 and {"exit" | "signal" | "timeout", "report", "wall_s"} at the end. A worker whose order has "forks"
-calls MODULE.share, which may fork the worker in the middle of its task (`Forks`). The worker waits
+may fork itself in the middle of its task (`Forks`). The worker waits
 for its fork as a guard does, and sends the same message with the fork's {"key"}.
 """
 
@@ -50,7 +50,7 @@ from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.files import open_own
-from mavfi_cli.core.processes import PYTHON, fork, fork_here
+from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
 # Process names in ps.
@@ -77,10 +77,11 @@ class _Module(Protocol):
         """Load everything once, without starting a thread."""
 
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
-        """Do a task. Return the folder that it made in `folder`."""
+        """Do a task. Return the folder that it made in `folder`.
 
-    def share(self, task: Mapping[str, Any], folder: Path, forks: Forks) -> Path:
-        """Do tasks that share a beginning. Return the folder that a fork made in its own."""
+        It gets its `Forks` as `forks` if the order allows it to fork itself. A fork returns the
+        folder that it made in its own.
+        """
 
 
 # The client's side --------------------------------------------------------------------------------
@@ -288,8 +289,8 @@ def _work(
         folder = Path(order["folder"])
         _begin(folder, guard)
         task = order["task"]
-        made = module.share(task, folder, forks) if forks else module.perform(task, folder)
-        report = {"folder": made.name}
+        allowed = {"forks": forks} if forks else {}
+        report = {"folder": module.perform(task, folder, **allowed).name}
         code = 0
     except MavfiError as error:
         report = {"error": type(error).__name__, "text": str(error)}
@@ -314,8 +315,8 @@ class Forks:
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
         """Fork the worker. Return True in the fork; in the worker, return False after its end.
 
-        The fork ends by returning from `share`. There is none after HALT, or if there is no memory
-        or no process left.
+        The fork ends by returning from `perform`. There is none after HALT, or if the system has
+        no memory or no process left.
 
         Args:
             key: names the fork in the message about its end, which has the wall time since the
@@ -330,7 +331,7 @@ class Forks:
         deadline_s = time.monotonic() + limit_s
         reading, writing = os.pipe()
         try:
-            child = fork_here()
+            child = fork(None)
         except OSError:
             for descriptor in (reading, writing):
                 os.close(descriptor)

@@ -24,10 +24,11 @@ _LENGTH = 8
 _libc = ctypes.CDLL(None)
 
 
-def fork(work: Callable[[], int], *, exact: bool = False) -> int:
+def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
     """Do work in a fork of this process. It exits with the returned code, or 1 on an error.
 
     Args:
+        work: None lets the fork continue where this process is, with the result 0.
         exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
             memory. The process must have one thread.
 
@@ -35,18 +36,13 @@ def fork(work: Callable[[], int], *, exact: bool = False) -> int:
         Process id of the fork.
     """
     child = int(_libc.fork()) if exact else os.fork()
-    if child:
+    if child or work is None:
         return child
     code = 1
     try:
         code = work()
     finally:
         os._exit(code)
-
-
-def fork_here() -> int:
-    """Fork this process in the middle of its work. Return 0 in the fork, else its process id."""
-    return os.fork()
 
 
 def send(connection: socket.socket, value: Any) -> None:

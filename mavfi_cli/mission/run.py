@@ -73,7 +73,7 @@ def fly_mission(
         shared: missions to be forked from this flight, which writes no record itself.
 
     Raises:
-        FlightShared: this process has flown the shared flight.
+        SystemExit: this process has flown the shared flight.
         MavfiError: the mission could not begin (unknown name, blocked start, no autopilot, ...), or
             its record could not be written.
     """

@@ -13,16 +13,16 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
+from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.types import Trajectory
+from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.injector import Moment, NoInjector, Strike
-from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -30,20 +30,22 @@ from mavfi_cli.spec.mission import MissionConfig
 M = TypeVar("M")
 
 
-class FlightShared(Exception):
-    """Ends the shared flight, after all its missions have been forked, without a record."""
+class _Flight(Protocol):
+    """The parts of `flight.Flight` that are used here."""
+
+    wall: WallClock
+    stamp_s: float
+
+    def take(self, config: MissionConfig, tlog: Path) -> None: ...
+
+    def isolate_late(self, name: str) -> Executor: ...
 
 
 class _Struck(Exception):
     """Ends a strike in the shared flight, whose mission has been forked and has ended."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Branch:
-    """A mission of a shared flight, and the folder for its run folder."""
-
-    config: MissionConfig
-    out: Path
+Branch = tuple[MissionConfig, Path]  # a mission, and the folder for its run folder
 
 
 class SharedFlight(NoInjection):
@@ -56,12 +58,12 @@ class SharedFlight(NoInjection):
 
     Attributes:
         flight: the flight, which is set before its first message.
-        branch: the mission of this fork; None in the shared flight.
+        config: the mission of this fork; None in the shared flight.
         folder: the fork's run folder.
         forked_s: stamp at which it was forked, s.
     """
 
-    flight: Flight
+    flight: _Flight
     folder: RunFolder
 
     def __init__(self, branches: Mapping[int, Branch], fork: Callable[[int], bool]) -> None:
@@ -69,19 +71,19 @@ class SharedFlight(NoInjection):
         self._fork = fork
         self._injections = {
             number: NoInjection()
-            if branch.config.fault is None
-            else _ForkedInjection(branch.config.fault, self, number)
-            for number, branch in branches.items()
+            if config.fault is None
+            else _ForkedInjection(config.fault, self, number)
+            for number, (config, _) in branches.items()
         }
         self._branches = branches
-        self.branch: Branch | None = None
+        self.config: MissionConfig | None = None
         self.forked_s = 0.0
         self.injector = _Injectors(self._injections)
 
     @property
     def _own(self) -> NoInjection | None:
         """The injection of this fork's mission."""
-        return None if self.branch is None else next(iter(self._injections.values()))
+        return None if self.config is None else next(iter(self._injections.values()))
 
     @property
     def in_queue(self) -> bool:  # type: ignore[override]
@@ -107,29 +109,29 @@ class SharedFlight(NoInjection):
 
     def depart(self, number: int) -> bool:
         """Fork the flight for a mission. Return True in the fork."""
-        branch, begun_s = self._branches[number], time.perf_counter()
+        (config, out), begun_s = self._branches[number], time.perf_counter()
         injection = self._injections.pop(number)
         if not self._fork(number):
             self.flight.wall.skipped_s += time.perf_counter() - begun_s
             return False
         self._injections.clear()
         self._injections[number] = injection
-        self.branch, self.forked_s = branch, round(self.flight.stamp_s, 3)
-        self.folder = RunFolder.new(branch.out, branch.config.world, branch.config.seed)
+        self.config, self.forked_s = config, round(self.flight.stamp_s, 3)
+        self.folder = RunFolder.new(out, config.world, config.seed)
         injection.begin(self.folder.fault)
-        self.flight.take(branch.config, self.folder.tlog)
+        self.flight.take(config, self.folder.tlog)
         return True
 
     def end(self) -> tuple[MissionConfig, RunFolder]:
         """Fork the missions that are left. Return the mission and the run folder of this fork.
 
         Raises:
-            FlightShared: this is the shared flight, which has no mission of its own.
+            SystemExit: this is the shared flight, which has no mission of its own.
         """
-        if self.branch is None and not any(map(self.depart, list(self._injections))):
-            raise FlightShared
-        assert self.branch is not None
-        return self.branch.config, self.folder
+        if self.config is None and not any(map(self.depart, list(self._injections))):
+            raise SystemExit
+        assert self.config is not None
+        return self.config, self.folder
 
 
 class _ForkedInjection(SourceInjection):
@@ -140,7 +142,7 @@ class _ForkedInjection(SourceInjection):
         self._shared, self._number = shared, number
 
     def _on_strike(self, strike: Strike) -> None:
-        if self._shared.branch is None:
+        if self._shared.config is None:
             if not self._shared.depart(self._number):
                 raise _Struck
             if self._config.killed_node is not None:

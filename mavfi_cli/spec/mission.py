@@ -235,6 +235,21 @@ class MissionConfig:
         return replace(self, **NOT_OF_GOLDEN)
 
     @property
+    def shared_flight(self) -> MissionConfig | None:
+        """The flight from which the mission can be forked: the mission without its fault.
+
+        None for a mission whose flight other processes or the wall clock affect.
+        """
+        alone = (
+            self.instruction is not None
+            or self.isolate
+            or self.realtime
+            or self.link is not None
+            or self.autopilot != OWN_AUTOPILOT
+        )
+        return None if alone else replace(self, fault=None)
+
+    @property
     def seed_of_world(self) -> int:
         """Seed of the world."""
         return self.seed if self.world_seed is None else self.world_seed

@@ -10,7 +10,7 @@ import pytest
 from killing import processes
 from live_processes import none_left
 
-from mavfi_cli.campaigns.missions import MissingMission, PlannedMission, shared_flight
+from mavfi_cli.campaigns.missions import MissingMission, PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import MissionQueue, Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep, Stop
@@ -146,11 +146,10 @@ def test_a_stop_rule_admits_the_missions_of_a_flight():
         {"isolate": ("control",)},
         {"realtime": True},
         {"link": "udpin:127.0.0.1:14550", "goal": (9.0, 0.0, 5.0)},
-        {"platform": "no such platform"},
     ],
 )
 def test_missions_that_other_processes_affect_are_flown_alone(changes):
-    assert shared_flight(replace(MissionConfig(), **changes)) is None
+    assert replace(MissionConfig(), **changes).shared_flight is None
 
 
 def test_a_flight_that_ends_after_its_missions_ends_no_campaign(
