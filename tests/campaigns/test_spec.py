@@ -216,7 +216,7 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
     ("text", "problem"),
     [
         ("seed = ['a']", r"seed"),
-        ("seed = [-1]", r"seed: must be between 0 and 2\^31"),
+        ("seed = [-1]", r"seed: must be between 0 and 2147483647"),
         ("bits = [1]", r"bits: requires a stage or a site"),
         ("level = 'source'", r"level: requires a stage or a site"),
         ("stage = 'control'\nsite = 'command_yaw'", r"a stage or a site for the fault, not both"),
