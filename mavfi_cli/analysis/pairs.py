@@ -88,7 +88,7 @@ class Balance:
 class Flights:
     """Flown missions, one per row, with the columns that items and claims read.
 
-    The columns of an export; a column that the export lacks is empty. Further columns:
+    It has the columns of an export. A column that the export lacks is empty. Further columns:
         fault: the configured fault as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
         at: when a source-level fault strikes; empty without one.

@@ -43,7 +43,7 @@ def scored(
     pairs: tuple[pa.Table, pa.Table],
     tell: Callable[[str], None],
 ) -> Scored:
-    """Scores of the harmful faults and of the error-free flights, by detector.
+    """Compute the detectors' scores of the harmful faults and of the error-free flights.
 
     Args:
         detectors: all except `none`.

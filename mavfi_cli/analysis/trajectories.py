@@ -91,7 +91,7 @@ class _Flown:
 
     @property
     def treatment(self) -> list[str]:
-        """The rest of its treatment, which distinguishes settings of the same name."""
+        """The labels, except the name, that distinguish its setting from others of that name."""
         values = (self.labels.get(name) for name in TREATMENT[1:])
         return [
             "no detector" if value == "none" else str(value)

@@ -415,8 +415,8 @@ class _Run:
         if self._given_up:
             number, reason = next(iter(sorted(self._given_up.items())))
             raise CampaignStopped(
-                f"{len(self._given_up)} missions were killed from outside {ATTEMPTS} times, the "
-                f"first is {number} ({reason}): if memory is short, use fewer --jobs"
+                f"{len(self._given_up)} missions were killed from outside {ATTEMPTS} times; the "
+                f"first is mission {number} ({reason}). If memory is short, use fewer --jobs"
             )
 
     def _fill(self, workers: LocalWorkers | Cluster, interrupts: Sequence[int]) -> None:

@@ -291,7 +291,7 @@ class Safeguard:
 
 
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
-    """The detectors on the first stack, and each other stack instead of the first."""
+    """Compare protections: the detectors on the first stack, and every other stack in its place."""
     (name, first), *others = flights.items()
     found = [
         Safeguard(

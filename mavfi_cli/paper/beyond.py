@@ -227,7 +227,7 @@ class Arm:
 
 
 def arms(flights: Flights) -> list[Arm]:
-    """The arms of a campaign, the unprotected one first; none unless it flew several stacks."""
+    """Return the arms of a campaign that flew several stacks, with the unprotected arm first."""
     if len(set(flights["stack"])) < 2:
         return []
     golden: dict[str, list[Row]] = {}

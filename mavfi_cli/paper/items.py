@@ -138,7 +138,9 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightsPlan:
-    """The flights of items on one stack. Its methods take items of it; none mean all.
+    """The flights of some items on one stack.
+
+    A method that takes items applies to all items if it gets none.
 
     Attributes:
         scale: fraction of the paper's number of missions.

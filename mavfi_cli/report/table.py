@@ -256,7 +256,7 @@ def with_ends(
     unit: str = "",
     chance: float | None = None,
 ) -> str:
-    """Format a value with the ends of its interval and a p-value if there are any.
+    """Format a value, with the ends of its interval and a p-value if it has them.
 
     Args:
         estimate: value, low, high.
