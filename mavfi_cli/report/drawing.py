@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mavfi_cli.core.files import require_output, write_atomically
 from mavfi_cli.core.terminal import cleaned
-from mavfi_cli.core.types import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from mavfi_cli.core.types import FloatArray
 
 PICTURES = (".svg", ".pdf", ".png")
 _STAMPS: dict[str, dict[str, str | None]] = {  # metadata that is the same at any time
@@ -88,6 +87,8 @@ def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
 
 def scattered(count: int) -> FloatArray:
     """Return offsets from -0.5 to 0.5 that spread dots evenly, the same at any time, (count,)."""
+    import numpy as np  # the commands load this module
+
     return (0.5 + np.arange(count, dtype=np.float64) * _TURN) % 1.0 - 0.5
 
 

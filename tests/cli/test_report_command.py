@@ -12,8 +12,8 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
 def assert_only_steps(text):
-    """A step shows after ten seconds, on a busy machine."""
-    assert all(line.endswith(" ...") for line in text.splitlines())
+    """A step shows after ten seconds, on a busy machine; an export without builds is noted."""
+    assert all(line.endswith(" ...") for line in text.splitlines() if "does not name" not in line)
 
 
 def test_it_writes_one_page(command_line, tmp_path):
