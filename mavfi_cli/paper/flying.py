@@ -19,7 +19,7 @@ from mavfi_cli.campaigns.begin import check_kinds
 from mavfi_cli.campaigns.ledger import LEDGER, RUNS, Ledger
 from mavfi_cli.campaigns.missions import MissionResult
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
-from mavfi_cli.campaigns.run import Options, fly_missing, require_unchanged, store_plan
+from mavfi_cli.campaigns.run import PROFILES, Options, fly_missing, require_unchanged, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
@@ -29,6 +29,7 @@ _MEASURED = 12  # missions that a forecast is from, if no more are over
 _OF_A_KIND = 4  # at least so many of each kind
 _NEWEST = 2000  # the most that are read
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
+_PROFILES_BYTES = 10_000_000  # of the profiles of one golden flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +39,7 @@ class Forecast:
     Attributes:
         missions, over: missions of the items; those of them that are over.
         seconds: wall time of the rest; without missions if none is measured.
-        disk_bytes: space for the rest.
+        disk_bytes: space for the rest, profiles that are removed later included.
         measured: number of missions that the forecast is from; 0 if few are left.
         jobs: missions or runs at the same time.
         runs: runs of isolated kernels that are missing.
@@ -235,21 +236,29 @@ def _with_flights(
     losses = sum(result.outcome != "success" for result in flown) / max(1, len(flown))
     rows = sum(path.stat().st_size for path in ledger.folder.glob(f"{LEDGER}*"))
     row_bytes = rows / ledger.over() if flown else _ROW_BYTES
-    runs = [run for run in (ledger.folder / RUNS).glob("*") if run.is_dir()][-20:]
-    run_bytes = sum(map(_size, runs)) / len(runs) if runs else _FOLDER_BYTES
+    run_bytes = _mean_size(ledger.folder / RUNS, _FOLDER_BYTES)
     kept = len(missing.keys() & options.kept) + losses * len(missing)
+    profiled = {
+        mission.config.golden
+        for mission in ledger.missing()
+        if mission.number in missing and mission.config.instruction is not None
+    }
+    profiles = len(profiled) * _mean_size(ledger.folder / PROFILES, _PROFILES_BYTES)
     return replace(
         forecast,
         missions=len(wanted),
         over=len(wanted) - len(missing),
         seconds=forecast.seconds + left_s / forecast.jobs,
-        disk_bytes=forecast.disk_bytes + len(missing) * row_bytes + kept * run_bytes,
+        disk_bytes=forecast.disk_bytes + len(missing) * row_bytes + kept * run_bytes + profiles,
         measured=len(flown),
     )
 
 
-def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+def _mean_size(parent: Path, unknown: float) -> float:
+    """Return the mean size of the newest folders of a parent, bytes; `unknown` without any."""
+    folders = [path for path in parent.glob("*") if path.is_dir()][-20:]
+    files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in files) / len(folders) if folders else unknown
 
 
 def _require_room(out: Path, forecast: Forecast) -> None:

@@ -13,7 +13,7 @@ from made_flights import export_table, row
 from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
 from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.run import PROFILES, Options, run_campaign, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.paper import flying
 from mavfi_cli.paper.items import FlightsPlan, items_named
@@ -93,6 +93,24 @@ def test_each_kind_that_is_missing_is_measured(tmp_path):
         kinds = {kind for kind, _ in flying._kinds(ledger.results())}
     assert {"golden", "source"} <= kinds
     assert forecast.measured >= 4 * len(kinds)
+
+
+def test_a_forecast_counts_the_profiles(tmp_path):
+    asked = plan(tmp_path, "table4", scale=0.05)
+    with Ledger(tmp_path / "table4", writing=True) as ledger:
+        store_plan(ledger, asked.missions())
+        every = frozenset(range(ledger.planned()))
+        goldens = {
+            mission.config.golden for mission in asked.missions() if mission.config.instruction
+        }
+        assert goldens
+        before = flying._with_flights(flying.Forecast(), ledger, every, Options(), [])
+        assert before.disk_bytes > len(goldens) * flying._PROFILES_BYTES
+        for golden in range(2):
+            (ledger.folder / PROFILES / str(golden)).mkdir(parents=True)
+            (ledger.folder / PROFILES / str(golden) / "orders.npz").write_bytes(bytes(300))
+        after = flying._with_flights(flying.Forecast(), ledger, every, Options(), [])
+    assert before.disk_bytes - after.disk_bytes == len(goldens) * (flying._PROFILES_BYTES - 300)
 
 
 def test_few_missions_are_not_measured(tmp_path):
