@@ -152,6 +152,7 @@ def test_missions_that_other_processes_affect_are_flown_alone(changes):
     assert replace(MissionConfig(), **changes).shared_flight is None
 
 
+@pytest.mark.slow
 def test_a_flight_that_ends_after_its_missions_ends_no_campaign(
     short_config, tmp_path, monkeypatch
 ):

@@ -86,6 +86,7 @@ def test_a_forecast_takes_the_rate_of_each_kind():
     assert flying.remaining_s([], {"golden": 3}) == 0.0
 
 
+@pytest.mark.slow
 def test_each_kind_that_is_missing_is_measured(tmp_path):
     asked = plan(tmp_path, "fig9", "table4", scale=0.05)
     forecast = flown(asked)
