@@ -47,6 +47,7 @@ def mission(place, number):
         return mission_of(ledger, number)
 
 
+@pytest.mark.slow
 def test_a_faulty_mission_repeats_from_both(folder, export, mavfi, tmp_path):
     for place in (folder, export):
         done = mavfi("replay", str(place), "--mission", "1", "--out", str(tmp_path), "--json")

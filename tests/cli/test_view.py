@@ -43,6 +43,7 @@ def test_fly_keeps_the_whole_flight(struck, mavfi, tmp_path):
     assert again.stdout.startswith("identical")
 
 
+@pytest.mark.slow
 def test_a_fault_is_seen_beside_its_golden_flight(struck, mavfi, tmp_path):
     before = json.loads((struck / "result.json").read_text())
     for name in ("pair.mcap", "pair.rrd"):

@@ -28,6 +28,7 @@ def lawn(tmp_path):
     (tmp_path / "lawn.toml").write_text(WORLD)
 
 
+@pytest.mark.slow
 def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     """One command: the table, the files, the same once more without flying."""
     code, out, err = command_line(*LINE)

@@ -118,7 +118,7 @@ def test_gad_is_warmed_by_the_flights_that_set_no_threshold(dataset):
     assert fitted.arrays["n_sigma"][0] == fitted.provenance["threshold"] == 6.5
 
 
-@pytest.mark.parametrize("kind", ["l2", "aad"])
+@pytest.mark.parametrize("kind", ["l2", pytest.param("aad", marks=pytest.mark.slow)])
 def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
     dataset, kind, quick, tmp_path
 ):

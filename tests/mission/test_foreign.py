@@ -40,6 +40,7 @@ def summary_of(path):
         return make_reader(stream).get_summary().statistics
 
 
+@pytest.mark.slow
 def test_the_whole_mission_over_a_real_udp_socket(sitl_on_udp, fly_short, at_event, tmp_path):
     watcher = at_event("", None)
     begun = time.time()
@@ -188,6 +189,7 @@ def test_an_autopilot_of_an_unknown_type_is_not_flown(
 EYES = {"eyes": True, "world": "farm"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("autopilot", [FakePX4, FakeArduCopter])
 def test_eyes_bring_camera_world_and_referee(autopilot, autopilot_on_udp, fly_short):
     """The autopilot stands at its local origin, which is the world's start: goals are the world's.
@@ -287,6 +289,7 @@ def test_heartbeats_that_stop_are_no_lost_link(autopilot_on_udp, fly_short, at_e
     assert load_run(folder.path).result["outcome"] == "timeout"
 
 
+@pytest.mark.slow
 def test_a_simulator_slower_than_real_time_is_no_lost_link(
     autopilot_on_udp, fly_short, at_event, monkeypatch
 ):

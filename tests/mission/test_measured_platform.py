@@ -92,6 +92,7 @@ def test_other_platforms_measure_nothing(short_flight):
     assert not any(line.startswith("Measured") for line in summary_lines(result))
 
 
+@pytest.mark.slow
 def test_a_flight_on_this_host_ten_times_as_slow(fly_short):
     """The record says platform and factor; response time follows from what was measured."""
     folder = fly_short(platform="measured:10", realtime=True)

@@ -53,6 +53,7 @@ def test_the_file_is_alone(page):
     assert "<script" not in text
 
 
+@pytest.mark.slow
 def test_equal_flights_give_equal_pages(page):
     assert render(everything()) == page.read_text(encoding="utf-8")
 

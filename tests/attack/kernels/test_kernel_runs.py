@@ -29,6 +29,7 @@ def untimed(runs):
     return records
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_nothing(attack, control_campaign):
     _, (control,) = control_campaign
     _, (cloud,) = attack("point_cloud", runs=12)

@@ -4,6 +4,7 @@ import math
 import struct
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,6 +70,7 @@ def check_sane(bench):
     assert np.isfinite(bench.vehicle.position_ned_m).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(data=st.lists(messages(), min_size=1, max_size=8), airborne=st.booleans())
 def test_valid_frames_of_any_message_with_any_fields(make_bench, data, airborne):
@@ -107,6 +109,7 @@ def test_damaged_frames(make_bench, message, flips):
     bench.run(0.1)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(index=st.integers(0, 60), bits=st.integers(0, 2**32 - 1))
 def test_flight_with_any_parameter_value(make_bench, index, bits):
