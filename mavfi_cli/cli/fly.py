@@ -129,7 +129,7 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
           help="Time without a new state or depth frame after which --link counts as lost, s. It "
                "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
-          help="Land and disarm at the goal  [only with --link].")  # fmt: skip
+          help="Land and disarm at the goal  [default: on with --link, else off].")  # fmt: skip
 @_fault("--inject", type=TARGET, metavar="STAGE|STATE|GROUP",
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
