@@ -21,6 +21,7 @@ from mavfi_cli.core.terminal import echo, exit_code, note
 from mavfi_cli.core.types import FlightTruth
 from mavfi_cli.link.codec import Codec, Signing, dialect
 from mavfi_cli.link.endpoint import parse_endpoint
+from mavfi_cli.link.peers import Peer, Peers
 from mavfi_cli.link.transport import Transport, memory_pair, open_transport, signing_from_file
 from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
@@ -29,7 +30,6 @@ from sitl.camera.component import Camera
 from sitl.command_line import stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.options import ServerOptions, VehicleSetup, parse
-from sitl.peers import Peer, Peers
 from sitl.referee import Collision
 from sitl.simulation import Simulation
 from sitl.vehicle.cascade import control_step

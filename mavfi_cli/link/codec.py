@@ -226,12 +226,25 @@ def _kind(message_id: int) -> _Kind | None:
 
 
 class Codec:
-    """Codec of one end of a link. It numbers the frames that it encodes."""
+    """Codec of one end of a link. It numbers the frames that it encodes.
 
-    def __init__(self, system: int, component: int, *, signing: Signing | None = None) -> None:
+    Args:
+        keeps_unknown: Decode frames whose id the dialect lacks as `MAVLink_unknown`, so that they
+            can be passed on.
+    """
+
+    def __init__(
+        self,
+        system: int,
+        component: int,
+        *,
+        signing: Signing | None = None,
+        keeps_unknown: bool = False,
+    ) -> None:
         self.system = system
         self.component = component
         self._signing = signing
+        self._keeps_unknown = keeps_unknown
         self._sequence = 0
         self._rest = b""
         self.bad_bytes = 0  # received bytes that belong to no frame
@@ -312,6 +325,17 @@ class Codec:
             if not bounded or crc ^ (_crc(frame[1:crc_at]) >> 8) not in _CRC_TABLE:
                 return False
             self.unknown += 1
+            if self._keeps_unknown:
+                signed = flags != 0
+                if self._signing and not self._signing.accept(frame, header, number, signed=signed):
+                    self.refused += 1
+                    return True
+                unknown = dialect.MAVLink_unknown(number, frame[header:crc_at])
+                unknown._header = dialect.MAVLink_header(
+                    number, flags, compat, length, sequence, system, component
+                )
+                unknown._msgbuf = frame
+                messages.append(unknown)
             return True
         if _crc(frame[1:crc_at] + kind.crc_extra) != crc:
             return False

@@ -135,7 +135,7 @@ def open_transport(
 
 
 def open_listener(
-    url: str,
+    url: str | Transport,
     *,
     signed: bool = False,
     allow_unsigned: bool = False,
@@ -144,9 +144,11 @@ def open_listener(
     """Open an endpoint that serves several peers, with the arguments and errors of a transport.
 
     Args:
-        url, signed, allow_unsigned: As in `open_transport`.
+        url, signed, allow_unsigned: As in `open_transport`. An open transport is the single peer.
         admits: Returns True if the sender of this first datagram may become a peer.
     """
+    if isinstance(url, Transport):
+        return _OnePeer(url)
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "fd":
         return _OnePeer(_Stream(endpoint.inherited_socket(), url, patient=False))

@@ -24,10 +24,10 @@ from mavfi_cli.core.frames import (
 )
 from mavfi_cli.link.codec import Codec, Signing, dialect, text_messages
 from mavfi_cli.link.endpoint import TWO_AUTOPILOTS, SenderSlot, parse_endpoint
+from mavfi_cli.link.peers import Peer, Peers
 from mavfi_cli.link.transport import Transport
 from sitl.camera.component import COMPONENT_ID, Camera
 from sitl.firmware.autopilot import follows_companion
-from sitl.peers import Peer, Peers
 from sitl.referee import Collision, Referee
 from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.vehicle import regression_power

@@ -7,8 +7,8 @@ import pytest
 
 from mavfi_cli.core.errors import LinkLost
 from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.peers import Peer, Peers
 from mavfi_cli.link.transport import MAX_PEERS, open_transport
-from sitl.peers import Peer, Peers
 
 FRAME = Codec(9, 190).encode(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
 

@@ -87,21 +87,26 @@ class Peers(Generic[P]):
         """Iterate over the present peers. Peers may leave during the iteration."""
         return iter(list(self._peers))
 
-    def open(self, url: str, make: Callable[[Transport], P]) -> None:
+    def open(self, endpoint: str | Transport, make: Callable[[Transport], P]) -> Listener:
         """Open an endpoint, whose transports `make` turns into peers. On an error, close all.
+
+        Args:
+            endpoint: URL, or an open transport.
 
         Raises LinkError if it cannot be opened.
         """
         signing = self._signing
+        url = endpoint if isinstance(endpoint, str) else endpoint.url
         try:
             listener = open_listener(
-                url, signed=signing is not None, allow_unsigned=self._allow_unsigned,
+                endpoint, signed=signing is not None, allow_unsigned=self._allow_unsigned,
                 admits=begins_with_frame if signing is None else signing.authenticates,
             )  # fmt: skip
         except BaseException:
             self.close()
             raise
         self._endpoints.append((parse_endpoint(url).scheme, listener, make))
+        return listener
 
     def wait(self, timeout_s: float) -> None:
         """Wait until bytes or a connection arrive, at most `timeout_s`."""

@@ -1,0 +1,113 @@
+"""Passes MAVLink frames between an autopilot and the programs of a companion, byte for byte.
+
+Every frame of one side reaches the other side. Frames of a program also reach the other programs of
+the companion, as on a real autopilot's link. An owner may replace frames on their way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from enum import Enum
+from functools import partial
+from typing import Any
+
+from mavfi_cli.core.errors import LinkLost
+from mavfi_cli.link.codec import Codec, Message, Signing, frame_of
+from mavfi_cli.link.peers import Peer, Peers
+from mavfi_cli.link.transport import Transport
+
+
+class Side(Enum):
+    """The sender of a frame."""
+
+    AUTOPILOT = "autopilot"
+    COMPANION = "companion"
+
+
+Pass = Callable[[Message, Side], Iterable[bytes]]
+"""Returns the frames that go on in place of a message: its own frame, others, or none."""
+
+
+class _Program(Peer):
+    """The autopilot, or one program of the companion."""
+
+    def __init__(self, transport: Transport, *, router: Router, side: Side) -> None:
+        super().__init__(transport)
+        self.side, self._router = side, router
+        self._codec = Codec(0, 0, signing=router.signing, keeps_unknown=True)
+
+    def take(self, data: bytes) -> list[Message]:
+        messages = self._codec.decode(data, datagram=self.transport.datagram)
+        for message in messages:
+            self._router.receive(message, self)
+        return messages
+
+
+class Router:
+    """The links of one autopilot and one companion.
+
+    Args:
+        autopilot: URL or open transport of the autopilot.
+        companion: URL of the companion's link; a listening one takes several programs.
+        passes: Decides what goes on; None passes every frame.
+        signing: Refuses frames without a good signature, on both sides.
+        allow_unsigned: Allow an unsigned link to reach beyond this machine.
+
+    Attributes:
+        port: Local port of the companion's link if that listens; the system chooses one for port 0.
+
+    Raises:
+        LinkError: A link cannot be opened.
+    """
+
+    def __init__(
+        self,
+        autopilot: str | Transport,
+        companion: str,
+        *,
+        passes: Pass | None = None,
+        signing: Signing | None = None,
+        allow_unsigned: bool = False,
+    ) -> None:
+        self.signing = signing
+        self._passes = passes or (lambda message, _side: (frame_of(message),))
+        self.peers: Peers[_Program] = Peers(signing=signing, allow_unsigned=allow_unsigned)
+        make = partial(_Program, router=self)
+        self.peers.open(autopilot, partial(make, side=Side.AUTOPILOT))
+        listener = self.peers.open(companion, partial(make, side=Side.COMPANION))
+        self.port = int(getattr(listener, "port", 0))
+
+    def turn(self, timeout_s: float, until_s: float) -> None:
+        """Wait for frames, then pass on those that have arrived.
+
+        Args:
+            timeout_s: Longest wait for a first frame, s.
+            until_s: Monotonic time after which remaining frames wait for the next turn.
+
+        Raises:
+            LinkLost: The autopilot, or a companion at an endpoint that calls, closed its link.
+        """
+        self.peers.wait(timeout_s)
+        self.peers.serve(until_s)
+        if self.peers.lost is not None:
+            raise self.peers.lost
+        if self.peers.over:
+            raise LinkLost("the autopilot closed the connection")
+
+    def receive(self, message: Message, sender: _Program) -> None:
+        """Pass a received message on."""
+        for frame in self._passes(message, sender.side):
+            self.send(frame, sender.side, sender)
+
+    def send(self, frame: bytes, side: Side, sender: Any = None) -> None:
+        """Send a frame as if a side had sent it."""
+
+        def forward(peer: _Program) -> None:
+            if peer is not sender and not side is peer.side is Side.AUTOPILOT:
+                peer.transport.send(frame)
+
+        self.peers.for_all(forward)
+
+    def close(self) -> None:
+        """Close both links."""
+        self.peers.close()
