@@ -55,7 +55,7 @@ Window = tuple[int, int]  # stratum and number of the sampled window that a run 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScopeCode:
+class _ScopeCode:
     """One contiguous piece of code in scope."""
 
     start: int  # address
@@ -70,7 +70,7 @@ class TargetProfile:
 
     strata: tuple[Stratum, ...] = ()
     counted: CountedRun | None = None  # a whole run that was counted instead of stepped
-    code: tuple[ScopeCode, ...]
+    code: tuple[_ScopeCode, ...]
     cost_s: float
     image: Image | None = None  # None in a profile that was read from a file
 
@@ -201,7 +201,7 @@ class TargetProfile:
         )
 
 
-def _code_of(code: Iterable[ScopeCode], address: int) -> bytes:
+def _code_of(code: Iterable[_ScopeCode], address: int) -> bytes:
     """Return 16 bytes at an address from pieces of code."""
     for piece in code:
         if 0 <= (at := address - piece.start) < len(piece.data):
@@ -355,7 +355,7 @@ def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
 
 def _counted(
     place: AttackPlace, counts: Executions
-) -> tuple[CountedRun, Image, tuple[ScopeCode, ...]]:
+) -> tuple[CountedRun, Image, tuple[_ScopeCode, ...]]:
     """Map the counts in scope to the addresses of a native run."""
     image, code, scope = _code(place)
     objects = {entry.path: entry.bias for entry in map(image.named, scope.objects) if entry.path}
@@ -435,13 +435,13 @@ def _profile(place: AttackPlace, strata: Iterable[Stratum], begun: float) -> Tar
     return TargetProfile(strata=tuple(strata), image=image, code=code, cost_s=cost_s)
 
 
-def _code(place: AttackPlace) -> tuple[Image, tuple[ScopeCode, ...], Scope]:
+def _code(place: AttackPlace) -> tuple[Image, tuple[_ScopeCode, ...], Scope]:
     with started(place) as tracee:
         image = place.image(tracee)
         scope = place.scope(image)
         places = [image.locate(span.start) for span in scope.spans]
         code = tuple(
-            ScopeCode(
+            _ScopeCode(
                 start=span.start,
                 data=tracee.memory.read(span.start, len(span) + _TAIL),
                 object=place.object,

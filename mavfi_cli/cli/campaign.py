@@ -4,32 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import (
-    GroupedCommand,
-    GroupedOption,
-    GroupOfCommands,
-    given_options,
-    names_in,
-    refuse_given,
-)
-from mavfi_cli.cli.parameters import (
-    ABOVE_ZERO,
-    CAMPAIGN,
-    CONFIDENCE,
-    ITEM,
-    JOBS,
-    NUMBER,
-    OUT,
-    SCALE,
-    SHARE,
-    UPSETS,
-)
+from mavfi_cli.cli import grouped, types
+from mavfi_cli.cli.grouped import given_options, option, refuse_given, section
 from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
@@ -39,10 +20,10 @@ if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
-_what = partial(click.option, cls=GroupedOption, group="Missions")
-_execution = partial(click.option, cls=GroupedOption, group="Execution")
-_size = partial(click.option, cls=GroupedOption, group="Sample size")
-_output = partial(click.option, cls=GroupedOption, group="Output")
+_what = section("Missions")
+_execution = section("Execution")
+_size = section("Sample size")
+_output = section("Output")
 _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
              help="Replace a factor of the preset or file, as in world=dense. May be repeated. "
                   "Quote a value that contains a comma, or write all values as a TOML list. The "
@@ -56,7 +37,7 @@ _OPEN_CLUSTER = (
 )
 
 
-@click.group(cls=GroupOfCommands)
+@click.group(cls=grouped.GroupOfCommands)
 def campaign() -> None:
     """Plan, fly and evaluate thousands of paired missions.
 
@@ -67,16 +48,15 @@ def campaign() -> None:
     """
 
 
-@campaign.command(cls=GroupedCommand)
-@click.argument("what", metavar="WHAT", type=CAMPAIGN)
-@_what("--scale", type=SCALE, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
+@campaign.command(cls=grouped.GroupedCommand)
+@click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
+@_what("--scale", type=types.SCALE, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
 @_SET
 @_what("--missing-only", is_flag=True,
        help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
 @_what("--append", is_flag=True, help="Add the missions that are not yet on the folder's list.")
-@_what("--retry-errors", is_flag=True, help="Repeat the missions that could not begin.")
-@_execution("--jobs", type=JOBS,
-            help="Number of parallel missions  [one per core].")  # fmt: skip
+@_what("--retry-errors", "errors", is_flag=True, help="Repeat the missions that could not begin.")
+@_execution("--jobs", type=types.JOBS, help="Number of parallel missions  [one per core].")
 @_execution("--cluster", metavar="URL",
             help="Fly on a dask.distributed scheduler, such as tls://host:8786.")  # fmt: skip
 @_execution("--cluster-key", type=_FOLDER, metavar="DIR",
@@ -84,16 +64,14 @@ def campaign() -> None:
 @_execution("--firmware", metavar="PATH",
             help="SITL binary to trust. A binary that the missions of a folder name is executed "
                  "only if it is this one or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
-@_execution("--limit", "limit_s", type=ABOVE_ZERO, default=900.0,
-            show_default=True,
+@_execution("--limit", "limit_s", type=types.ABOVE_ZERO, default=900.0,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
                  "`hang`.")  # fmt: skip
 @_execution("--whole", is_flag=True,
             help="Fly every mission from its start. By default missions that differ only in their "
                  "fault are forked from one flight; their records are the same.")  # fmt: skip
-@_output("--out", type=OUT, help="Folder of the campaign  [campaigns/NAME].")
-@_output("--keep", type=click.Choice(_KEEP),
-         help="Run folders to keep  [the campaign's choice].")  # fmt: skip
+@_output("--out", type=types.OUT, help="Folder of the campaign  [campaigns/NAME].")
+@_output("--keep", type=click.Choice(_KEEP), help="Run folders to keep  [the campaign's choice].")
 @_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
@@ -107,21 +85,17 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.progress import missions_view
 
-    cluster, keys = options["cluster"], options["cluster_key"]
     named = (options[name] for name in ("out", "scale", "changes", "firmware"))
     spec, folder = chosen(what, *named)
     flying = Options(
-        jobs=options["jobs"] or 0,
-        keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
-        limit_s=options["limit_s"],
-        errors=options["retry_errors"],
-        whole=options["whole"],
-        cluster=cluster,
-        cluster_key=keys,
-        firmware=spec.firmware(),
+        **grouped.given_fields(
+            Options,
+            keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
+            firmware=spec.firmware(),
+        )
     )
-    if cluster is not None and keys is None:
-        note(_OPEN_CLUSTER.format(cluster))
+    if flying.cluster is not None and flying.cluster_key is None:
+        note(_OPEN_CLUSTER.format(flying.cluster))
     with (
         missions_view(quiet=quiet) as view,
         begin(
@@ -135,28 +109,27 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT", type=CAMPAIGN)
-@click.option("--by", metavar="LABEL,LABEL", help="Group settings by these labels  [all].")
-@click.option("--confidence", default=0.95, show_default=True,
-              type=CONFIDENCE,
-              help="Confidence level of the intervals.")  # fmt: skip
-@click.option("--quality", is_flag=True,
-              help="Add intervals and extremes of time, distance, energy and replans.")  # fmt: skip
-@click.option("--overhead", is_flag=True,
-              help="Add the share of flight time that detection and recovery take, by "
-                   "stage.")  # fmt: skip
-@click.option("--failures", is_flag=True,
-              help="Add the share of faults that fail otherwise successful missions.")  # fmt: skip
-@click.option("--kernels", type=_FOLDER,
-              help="With --failures: folder of `mavfi kernels --out`. Adds the probability of "
-                   "failure given an SDC of a kernel.")  # fmt: skip
-@click.option("--upsets", type=UPSETS,
-              help="With --failures: bit flips per hour that reach the injection sites. "
-                   "Adds failures per flight hour.")  # fmt: skip
-@click.option("--full", is_flag=True,
-              help="Print all settings and comparisons instead of one screen. --by, --confidence, "
-                   "--quality, --overhead and --failures imply it.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the whole summary as JSON.")
+@click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
+@option("--by", metavar="LABEL,LABEL", help="Group settings by these labels  [all].")
+@option("--confidence", default=0.95, type=types.CONFIDENCE,
+        help="Confidence level of the intervals.")  # fmt: skip
+@option("--quality", is_flag=True,
+        help="Add intervals and extremes of time, distance, energy and replans.")  # fmt: skip
+@option("--overhead", is_flag=True,
+        help="Add the share of flight time that detection and recovery take, by "
+             "stage.")  # fmt: skip
+@option("--failures", is_flag=True,
+        help="Add the share of faults that fail otherwise successful missions.")  # fmt: skip
+@option("--kernels", type=_FOLDER,
+        help="With --failures: folder of `mavfi kernels --out`. Adds the probability of failure "
+             "given an SDC of a kernel.")  # fmt: skip
+@option("--upsets", type=types.UPSETS,
+        help="With --failures: bit flips per hour that reach the injection sites. Adds failures "
+             "per flight hour.")  # fmt: skip
+@option("--full", is_flag=True,
+        help="Print all settings and comparisons instead of one screen. --by, --confidence, "
+             "--quality, --overhead and --failures imply it.")  # fmt: skip
+@option("--json", "as_json", is_flag=True, help="Print the whole summary as JSON.")
 def status(
     what: str, by: str | None, confidence: float, as_json: bool, full: bool, **parts: Any
 ) -> None:
@@ -172,20 +145,20 @@ def status(
         raise click.UsageError("--kernels and --upsets need --failures")
     full = full or bool(given_options().keys() & _FULL)
     with opened(what) as ledger:
-        _show(ledger, names_in(by or ""), confidence, as_json=as_json, full=full, **parts)
+        _show(ledger, grouped.names_in(by or ""), confidence, as_json=as_json, full=full, **parts)
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT", type=CAMPAIGN)
-@click.option("--item", type=ITEM, metavar="ITEM",
-              help="Figure or table of the paper, such as fig12 for flights of table4. Required "
-                   "in the folder of `mavfi reproduce`  [that of the preset].")  # fmt: skip
-@click.option("--format", "form", type=click.Choice([*FORMATS]),
-              default="text", show_default=True, help="Format of the table.")  # fmt: skip
-@click.option("--output", metavar="FILE", type=OutFile(PICTURES),
-              help="Draw the figure into this .svg, .pdf or .png file.")  # fmt: skip
-@click.option("--columns", type=click.Choice(["one", "two"]), default="one", show_default=True,
-              help="Width of the figure in columns of a printed page.")  # fmt: skip
+@click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
+@option("--item", type=types.ITEM, metavar="ITEM",
+        help="Figure or table of the paper, such as fig12 for flights of table4. Required in the "
+             "folder of `mavfi reproduce`  [that of the preset].")  # fmt: skip
+@option("--format", "form", type=click.Choice([*FORMATS]), default="text",
+        help="Format of the table.")  # fmt: skip
+@option("--output", metavar="FILE", type=OutFile(PICTURES),
+        help="Draw the figure into this .svg, .pdf or .png file.")  # fmt: skip
+@option("--columns", type=click.Choice(["one", "two"]), default="one",
+        help="Width of the figure in columns of a printed page.")  # fmt: skip
 def report(what: str, item: str | None, form: str, output: Path | None, columns: str) -> None:
     """Print the table, or the numbers of the figure, with our values beside the paper's.
 
@@ -205,10 +178,10 @@ def report(what: str, item: str | None, form: str, output: Path | None, columns:
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT", type=CAMPAIGN)
+@click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
 @click.argument("path", type=OutFile((".parquet", ".csv"), allow_dash=True))
-@click.option("--json", "as_json", is_flag=True,
-              help="Print the file and the number of its missions as JSON.")  # fmt: skip
+@option("--json", "as_json", is_flag=True,
+        help="Print the file and the number of its missions as JSON.")  # fmt: skip
 def export(what: str, path: Path, as_json: bool) -> None:
     """Write one row per mission to PATH: a .parquet or .csv file, or - for CSV on stdout."""
     from mavfi_cli import library
@@ -229,14 +202,13 @@ def export(what: str, path: Path, as_json: bool) -> None:
 
 
 @campaign.command()
-@click.argument("what", metavar="WHAT", type=CAMPAIGN)
-@click.option("--pair", "number", type=NUMBER, metavar="NUMBER",
-              help="Draw the pair of this mission. The number is the first part of the run "
-                   "folder's name  [the pair whose flight time a fault increases "
-                   "most].")  # fmt: skip
-@click.option("--output", metavar="FILE", type=OutFile(PICTURES),
-              required=True, help="The .svg, .pdf or .png file to write.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
+@click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
+@option("--pair", "number", type=types.NUMBER, metavar="NUMBER",
+        help="Draw the pair of this mission. The number is the first part of the run folder's "
+             "name  [the pair whose flight time a fault increases most].")  # fmt: skip
+@option("--output", metavar="FILE", type=OutFile(PICTURES), required=True,
+        help="The .svg, .pdf or .png file to write.")  # fmt: skip
+@option("--json", "as_json", is_flag=True, help="Print what was drawn as JSON.")
 def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
     """Draw the golden, faulty and protected flights of one pair from above.
 
@@ -262,24 +234,22 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
         echo_lines([*flown.lines(), *absent, f"Picture  {output}"])
 
 
-@campaign.command(cls=GroupedCommand)
-@click.argument("what", metavar="[WHAT]", required=False, type=CAMPAIGN)
-@_what("--scale", type=SCALE, help="Fraction of the repetitions to run.")
+@campaign.command(cls=grouped.GroupedCommand)
+@click.argument("what", metavar="[WHAT]", required=False, type=types.CAMPAIGN)
+@_what("--scale", type=types.SCALE, help="Fraction of the repetitions to run.")
 @_SET
 @_size("--margin", type=Number(1.0e-6, 0.5, max_open=True),
-              help="Print the number of missions per setting for a confidence interval of this "
-                   "half-width.")  # fmt: skip
-@_size("--expect", "expected", default=0.5, show_default=True, type=SHARE,
-              help="With --margin: expected success rate.")  # fmt: skip
+       help="Print the number of missions per setting for a confidence interval of this "
+            "half-width.")  # fmt: skip
+@_size("--expect", "expected", default=0.5, type=types.SHARE,
+       help="With --margin: expected success rate.")  # fmt: skip
 @_size("--difference", type=Number(-1.0, 1.0),
-              help="Print the number of pairs that detects this difference of success "
-                   "rates.")  # fmt: skip
-@_size("--discordant", default=0.2, show_default=True, type=SHARE,
-              help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
-@_size("--power", default=0.8, show_default=True, type=CONFIDENCE,
-              help="With --difference: probability of detecting it.")  # fmt: skip
-@_size("--confidence", default=0.95, show_default=True, type=CONFIDENCE,
-              help="Confidence level.")  # fmt: skip
+       help="Print the number of pairs that detects this difference of success rates.")  # fmt: skip
+@_size("--discordant", default=0.2, type=types.SHARE,
+       help="With --difference: expected share of pairs whose outcomes differ.")  # fmt: skip
+@_size("--power", default=0.8, type=types.CONFIDENCE,
+       help="With --difference: probability of detecting it.")  # fmt: skip
+@_size("--confidence", default=0.95, type=types.CONFIDENCE, help="Confidence level.")
 @_output("--json", "as_json", is_flag=True, help="Print as JSON.")
 def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -> None:
     """List the missions of a campaign without flying, or compute a sample size.
@@ -325,7 +295,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
 
 
 @campaign.command()
-@click.argument("folder", metavar="DIR", type=OUT)
+@click.argument("folder", metavar="DIR", type=types.OUT)
 def keys(folder: Path) -> None:
     """Make the keys of a cluster in DIR, for `mavfi campaign run --cluster tls://...`.
 

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, GroupOfCommands, names_in
-from mavfi_cli.cli.parameters import (
-    DETECTORS,
-    FIELDS,
-    FIRST_SEED,
-    JOBS,
-    MISSIONS,
-    OUT,
-    PLATFORM,
-    SEED,
-    STACK,
-    STAGES,
-    WORLD,
-)
-from mavfi_cli.core.terminal import echo, echo_lines
+from mavfi_cli.cli import results, types
+from mavfi_cli.cli.grouped import GroupedCommand, GroupOfCommands, given_fields, option, section
+from mavfi_cli.core.terminal import echo
 
 if TYPE_CHECKING:
     from mavfi_cli.detect.base import DetectorListing
-    from mavfi_cli.studies.evaluate import EvaluationPlan
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -39,8 +25,8 @@ def detect() -> None:
 
 
 @detect.command("list")
-@click.option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
+@option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
+@option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
     """List the detectors with the model file, stack, threshold and origin of each."""
     from mavfi_cli.detect.base import listing
@@ -63,54 +49,47 @@ def _entry(row: DetectorListing) -> dict[str, Any]:
     return entry
 
 
-_missions = partial(click.option, cls=GroupedOption, group="Missions")
-_fault = partial(click.option, cls=GroupedOption, group="Faults")
-_detector = partial(click.option, cls=GroupedOption, group="Detectors")
-_output = partial(click.option, cls=GroupedOption, group="Output")
+_missions = section("Missions")
+_fault = section("Faults")
+_detector = section("Detectors")
+_output = section("Output")
 
 
 @detect.command(cls=GroupedCommand)
-@_missions("--world", "worlds", multiple=True, type=WORLD, metavar="NAME|FILE",
+@_missions("--world", "worlds", multiple=True, type=types.WORLD, metavar="NAME|FILE",
            help="World; may be repeated  [sparse, dense, factory, farm].")  # fmt: skip
-@_missions("--flights", default=25, show_default=True, type=click.IntRange(0, MISSIONS.max),
+@_missions("--flights", default=25, type=click.IntRange(0, types.MISSIONS.max),
            help="Faulty missions per world. Each is flown once per kind of fault.")  # fmt: skip
-@_missions("--golden-flights", default=100, show_default=True, type=MISSIONS,
+@_missions("--golden-flights", default=100, type=types.MISSIONS,
            help="Error-free missions per world, at least --flights.")  # fmt: skip
-@_missions("--first-seed", default=500_000, show_default=True, type=FIRST_SEED,
+@_missions("--first-seed", default=500_000, type=types.FIRST_SEED,
            help="Seed of the first mission; each further mission adds 1. Seeds that trained a "
                 "model are rejected.")  # fmt: skip
-@_missions(
-    "--platform", type=PLATFORM, metavar="NAME|FILE", help="Platform of the companion  [x86]."
-)
-@_missions("--stack", type=STACK, metavar="NAME|FILE",
+@_missions("--platform", type=types.PLATFORM, metavar="NAME|FILE",
+           help="Platform of the companion  [x86].")  # fmt: skip
+@_missions("--stack", type=types.STACK, metavar="NAME|FILE",
            help="Stack; its shipped models are used. `mavfi stacks` lists them  "
                 "[mavbench].")  # fmt: skip
-@_missions("--jobs", type=JOBS,
-           help="Number of parallel missions  [one per core].")  # fmt: skip
+@_missions("--jobs", type=types.JOBS, help="Number of parallel missions  [one per core].")
 @_fault("--level", type=click.Choice(["source", "instruction"]), default="source",
-        show_default=True,
         help="`source` corrupts states between kernels, `instruction` operands of a node's "
              "instructions.")  # fmt: skip
-@_fault("--field", "fields", type=FIELDS, default="sign,exponent,mantissa,integer",
-        show_default=True,
+@_fault("--field", "fields", type=types.FIELDS, default="sign,exponent,mantissa,integer",
         help="Fields of the bits at source level; integer means states that have no other "
              "field.")  # fmt: skip
-@_fault("--seed", default=1, show_default=True, type=SEED,
-        help="Seed of the faults.")  # fmt: skip
-@_detector("--detector", "detectors", type=DETECTORS, metavar="NAME,NAME",
+@_fault("--seed", default=1, type=types.SEED, help="Seed of the faults.")
+@_detector("--detector", "detectors", type=types.DETECTORS, metavar="NAME,NAME",
            help="Detectors to evaluate  [none,range,l2,gad,aad].")  # fmt: skip
 @_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
-@_detector("--protect", type=STAGES, default="perception,planning,control", show_default=True,
+@_detector("--protect", type=types.STAGES, default="perception,planning,control",
            help="Stages that the detectors watch.")  # fmt: skip
-@_output("--out", type=OUT, default=Path("evaluation"), show_default=True,
+@_output("--out", type=types.OUT, default=Path("evaluation"),
          help="Folder of flights, tables and pictures. Recorded missions are not flown "
               "again.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the evaluation as JSON.")
 @_output("--csv", "as_csv", is_flag=True, help="Print the evaluation as CSV, one pair per row.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
-def evaluate(
-    out: Path, as_json: bool, as_csv: bool, quiet: bool, jobs: int | None, **options: Any
-) -> None:
+def evaluate(out: Path, as_json: bool, as_csv: bool, quiet: bool, **options: Any) -> None:
     """Evaluate detectors on held-out missions: golden, faulty, and faulty with detector.
 
     The same command resumes an interrupted evaluation. More flights, worlds or detectors are added
@@ -118,57 +97,19 @@ def evaluate(
     """
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
-    from mavfi_cli.core.files import plain, write_json, write_text
-    from mavfi_cli.report.detectors import (
-        PICTURES,
-        detector_csv,
-        detector_lines,
-    )
-    from mavfi_cli.report.drawing import write_figure
+    from mavfi_cli.core.files import plain
+    from mavfi_cli.report.detectors import PICTURES, detector_csv, detector_lines
+    from mavfi_cli.spec.mission import MissionConfig
+    from mavfi_cli.studies.evaluate import EvaluationPlan
     from mavfi_cli.studies.evaluate import evaluate as run
 
-    if as_json and as_csv:
-        raise click.UsageError("--json cannot be combined with --csv")
-    plan = _plan(**options)
+    golden = max(options["golden_flights"], options["flights"])
+    base = MissionConfig(**given_fields(MissionConfig, seed=MissionConfig().seed))
+    plan = EvaluationPlan(**given_fields(EvaluationPlan, golden_flights=golden, base=base))
     with missions_view(quiet=quiet) as view:
-        evaluation, pairs = run(plan, out, Options(jobs=jobs or 0), view)
-    contents = plain(asdict(evaluation))
-    write_json(out / "evaluation.json", contents)
-    write_text(out / "evaluation.csv", detector_csv(*pairs))
-    for name, draw in PICTURES.items():
-        write_figure(draw(evaluation), out / name)
-    if as_json:
-        echo(json.dumps(contents, indent=2, sort_keys=True))
-    elif as_csv:
-        echo(detector_csv(*pairs), nl=False)
-    else:
-        files = "evaluation.json, evaluation.csv, roc.svg, recovery.svg"
-        echo_lines([*detector_lines(evaluation), "", f"Files  {out}: {files}"])
-
-
-def _plan(
-    *,
-    worlds: tuple[str, ...] | None,
-    detectors: str | None,
-    golden_flights: int,
-    flights: int,
-    protect: str,
-    fields: str,
-    platform: str | None,
-    stack: str | None,
-    **same: Any,
-) -> EvaluationPlan:
-    from mavfi_cli.spec.mission import MissionConfig
-    from mavfi_cli.studies.evaluate import DETECTORS, WORLDS, EvaluationPlan
-
-    base = MissionConfig()
-    return EvaluationPlan(
-        worlds=worlds or WORLDS,
-        detectors=DETECTORS if detectors is None else names_in(detectors),
-        golden_flights=max(golden_flights, flights),
-        flights=flights,
-        protect=names_in(protect),
-        fields=names_in(fields),
-        base=replace(base, platform=platform or base.platform, stack=stack or base.stack),
-        **same,
-    )
+        evaluation, pairs = run(plan, out, Options(**given_fields(Options)), view)
+    contents, table = plain(asdict(evaluation)), detector_csv(*pairs)
+    pictures = {name: draw(evaluation) for name, draw in PICTURES.items()}
+    names = results.save(out, {"evaluation.json": contents}, {"evaluation.csv": table}, pictures)
+    lines = [*detector_lines(evaluation), "", f"Files  {out}: {', '.join(names)}"]
+    results.show(contents, table, lines, as_json=as_json, as_csv=as_csv)

@@ -5,42 +5,13 @@ from __future__ import annotations
 import json
 import shlex
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import (
-    GroupedCommand,
-    GroupedOption,
-    given_options,
-    names_in,
-    refuse_given,
-    spelling,
-)
-from mavfi_cli.cli.parameters import (
-    ABOVE_ZERO,
-    AUTOPILOT,
-    BIT,
-    BITS,
-    DETECTOR,
-    EFFECT,
-    FIELD,
-    OUT,
-    PERSISTENCE,
-    PLANNER,
-    PLATFORM,
-    ROLE,
-    SEED,
-    SITE,
-    STACK,
-    STAGES,
-    TARGET,
-    VEHICLE,
-    WATCH,
-    WORLD,
-)
+from mavfi_cli.cli import types
+from mavfi_cli.cli.grouped import GroupedCommand, given_options, refuse_given, section, spelling
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
 from mavfi_cli.core.terminal import echo, echo_lines, note_error
 
@@ -74,34 +45,32 @@ def _place(_ctx: Any, _param: Any, value: str | None) -> tuple[float, float, flo
     return x, y, z
 
 
-_option = partial(click.option, cls=GroupedOption, show_default=True)
-_mission, _fault = partial(_option, group="Mission"), partial(_option, group="Fault")
-_instruction = partial(_option, group="Instruction level")
-_detector, _output = partial(_option, group="Detector"), partial(_option, group="Output")
+_mission, _fault = section("Mission"), section("Fault")
+_instruction = section("Instruction level")
+_detector, _output = section("Detector"), section("Output")
 
 
 @click.command(cls=GroupedCommand)
 @_mission("--config", metavar="FILE", type=click.Path(path_type=Path, exists=True, dir_okay=False),
           help="TOML file of the whole mission. Other options override it. "
                "docs/reference/settings.md lists its keys.")  # fmt: skip
-@_mission("--world", type=WORLD, default="dense", metavar="NAME|FILE",
+@_mission("--world", type=types.WORLD, default="dense", metavar="NAME|FILE",
           help="World, or a TOML file of boxes; `mavfi world list` lists the worlds.")  # fmt: skip
 @_mission("--seed", default=3, help="Root seed of all random draws.")
 @_mission("--world-seed", type=int, help="Seed of the world only  [--seed].")
-@_mission("--planner", type=PLANNER, default="rrtstar",
+@_mission("--planner", type=types.PLANNER, default="rrtstar",
           help="Planner: rrtstar, rrt, rrtconnect, or the name of a plug-in.")  # fmt: skip
-@_mission("--platform", type=PLATFORM, default="x86", metavar="NAME|FILE|measured:FACTOR",
-          help="Computer whose kernel latencies apply; `mavfi platforms` lists them. "
-               "`measured` takes the kernel times of this host times FACTOR and needs "
+@_mission("--platform", type=types.PLATFORM, default="x86", metavar="NAME|FILE|measured:FACTOR",
+          help="Computer whose kernel latencies apply; `mavfi platforms` lists them. `measured` "
+               "takes the kernel times of this host times FACTOR and needs "
                "--realtime.")  # fmt: skip
-@_mission("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
+@_mission("--stack", type=types.STACK, default="mavbench", metavar="NAME|FILE",
           help="Structure, checks and gains of the companion; `mavfi stacks` lists the "
                "stacks.")  # fmt: skip
-@_mission("--vehicle", type=VEHICLE, default="solo", metavar="NAME|FILE",
+@_mission("--vehicle", type=types.VEHICLE, default="solo", metavar="NAME|FILE",
           help="Simulated vehicle: solo, spark, or a TOML file.")  # fmt: skip
-@_mission(
-    "--start", metavar="X,Y,Z", callback=_place, help="Take-off position, ENU, m  [the world's]."
-)
+@_mission("--start", metavar="X,Y,Z", callback=_place,
+          help="Take-off position, ENU, m  [the world's].")  # fmt: skip
 @_mission("--goal", metavar="X,Y,Z", callback=_place,
           help="Goal, ENU, m  [the world's]. A generated world is built around start and goal: "
                "other positions move its bounds, and towers within 3 m of them are left "
@@ -113,12 +82,12 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @_mission("--eyes", is_flag=True,
-          help="Start a depth camera and a referee of --world beside the autopilot on --link, "
-               "with the body of --vehicle.")  # fmt: skip
+          help="Start a depth camera and a referee of --world beside the autopilot on --link, with "
+               "the body of --vehicle.")  # fmt: skip
 @_mission("--origin", metavar="X,Y,Z", callback=_place,
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
-@_mission("--autopilot", type=AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",
+@_mission("--autopilot", type=types.AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",
           help="Autopilot of the simulated vehicle. px4 and ardupilot start and stop with the "
                "mission.")  # fmt: skip
 @_mission("--firmware", metavar="PATH",
@@ -130,29 +99,27 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
                "must pass on the vehicle's clock and on the wall clock.")  # fmt: skip
 @_mission("--land/--no-land", default=None,
           help="Land and disarm at the goal  [default: on with --link, else off].")  # fmt: skip
-@_fault("--inject", type=TARGET, metavar="STAGE|STATE|GROUP",
+@_fault("--inject", type=types.TARGET, metavar="STAGE|STATE|GROUP",
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
              "process.NODE (kills the node's process).")  # fmt: skip
-@_fault("--at", default="random",
-        metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
+@_fault("--at", default="random", metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
-@_fault("--fault-seed", default=1, type=SEED,
-        help="Seed of all random draws of the fault.")  # fmt: skip
-@_fault("--bits", default=1, type=BITS, help="Number of bits to flip.")
-@_fault("--field", default="any", type=FIELD,
+@_fault("--fault-seed", default=1, type=types.SEED, help="Seed of all random draws of the fault.")
+@_fault("--bits", default=1, type=types.BITS, help="Number of bits to flip.")
+@_fault("--field", default="any", type=types.FIELD,
         help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
-@_fault("--bit", "exact_bits", multiple=True, type=BIT,
+@_fault("--bit", "exact_bits", multiple=True, type=types.BIT,
         help="Flip this bit instead of a random one; 0 is the lowest. May be "
              "repeated.")  # fmt: skip
 @_fault("--all-components", "together", is_flag=True,
         help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
-@_fault("--effect", default="flip", type=EFFECT,
+@_fault("--effect", default="flip", type=types.EFFECT,
         help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
-@_fault("--persistence", default="transient", type=PERSISTENCE,
+@_fault("--persistence", default="transient", type=types.PERSISTENCE,
         help="Persistence: transient (once), stuck-at (held) or intermittent "
              "(repeated).")  # fmt: skip
-@_fault("--duration", "duration_s", type=ABOVE_ZERO,
+@_fault("--duration", "duration_s", type=types.ABOVE_ZERO,
         help="Duration of a stuck-at or intermittent fault, s  [until the end].")  # fmt: skip
 @_fault("--restart", "node_restart_s", default=1.0,
         help="Time until a dead node works again, s; 3600 means never.")  # fmt: skip
@@ -160,16 +127,16 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
               help="`instruction` corrupts an operand of one machine instruction of a kernel. "
                    "--inject is then point_cloud, octomap, collision_check, planner, control, "
                    "perception or planning.")  # fmt: skip
-@_instruction("--site", "sites", multiple=True, type=SITE,
+@_instruction("--site", "sites", multiple=True, type=types.SITE,
               help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, "
                    "opcode, memory. May be repeated  [the first five: registers].")  # fmt: skip
-@_instruction("--role", "roles", multiple=True, type=ROLE,
+@_instruction("--role", "roles", multiple=True, type=types.ROLE,
               help="Role of the operand: source or destination  [both].")  # fmt: skip
-@_detector("--detector", type=DETECTOR, metavar="NAME",
+@_detector("--detector", type=types.DETECTOR, metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
-@_detector("--protect", type=STAGES, metavar="STAGE,...", default="perception,planning,control",
-           callback=lambda _ctx, _param, value: names_in(value),
+@_detector("--protect", type=types.STAGES, metavar="STAGE,...",
+           default="perception,planning,control",
            help="Stages that the detector watches.")  # fmt: skip
 @_detector("--threshold", type=float,
            help="Score above which the detector raises an alarm; for gad the number of sigmas  "
@@ -179,17 +146,15 @@ _detector, _output = partial(_option, group="Detector"), partial(_option, group=
 @_detector("--any-stack-model", "any_stack", is_flag=True,
            help="Accept a model of another stack. Without --model, use the model of the base "
                 "stack.")  # fmt: skip
-@_detector("--watch", type=WATCH, default="paper", metavar="paper|extended",
+@_detector("--watch", type=types.WATCH, default="paper", metavar="paper|extended",
            help="States that the detector watches. paper has the 13 of the paper; extended adds "
                 "collision and the sequence numbers of plans.")  # fmt: skip
-@_output("--out", type=OUT, default=Path("runs"),
-         help="Parent of the new run folder.")  # fmt: skip
+@_output("--out", type=types.OUT, default=Path("runs"), help="Parent of the new run folder.")
 @_output("--record", metavar="mcap|rrd", type=click.Choice(["mcap", "rrd"]),
-         help="Also record depth frames, clouds and maps: flight.mcap for Foxglove, flight.rrd "
-              "for rerun.")  # fmt: skip
+         help="Also record depth frames, clouds and maps: flight.mcap for Foxglove, flight.rrd for "
+              "rerun.")  # fmt: skip
 @_output("--picture/--no-picture", default=True, help="Draw flight.svg.")
-@_output("--expect", type=click.Choice(_OUTCOMES),
-         help="Exit with code 1 if the outcome differs.")  # fmt: skip
+@_output("--expect", type=click.Choice(_OUTCOMES), help="Exit with code 1 if the outcome differs.")
 @_output("--json", "as_json", is_flag=True, help="Print result.json instead of the summary.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def fly(

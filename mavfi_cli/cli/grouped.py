@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Callable, Collection
+from dataclasses import fields
+from functools import partial
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -11,7 +13,7 @@ from click.core import ParameterSource
 from mavfi_cli.core.errors import ConfigError, MavfiError, PlaceError
 
 
-class GroupedOption(click.Option):
+class _GroupedOption(click.Option):
     """An option that the help shows in the section of its group."""
 
     def __init__(self, *args: Any, group: str, **kwargs: Any) -> None:
@@ -19,11 +21,24 @@ class GroupedOption(click.Option):
         self.group = group
 
 
+Decorated = TypeVar("Decorated", bound=Callable[..., Any] | click.Command)
+
+
+def section(title: str) -> Callable[..., Callable[[Decorated], Decorated]]:
+    """`click.option` for the options of a section of the help, which show their defaults."""
+    return partial(click.option, cls=_GroupedOption, group=title, show_default=True)
+
+
+option = section("Options")  # of a command without sections
+
+
 class GroupedCommand(click.Command):
     """A command whose errors name the option at fault and whose help groups the options."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Call the command. An invalid value is a usage error that names the option."""
+        if ctx.params.get("as_json") and ctx.params.get("as_csv"):
+            raise click.UsageError("--json cannot be combined with --csv")
         try:
             return super().invoke(ctx)
         except MavfiError as error:
@@ -36,7 +51,7 @@ class GroupedCommand(click.Command):
         """Write one section per group, in the order of declaration."""
         sections: dict[str, list[tuple[str, str]]] = {}
         params = self.get_params(ctx)
-        rest = "Output" if any(isinstance(param, GroupedOption) for param in params) else "Options"
+        (*_, rest) = ("Options", *(p.group for p in params if isinstance(p, _GroupedOption)))
         for param in params:
             record = None if isinstance(param, click.Argument) else param.get_help_record(ctx)
             if record is not None:
@@ -86,6 +101,17 @@ def given_options() -> dict[str, Any]:
         for name, value in context.params.items()
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE
     }
+
+
+def given_fields(kind: type, **others: Any) -> dict[str, Any]:
+    """The options that the user gave, as fields of a plan with the defaults of the command.
+
+    Args:
+        kind: the dataclass of the plan.
+        others: further fields, which take precedence.
+    """
+    known = {field.name for field in fields(kind)}
+    return {name: own for name, own in given_options().items() if name in known} | others
 
 
 def spelling(name: str) -> str:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand
-from mavfi_cli.cli.parameters import PLATFORM, STACK
+from mavfi_cli.cli.grouped import GroupedCommand, option
+from mavfi_cli.cli.types import PLATFORM, STACK
 from mavfi_cli.core.terminal import echo, echo_lines
 from mavfi_cli.report.table import WIDTH, Table
 
@@ -36,7 +36,7 @@ _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("r
 
 
 @click.command(cls=GroupedCommand)
-@click.option("--json", "as_json", is_flag=True, help="Print the checks as JSON.")
+@option("--json", "as_json", is_flag=True, help="Print the checks as JSON.")
 def doctor(as_json: bool) -> None:
     """Test this machine: wheels, cores, physics, loopback, ptrace, breakpoints.
 
@@ -83,7 +83,7 @@ result.json has the medians. Such a flight does not repeat, so only
 
 @click.command(cls=GroupedCommand)
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...", type=PLATFORM)
-@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+@option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def platforms(names: tuple[str, ...], as_json: bool) -> None:
     """List the compute platforms, or show the named ones kernel by kernel."""
     from mavfi_cli.spec.platform import PLATFORMS, load_platform
@@ -168,7 +168,7 @@ NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true.
 
 @click.command(cls=GroupedCommand)
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...", type=STACK)
-@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
+@option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def stacks(names: tuple[str, ...], as_json: bool) -> None:
     """List the stacks, explain the keys of one, or show the keys in which several differ.
 
@@ -237,7 +237,7 @@ def _format_value(value: Any) -> str:
 
 
 @click.command(cls=GroupedCommand)
-@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
+@option("--json", "as_json", is_flag=True, help="Print the table as JSON.")
 def states(as_json: bool) -> None:
     """List the monitored states, which are the injection sites of source-level faults."""
     from mavfi_cli.core.types import STATES

@@ -7,27 +7,13 @@ import json
 import os
 import shlex
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption, given_options, refuse_given
-from mavfi_cli.cli.parameters import (
-    ABOVE_ZERO,
-    COMPAT,
-    FIELD,
-    JOBS,
-    KERNEL,
-    MISSIONS,
-    OUT,
-    ROLE,
-    SAMPLING,
-    SEED,
-    SITE,
-    WORLD,
-)
+from mavfi_cli.cli import types
+from mavfi_cli.cli.grouped import GroupedCommand, given_options, refuse_given, section
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.option_types import Number
@@ -44,30 +30,29 @@ _OF_PROGRAM = (
 
 
 _WIDEST = 4096  # bits of the longest operand, that of fxsave
-_target = partial(click.option, cls=GroupedOption, group="Kernels")
-_native = partial(click.option, cls=GroupedOption, group="Native program")
-_fault = partial(click.option, cls=GroupedOption, group="Fault")
-_runs = partial(click.option, cls=GroupedOption, group="Runs")
-_output = partial(click.option, cls=GroupedOption, group="Output")
+_target = section("Kernels")
+_native = section("Native program")
+_fault = section("Fault")
+_runs = section("Runs")
+_output = section("Output")
 
 
 @click.command(cls=GroupedCommand)
-@_target("--kernel", multiple=True, type=KERNEL, metavar="NAME",
+@_target("--kernel", multiple=True, type=types.KERNEL, metavar="NAME",
          help="Kernel to attack: point_cloud, octomap, collision_check, rrt, rrtconnect, rrtstar, "
               "control, or a Python file with your own kernel. May be repeated  "
               "[all].")  # fmt: skip
-@_target("--world", type=WORLD, default="dense", show_default=True, metavar="NAME|FILE",
+@_target("--world", type=types.WORLD, default="dense", metavar="NAME|FILE",
          help="World of the golden run that supplies the kernels' inputs.")  # fmt: skip
-@_target("--world-seed", default=3, show_default=True, type=SEED,
-         help="Seed of that golden run.")  # fmt: skip
+@_target("--world-seed", default=3, type=types.SEED, help="Seed of that golden run.")
 @_native("--program", help="Native program to attack instead of the kernels.")
 @_native("--args", help="Arguments of the program, quoted as in a shell.")
 @_native("--stdin", "stdin_file", metavar="FILE",
          type=click.Path(exists=True, dir_okay=False, path_type=Path),
          help="Standard input of the program  [none].")  # fmt: skip
 @_native("--compare", multiple=True, metavar="OUTPUT",
-         help="Output to compare: stdout, or file:PATH for a file that the program writes. PATH "
-              "is relative to the scratch folder in which the program then runs. May be repeated  "
+         help="Output to compare: stdout, or file:PATH for a file that the program writes. PATH is "
+              "relative to the scratch folder in which the program then runs. May be repeated  "
               "[stdout].")  # fmt: skip
 @_native("--ignore-lines", multiple=True, metavar="REGEX",
          help="Do not compare lines that contain a match. May be repeated.")  # fmt: skip
@@ -75,38 +60,35 @@ _output = partial(click.option, cls=GroupedOption, group="Output")
          help="Folder that each run works in a copy of  [an empty folder].")  # fmt: skip
 @_native("--env", multiple=True, metavar="NAME=VALUE",
          help="Environment variable of the program. May be repeated.")  # fmt: skip
-@_native("--memory", default=2.0, show_default=True, metavar="GB",
-         type=ABOVE_ZERO,
+@_native("--memory", default=2.0, metavar="GB", type=types.ABOVE_ZERO,
          help="Memory limit of the program.")  # fmt: skip
 @_native("--scope", multiple=True, help="Shared object to attack. May be repeated.")
 @_native("--function", help="Attack only code that executes during calls of this function.")
-@_fault("--sampling", default="instruction-uniform", show_default=True, type=SAMPLING,
+@_fault("--sampling", default="instruction-uniform", type=types.SAMPLING,
         help="Sampling rule: instruction-uniform, cpu-time or wall-clock.")  # fmt: skip
-@_fault("--site", multiple=True, type=SITE,
+@_fault("--site", multiple=True, type=types.SITE,
         help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, opcode, "
              "memory. May be repeated  [the first five: registers].")  # fmt: skip
-@_fault("--role", multiple=True, type=ROLE,
+@_fault("--role", multiple=True, type=types.ROLE,
         help="Role of the operand: source or destination  [both].")  # fmt: skip
-@_fault("--field", default="any", show_default=True, type=FIELD,
+@_fault("--field", default="any", type=types.FIELD,
         help="Field of the bits: sign, exponent, mantissa or any.")  # fmt: skip
-@_fault("--bits", default=1, show_default=True, type=click.IntRange(1, _WIDEST),
-        help="Number of bits to flip.")  # fmt: skip
-@_fault("--seed", default=1, show_default=True, type=SEED,
-        help="Seed of the faults.")  # fmt: skip
-@_fault("--compat", type=COMPAT, metavar="INJECTOR",
+@_fault("--bits", default=1, type=click.IntRange(1, _WIDEST), help="Number of bits to flip.")
+@_fault("--seed", default=1, type=types.SEED, help="Seed of the faults.")
+@_fault("--compat", type=types.COMPAT, metavar="INJECTOR",
         help="Follow the rules of another injector: pinfi, pinfi-bugs, rosfi-2021.")  # fmt: skip
 @_fault("--null", is_flag=True, help="Do everything except the flip.")
-@_runs("--runs", default=1000, show_default=True, type=MISSIONS,
+@_runs("--runs", default=1000, type=types.MISSIONS,
        help="Runs per kernel, or of the program. Each run has one fault.")  # fmt: skip
-@_runs("--jobs", default=1, show_default=True, type=JOBS,
+@_runs("--jobs", default=1, type=types.JOBS,
        help="Number of parallel runs. It does not change the results.")  # fmt: skip
-@_runs("--tolerance", default=0.0, type=Number(0.0, 1.0e6),
+@_runs("--tolerance", show_default=False, default=0.0, type=Number(0.0, 1.0e6),
        help="Largest relative error that counts as benign.")  # fmt: skip
 @_runs("--replay", type=click.Path(path_type=Path, file_okay=False),
        help="Repeat the recorded runs in this folder and compare them. --kernel selects kernels, "
             "--runs limits the runs of each. For runs of a program, give the options of the "
             "program again.")  # fmt: skip
-@_output("--out", type=OUT,
+@_output("--out", type=types.OUT,
          help="Folder for records, JSON, CSV and plot. Recorded runs are not "
               "repeated.")  # fmt: skip
 @_output("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
@@ -143,17 +125,14 @@ def _plan(options: dict[str, Any]) -> Plan:
     from mavfi_cli.fi.tracer.fault import FaultModel
 
     plan = Plan(
-        runs=options["runs"],
-        seed=options["seed"],
+        **{name: options[name] for name in ("runs", "seed", "compat", "null")},
         rule=options["sampling"],
-        compat=options["compat"],
         model=FaultModel.named(
             sites=options["site"],
             roles=options["role"],
             field=options["field"],
             bits=options["bits"],
         ),
-        null=options["null"],
     )
     plan.strategy()  # reports errors before any run
     return plan

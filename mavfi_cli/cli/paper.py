@@ -4,36 +4,32 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, GroupedOption
-from mavfi_cli.cli.parameters import ITEM, JOBS, OUT, STACK, UPSETS
+from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, section
+from mavfi_cli.cli.types import ITEM, JOBS, OUT, STACK, UPSETS
 from mavfi_cli.core.option_types import Number, OutFile
 from mavfi_cli.core.terminal import echo, note
 
-_what = partial(click.option, cls=GroupedOption, group="Missions")
-_execution = partial(click.option, cls=GroupedOption, group="Execution")
-_output = partial(click.option, cls=GroupedOption, group="Output")
+_what = section("Missions")
+_execution = section("Execution")
+_output = section("Output")
 
 
 @click.command(cls=GroupedCommand)
 @click.argument("names", metavar="[ITEM...]", nargs=-1, type=ITEM)
 @_what("--scale", type=Number(0.0, 1.0, min_open=True), default=1.0,
-       show_default=True,
-       help="Fraction of the paper's number of missions. A folder can be extended "
-            "to a larger fraction.")  # fmt: skip
-@_what("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
+       help="Fraction of the paper's number of missions. A folder can be extended to a larger "
+            "fraction.")  # fmt: skip
+@_what("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
-@_execution("--jobs", type=JOBS,
-            help="Number of parallel missions  [one per core].")  # fmt: skip
+@_execution("--jobs", type=JOBS, help="Number of parallel missions  [one per core].")
 @_execution("--whole", is_flag=True,
             help="Fly every mission from its start, as for `mavfi campaign run`.")  # fmt: skip
-@_output("--out", type=OUT, default=Path("reproduction"),
-         show_default=True, help="Parent of one folder per stack.")  # fmt: skip
+@_output("--out", type=OUT, default=Path("reproduction"), help="Parent of one folder per stack.")
 @_output("--json", "as_json", is_flag=True, help="Print the tables and their folder as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")
 def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
@@ -58,7 +54,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     with missions_view(quiet=quiet) as view:
         run(
             plan,
-            Options(jobs=options["jobs"] or 0, whole=options["whole"]),
+            Options(**given_fields(Options)),
             view,
             lambda forecast: view.on_note(forecast.summary),
         )
@@ -78,14 +74,13 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
 @click.command(cls=GroupedCommand)
 @click.argument("places", nargs=-1, required=True, metavar="DIR...",
                 type=click.Path(path_type=Path))  # fmt: skip
-@click.option("-o", "--output", required=True, metavar="FILE", help="HTML file to write.",
-              type=OutFile())  # fmt: skip
-@click.option("--upsets", type=UPSETS, default=1.0, show_default=True,
-              help="Bit flips per hour that reach the injection sites, for the table of "
-                   "failures per flight hour.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True,
-              help="Print the file, its number of missions and the count of each verdict as "
-                   "JSON.")  # fmt: skip
+@option("-o", "--output", required=True, metavar="FILE", help="HTML file to write.", type=OutFile())
+@option("--upsets", type=UPSETS, default=1.0,
+        help="Bit flips per hour that reach the injection sites, for the table of failures per "
+             "flight hour.")  # fmt: skip
+@option("--json", "as_json", is_flag=True,
+        help="Print the file, its number of missions and the count of each verdict as "
+             "JSON.")  # fmt: skip
 def report(places: tuple[Path, ...], output: Path, upsets: float, as_json: bool) -> None:
     """Write one HTML file: the paper's claims, tables and figures beside flown missions.
 

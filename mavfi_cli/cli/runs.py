@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand
-from mavfi_cli.cli.parameters import NUMBER, OUT, RunPath
+from mavfi_cli.cli.grouped import GroupedCommand, option
+from mavfi_cli.cli.types import NUMBER, OUT, RunPath
 from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
@@ -20,13 +20,13 @@ _ACTIVATION_SECTIONS = ("events", "fault")  # sections that also name the reader
 
 @click.command(cls=GroupedCommand)
 @click.argument("run", type=RunPath())
-@click.option("--json", "as_json", is_flag=True, help="Print result.json unchanged.")
-@click.option("--pair", is_flag=True,
-              help="Fly the golden run of the pair, keep it, and report what the fault "
-                   "changed.")  # fmt: skip
-@click.option("--events", is_flag=True, help="Add a list of all events of the flight.")
-@click.option("--picture", metavar="FILE", type=OutFile(PICTURES),
-              help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
+@option("--json", "as_json", is_flag=True, help="Print result.json unchanged.")
+@option("--pair", is_flag=True,
+        help="Fly the golden run of the pair, keep it, and report what the fault "
+             "changed.")  # fmt: skip
+@option("--events", is_flag=True, help="Add a list of all events of the flight.")
+@option("--picture", metavar="FILE", type=OutFile(PICTURES),
+        help="Draw the flight from above into this .svg, .pdf or .png file.")  # fmt: skip
 def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | None) -> None:
     """Summarise RUN, a run folder."""
     from mavfi_cli.core.files import reading
@@ -65,19 +65,18 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
 
 @click.command(cls=GroupedCommand)
 @click.argument("run", type=RunPath())
-@click.option("--mission", "number", type=NUMBER, metavar="NUMBER",
-              help="Repeat this mission of RUN, the folder or exported .parquet file of a "
-                   "campaign.")  # fmt: skip
-@click.option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
-@click.option("--out", type=OUT, default=Path("runs"),
-              show_default=True, help="Parent of the new run folder.")  # fmt: skip
-@click.option("--firmware", metavar="PATH",
-              help="SITL binary to trust. The binary that RUN names runs only if it is this one "
-                   "or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
-@click.option("--gdb", is_flag=True,
-              help="Instruction level: stop the node at the injected instruction and wait for a "
-                   "debugger. The activation is then neither tracked nor compared.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
+@option("--mission", "number", type=NUMBER, metavar="NUMBER",
+        help="Repeat this mission of RUN, the folder or exported .parquet file of a "
+             "campaign.")  # fmt: skip
+@option("--without-fault", is_flag=True, help="Fly the golden run of the pair instead.")
+@option("--out", type=OUT, default=Path("runs"), help="Parent of the new run folder.")
+@option("--firmware", metavar="PATH",
+        help="SITL binary to trust. The binary that RUN names runs only if it is this one or that "
+             "of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
+@option("--gdb", is_flag=True,
+        help="Instruction level: stop the node at the injected instruction and wait for a "
+             "debugger. The activation is then neither tracked nor compared.")  # fmt: skip
+@option("--json", "as_json", is_flag=True, help="Print the comparison as JSON.")
 def replay(
     run: Path, number: int | None, out: Path, firmware: str | None, as_json: bool, **how: bool
 ) -> None:

@@ -8,53 +8,38 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, refuse_given
-from mavfi_cli.cli.parameters import (
-    ABOVE_ZERO,
-    AUTOPILOT,
-    DETECTOR,
-    FIRST_SEED,
-    JOBS,
-    MISSIONS,
-    OUT,
-    SEED,
-    STACK,
-    WORLD,
-)
+from mavfi_cli.cli import types
+from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, refuse_given
 from mavfi_cli.core.terminal import echo
 
 _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 
 
 @click.command(cls=GroupedCommand)
-@click.option("--out", type=OUT, default=Path("training"),
-              show_default=True, help="Folder for flights, data set and models.")  # fmt: skip
-@click.option("--stack", type=STACK, default="mavbench", show_default=True, metavar="NAME|FILE",
-              help="Stack to fly and to fit models for; `mavfi stacks` lists them.")  # fmt: skip
-@click.option("--world", "worlds", multiple=True, type=WORLD, metavar="NAME|FILE",
-              help="World; may be repeated  [the paper's four: two densities, two "
-                   "sizes].")  # fmt: skip
-@click.option("--flights", type=MISSIONS, default=25, show_default=True,
-              help="Flights per world.")  # fmt: skip
-@click.option("--first-seed", default=10_000, show_default=True, type=FIRST_SEED,
-              help="Seed of the first flight; each further flight adds 1.")  # fmt: skip
-@click.option("--autopilot", type=AUTOPILOT, default="ours", show_default=True,
-              metavar="ours|px4|ardupilot",
-              help="Autopilot that flies the missions.")  # fmt: skip
-@click.option("--firmware", metavar="PATH",
-              help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
-@click.option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
-              help="Do not fly; fit to the error-free flights among the run folders in this "
-                   "folder. Any autopilot may have flown them.")  # fmt: skip
-@click.option("--kind", "kinds", multiple=True, type=DETECTOR,
-              help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
-@click.option("--n-sigma", type=ABOVE_ZERO, help="Threshold of the Gaussian model  [its default].")
-@click.option("--seed", default=1, show_default=True, type=SEED,
-              help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
-@click.option("--jobs", type=JOBS,
-              help="Number of parallel missions  [one per core].")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the provenance of the models as JSON.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+@option("--out", type=types.OUT, default=Path("training"),
+        help="Folder for flights, data set and models.")  # fmt: skip
+@option("--stack", type=types.STACK, default="mavbench", metavar="NAME|FILE",
+        help="Stack to fly and to fit models for; `mavfi stacks` lists them.")  # fmt: skip
+@option("--world", "worlds", multiple=True, type=types.WORLD, metavar="NAME|FILE",
+        help="World; may be repeated  [the paper's four: two densities, two sizes].")  # fmt: skip
+@option("--flights", type=types.MISSIONS, default=25, help="Flights per world.")
+@option("--first-seed", default=10_000, type=types.FIRST_SEED,
+        help="Seed of the first flight; each further flight adds 1.")  # fmt: skip
+@option("--autopilot", type=types.AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",
+        help="Autopilot that flies the missions.")  # fmt: skip
+@option("--firmware", metavar="PATH",
+        help="SITL binary of px4 or ardupilot  [$PX4_SITL or $ARDUCOPTER_SITL].")  # fmt: skip
+@option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
+        help="Do not fly; fit to the error-free flights among the run folders in this folder. Any "
+             "autopilot may have flown them.")  # fmt: skip
+@option("--kind", "kinds", multiple=True, type=types.DETECTOR,
+        help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
+@option("--n-sigma", type=types.ABOVE_ZERO, help="Threshold of the Gaussian model  [its default].")
+@option("--seed", default=1, type=types.SEED,
+        help="Seed of the split and of the autoencoder's initial weights.")  # fmt: skip
+@option("--jobs", type=types.JOBS, help="Number of parallel missions  [one per core].")
+@option("--json", "as_json", is_flag=True, help="Print the provenance of the models as JSON.")
+@option("--quiet", is_flag=True, help="No progress on stderr.")
 def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Fly error-free missions and fit the detectors to them.
 
@@ -63,27 +48,21 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
-    from mavfi_cli.detect.fit import KINDS
     from mavfi_cli.report.detectors import draw_loss_curve
     from mavfi_cli.report.drawing import write_figure
     from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
-    from mavfi_cli.studies.train import TRAINING_WORLDS, TrainingPlan
+    from mavfi_cli.studies.train import TrainingPlan
     from mavfi_cli.studies.train import train as run
 
-    flown, stack, autopilot = (options[name] for name in ("flown", "stack", "autopilot"))
-    if autopilot == OWN_AUTOPILOT:
+    flown, stack = options["flown"], options["stack"]
+    if options["autopilot"] == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
     if flown is not None:
         refuse_given(_FLYING, "has no effect with --flown")
-    named = ("flights", "first_seed", "seed", "n_sigma", "flown")
-    plan = TrainingPlan(
-        worlds=options["worlds"] or TRAINING_WORLDS,
-        kinds=options["kinds"] or KINDS,
-        base=MissionConfig(stack=stack, autopilot=autopilot, firmware=options["firmware"]),
-        **{name: options[name] for name in named},
-    )
+    base = MissionConfig(**given_fields(MissionConfig, seed=MissionConfig().seed))
+    plan = TrainingPlan(**given_fields(TrainingPlan, base=base))
     with missions_view(quiet=quiet) as view:
-        dataset, models, left = run(plan, out, Options(jobs=options["jobs"] or 0), view)
+        dataset, models, left = run(plan, out, Options(**given_fields(Options)), view)
     if "aad" in models:
         model, _ = models["aad"]
         write_figure(draw_loss_curve(model.provenance["loss_curve"]["rows"]), out / "loss.svg")

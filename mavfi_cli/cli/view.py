@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand
-from mavfi_cli.cli.parameters import RunPath
+from mavfi_cli.cli.grouped import GroupedCommand, option
+from mavfi_cli.cli.types import RunPath
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import reading
 from mavfi_cli.core.option_types import OutFile
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 @click.command(cls=GroupedCommand)
 @click.argument("run", type=RunPath())
-@click.option("--save", metavar="FILE", type=OutFile((".rrd", ".mcap")),
-              help="Write a file instead of opening a window: .rrd for rerun, .mcap for "
-                   "Foxglove.")  # fmt: skip
-@click.option("--layout", metavar="FILE.json", type=OutFile((".json",)),
-              help="With --save FILE.mcap: also write a layout that Foxglove imports.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True,
-              help="With --save: print the file and its flights as JSON.")  # fmt: skip
+@option("--save", metavar="FILE", type=OutFile((".rrd", ".mcap")),
+        help="Write a file instead of opening a window: .rrd for rerun, .mcap for "
+             "Foxglove.")  # fmt: skip
+@option("--layout", metavar="FILE.json", type=OutFile((".json",)),
+        help="With --save FILE.mcap: also write a layout that Foxglove imports.")  # fmt: skip
+@option("--json", "as_json", is_flag=True,
+        help="With --save: print the file and its flights as JSON.")  # fmt: skip
 def view(run: Path, save: Path | None, layout: Path | None, as_json: bool) -> None:
     """Show RUN, a run folder, in rerun: world, camera, map, plans, path and all states over time.
 

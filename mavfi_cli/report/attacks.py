@@ -71,7 +71,7 @@ def _share_entry(share: Share) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TargetCounts:
+class _TargetCounts:
     """The counts of one target; shares are those of the *injected* runs."""
 
     null_runs: NullRuns
@@ -81,7 +81,7 @@ class TargetCounts:
     activation: dict[str, int]
 
     @classmethod
-    def of(cls, runs: TargetRuns) -> TargetCounts:
+    def of(cls, runs: TargetRuns) -> _TargetCounts:
         """Count the runs of a target."""
         records = runs.records
         reasons = (entry["not_injected_reason"] for entry in records)
@@ -139,7 +139,7 @@ class TargetCounts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KernelCounts:
+class _KernelCounts:
     """The runs of a kernel with their counts.
 
     Attributes:
@@ -150,13 +150,13 @@ class KernelCounts:
 
     kernel: Kernel
     runs: TargetRuns
-    counts: TargetCounts
+    counts: _TargetCounts
     noticeable: Share
     sdc: list[float | None]
     parts: dict[str, list[float]]
 
     @classmethod
-    def of(cls, runs: TargetRuns) -> KernelCounts:
+    def of(cls, runs: TargetRuns) -> _KernelCounts:
         """Count the runs of a kernel."""
         assert isinstance(runs.target, KernelTarget)
         sizes = [entry["magnitude"] for entry in _with(runs.records, RunOutcome.SDC)]
@@ -169,7 +169,7 @@ class KernelCounts:
         return cls(
             kernel=catalogue.find(runs.target.kernel),
             runs=runs,
-            counts=TargetCounts.of(runs),
+            counts=_TargetCounts.of(runs),
             noticeable=_share(runs, noticeable),
             sdc=[magnitude["relative"] for magnitude in sizes],
             parts={name: sorted(own) for name, own in parts.items()},
@@ -237,7 +237,7 @@ class KernelsSummary:
 
     plan: dict[str, Any]
     sampling: str
-    kernels: list[KernelCounts]
+    kernels: list[_KernelCounts]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, the contents of `kernels.json`."""
@@ -270,7 +270,7 @@ class ProgramSummary:
     runs: TargetRuns
     sampling: str
     seed: int
-    counts: TargetCounts
+    counts: _TargetCounts
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as `--json` prints them."""
@@ -316,10 +316,10 @@ def summarise(plan: Plan, campaign: Sequence[TargetRuns]) -> KernelsSummary | Pr
     """Summarise a campaign on kernels or on a program."""
     sampling, first = plan.strategy().name, campaign[0]
     if isinstance(first.target, KernelTarget):
-        kernels = [KernelCounts.of(runs) for runs in campaign]
+        kernels = [_KernelCounts.of(runs) for runs in campaign]
         return KernelsSummary(plan=plan.to_json(first.target), sampling=sampling, kernels=kernels)
     return ProgramSummary(
-        runs=first, sampling=sampling, seed=plan.seed, counts=TargetCounts.of(first)
+        runs=first, sampling=sampling, seed=plan.seed, counts=_TargetCounts.of(first)
     )
 
 
@@ -478,7 +478,7 @@ def _small(share: float) -> str:
     return f"{share:.1f}" if share >= 0.05 else "< 0.1"
 
 
-def _tick(kernel: KernelCounts) -> str:
+def _tick(kernel: _KernelCounts) -> str:
     return f"{kernel.kernel.title}\nn = {kernel.counts.outcomes['benign'].total}"
 
 

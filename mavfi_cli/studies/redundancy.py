@@ -197,8 +197,8 @@ class RedundancyPlan:
     vehicles: Sequence[ModelVehicle]
     choices: Choices
     worlds: tuple[str, ...] = WORLDS
-    missions: int
-    first_seed: int
+    missions: int = 10
+    first_seed: int = 1
     folder: Path
     models: Path | None = None
     train: int = 0

@@ -7,7 +7,7 @@ from click.shell_completion import ShellComplete
 from mavfi_cli import cli, studies
 from mavfi_cli.attack import campaign as attacks
 from mavfi_cli.campaigns import begin, run
-from mavfi_cli.cli.parameters import Name
+from mavfi_cli.cli.types import Name
 from mavfi_cli.core.option_types import OutFile, OutFolder
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.paper import flying

@@ -14,6 +14,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from mavfi_cli.cli.grouped import names_in
 from mavfi_cli.core.compiled import PACKAGE
 from mavfi_cli.core.option_types import Number, OutFolder
 
@@ -37,12 +38,12 @@ UPSETS = Number(0.0, 1.0e12)
 Names = str | Callable[[click.Context], Iterable[str]]
 
 
-class Name(click.ParamType[str]):
+class Name(click.ParamType[Any]):
     """A name that the shell completes. The program itself rejects unknown names.
 
     Args:
         names: Sources of names: MODULE:ATTRIBUTE, or a function of the options given so far.
-        several: Names are separated by commas.
+        several: Names are separated by commas; the value is a tuple.
         files: A path is accepted in place of a name.
     """
 
@@ -50,6 +51,10 @@ class Name(click.ParamType[str]):
 
     def __init__(self, *names: Names, several: bool = False, files: bool = False) -> None:
         self._names, self._several, self._files = names, several, files
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the name, or the names."""
+        return names_in(value) if self._several and isinstance(value, str) else value
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
