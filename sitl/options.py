@@ -128,7 +128,7 @@ class ServerOptions:
     help="MAVLink system id that may command; repeatable  [all].",
 )  # fmt: skip
 def _sitl() -> None:
-    """Run a simulated quadrotor that speaks MAVLink as a PX4 does."""
+    """Run a simulated quadrotor that speaks MAVLink like PX4."""
 
 
 def parse(arguments: Sequence[str]) -> ServerOptions:

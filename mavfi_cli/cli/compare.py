@@ -30,8 +30,8 @@ _output = section("Output")
            help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
 @_missions("--jobs", type=types.JOBS, help="Number of parallel missions  [one per core].")
 @_settings("--inject", type=types.TARGETS, metavar="TARGET,TARGET",
-           help="Stages, states or groups to corrupt, one per mission; none flies golden runs "
-                "only  [perception,planning,control].")  # fmt: skip
+           help="Stages, states or groups to corrupt, one per mission; none flies only "
+                "golden runs  [perception,planning,control].")  # fmt: skip
 @_settings("--field", type=types.FIELD, help="Field of the bits: sign, exponent, mantissa  [any].")
 @_settings("--seed", default=1, type=types.SEED, help="Seed of the faults.")
 @_settings("--detector", "detectors", type=types.DETECTORS, metavar="NAME,NAME",

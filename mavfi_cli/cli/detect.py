@@ -25,7 +25,7 @@ def detect() -> None:
 
 
 @detect.command("list")
-@option("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
+@option("--models", type=_FOLDER, help="Folder of model files NAME.json  [shipped models].")
 @option("--json", "as_json", is_flag=True, help="Print as JSON, with the full provenance.")
 def list_(models: Path | None, as_json: bool) -> None:
     """List the detectors with the model file, stack, threshold and origin of each."""
@@ -80,7 +80,7 @@ _output = section("Output")
 @_fault("--seed", default=1, type=types.SEED, help="Seed of the faults.")
 @_detector("--detector", "detectors", type=types.DETECTORS, metavar="NAME,NAME",
            help="Detectors to evaluate  [none,range,l2,gad,aad].")  # fmt: skip
-@_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [the shipped].")
+@_detector("--models", type=_FOLDER, help="Folder of model files NAME.json  [shipped models].")
 @_detector("--protect", type=types.STAGES, default="perception,planning,control",
            help="Stages that the detectors watch.")  # fmt: skip
 @_output("--out", type=types.OUT, default=Path("evaluation"),

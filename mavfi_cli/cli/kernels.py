@@ -57,7 +57,7 @@ _output = section("Output")
 @_native("--ignore-lines", multiple=True, metavar="REGEX",
          help="Do not compare lines that contain a match. May be repeated.")  # fmt: skip
 @_native("--folder", type=click.Path(exists=True, file_okay=False, path_type=Path),
-         help="Folder that each run works in a copy of  [an empty folder].")  # fmt: skip
+         help="Folder of which each run gets a copy to work in  [an empty folder].")  # fmt: skip
 @_native("--env", multiple=True, metavar="NAME=VALUE",
          help="Environment variable of the program. May be repeated.")  # fmt: skip
 @_native("--memory", default=2.0, metavar="GB", type=types.ABOVE_ZERO,

@@ -28,7 +28,7 @@ _output = section("Output")
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
 @_execution("--jobs", type=JOBS, help="Number of parallel missions  [one per core].")
 @_execution("--whole", is_flag=True,
-            help="Fly every mission from its start, as for `mavfi campaign run`.")  # fmt: skip
+            help="Fly every mission from its start, as in `mavfi campaign run`.")  # fmt: skip
 @_output("--out", type=OUT, default=Path("reproduction"), help="Parent of one folder per stack.")
 @_output("--json", "as_json", is_flag=True, help="Print the tables and their folder as JSON.")
 @_output("--quiet", is_flag=True, help="No progress on stderr.")

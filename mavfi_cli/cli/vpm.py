@@ -58,10 +58,10 @@ _output = section("Output")
 @_flights("--first-seed", type=click.IntRange(0, 2**31 - 200_000), default=1,
           help="Seed of the first mission; each further mission adds 1.")  # fmt: skip
 @_flights("--models", type=click.Path(path_type=Path, file_okay=False, exists=True),
-          help="Folder of detector models NAME.json  [the shipped].")  # fmt: skip
+          help="Folder of detector models NAME.json  [the shipped models].")  # fmt: skip
 @_flights("--train", type=click.IntRange(0, types.MISSIONS.max), show_default=False, default=0,
           metavar="FLIGHTS",
-          help="First fit the detectors for each vehicle to this many error-free flights of each "
+          help="First fit the detectors for each vehicle to this many error-free flights in each "
                "training world at its safe velocity  [0: none].")  # fmt: skip
 @_flights("--jobs", type=types.JOBS, help="Number of parallel missions  [one per core].")
 @_flights("--quiet", is_flag=True, help="No progress on stderr.")
@@ -82,8 +82,9 @@ def vpm(
 
     The report contains the safe velocity, flight time and energy of each.
 
-    In the F-1 visual performance model a vehicle flies as fast as it can stop within its sensing
-    range. A copy of the computer adds mass and power. Detection and recovery adds compute time.
+    In the F-1 visual performance model a vehicle flies as fast as it can without losing the ability
+    to stop within its sensing range. A copy of the computer adds mass and power. Detection and
+    recovery adds compute time.
     """
     from mavfi_cli.campaigns.specification import require_named
     from mavfi_cli.report import model as views
