@@ -77,7 +77,7 @@ class Client(Peer):
         self.texts: deque[bytes] = deque(maxlen=_MOST_TEXTS)
 
     def rejoin(self) -> None:
-        """Begin again with the preset's streams, after the simulation has restarted."""
+        """Reset to the preset's streams after the simulation has restarted."""
         self.link = self._simulation.autopilot.open_link(self._preset)
 
     def close(self) -> None:

@@ -37,7 +37,7 @@ NOT_SCALED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSetup:
-    """What a vehicle flies with under a scheme, as far as its flights are compared with the model.
+    """The parameters of a vehicle under a scheme that the comparison with the model needs.
 
     Attributes:
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
@@ -56,8 +56,9 @@ class FlightSetup:
     def energy_j(self, flights: pa.Table) -> FloatArray:
         """Electrical energy of rotors and boards for each flight, (n,); NaN if it has none.
 
-        Shaft energy times the model's hover power over the simulated vehicle's, which is the same
-        for any number of boards, plus the boards' power times the flight time.
+        It is the shaft energy, scaled by the ratio of the model's hover power to the simulated
+        vehicle's, plus the boards' power times the flight time. The ratio is the same for any
+        number of boards.
         """
         shaft_j, hover_w, time_s = (
             numbers(flights, name)
@@ -68,7 +69,7 @@ class FlightSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelAndFlights:
-    """A number of the model and of its flights, with the difference over the model's."""
+    """A number in the model and in its flights, with the difference relative to the model."""
 
     model: float
     flights: Interval
@@ -76,7 +77,7 @@ class ModelAndFlights:
 
     @classmethod
     def of(cls, model: float, flights: Interval) -> ModelAndFlights:
-        """Compare two numbers."""
+        """Compare the model's number with that of its flights."""
         difference = 100.0 * (flights.value / model - 1.0)
         return cls(model=model, flights=flights, difference_percent=difference)
 

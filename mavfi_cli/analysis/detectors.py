@@ -83,12 +83,12 @@ class ErrorFreeRow:
     Attributes:
         by, value: label by which the flights are grouped, and its value.
         hours: flight time with the detector, from take-over to the end of the mission.
-        alarms, episodes: all alarms, and consecutive ones as one.
+        alarms, episodes: number of alarms; the same with consecutive alarms counted once.
         alarms_per_hour: bootstrap over flights; with no alarm at all, a Poisson upper limit.
         with_alarm: flights with at least one.
-        lost: golden successes that failed with the detector; gained: the other way round.
+        lost, gained: golden successes that fail with the detector; golden failures that succeed.
         success: golden first.
-        lengthening: median of flight time over golden flight time, minus 1, of both successful.
+        lengthening: median of flight time over golden flight time, minus 1, where both succeed.
     """
 
     by: str
@@ -137,18 +137,19 @@ class FaultRow:
             `golden_failed` (the mission fails without the fault as well) and `active`.
         crashed: faults that killed a node, which are noticed without any detector.
         harmful: `lost` or `longer`.
-        flown: with this detector: all harmful faults, and the harmless ones of complete missions.
+        flown: faults flown with this detector: all harmful ones, and the harmless ones of complete
+            missions.
         not_struck: those that never struck because the protected flight had diverged; they enter
             no rate of detection.
         latency_s, latency_s_p95: median and 95th percentile from strike to alarm, harmful faults.
         detected_harmful: with an alarm at or after the strike.
-        detected_active: the same of all faults of complete missions.
-        detected_inactive: the same of faults that were struck but not activated.
+        detected_active: the same for all faults of complete missions.
+        detected_inactive: the same for faults that struck but were not activated.
         by_chance: flights of complete missions that have an alarm in that time without their fault
             as well.
-        recovered: of the lost missions those that succeed with protection.
-        undone: of the harmful faults those that do no harm with it.
-        added: of the harmless faults those that do harm with it.
+        recovered: lost missions that succeed with the detector.
+        undone: harmful faults that do no harm with the detector.
+        added: harmless faults that do harm with the detector.
         unprotected: success rate of all missions with an active fault.
         protected: the same with the detector: `share`, `low` and `high` of harmful and harmless
             faults, each with its own rate, weighted by how many there are.
@@ -212,7 +213,7 @@ class DetectorComparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorCurves(Curves):
-    """The curves of a detector; `areas` of the faults of each group."""
+    """The curves of a detector; `areas` holds the area for each group of faults."""
 
     areas: list[dict[str, str | float]]
 
@@ -270,18 +271,18 @@ class Evaluation(DetectorResults):
 def pairs_of(
     flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
 ) -> tuple[pa.Table, pa.Table]:
-    """All pairs whose flights are complete: without faults, and with one.
+    """Return all pairs whose flights are complete: those without a fault, and those with one.
 
     Args:
         flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
         complete: whether all faults of the mission with this seed are flown with detectors.
 
     Returns:
-        Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and
-        something read it or may have. `judged`: also the golden flight succeeds. `struck`: the
-        protected flight was; otherwise there was nothing to detect. `seen`: it had an alarm at or
-        after the strike. `by_chance`: the detector also raises one after that time without the
-        fault.
+        Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and a
+        node read the value or may have. `judged`: the golden flight succeeds as well. `struck`: the
+        protected flight was struck too; otherwise there was nothing to detect. `seen`: it had an
+        alarm at or after the strike. `by_chance`: the detector also raises one after that time
+        without the fault.
     """
     rows = [row for table in flights for row in _rows_of(table)]
     alarms = [row.pop("all_alarms") for row in rows]

@@ -142,7 +142,7 @@ def untreated(labels: Labels) -> str:
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """The rows that have these values. None matches empty cells, a tuple any of its items."""
+    """The rows with these values. None matches empty cells; a tuple matches any of its items."""
     for name, value in values.items():
         allowed = value if isinstance(value, tuple) else (value,)
         equal = (

@@ -147,7 +147,7 @@ class ComputeOverhead:
 
     @property
     def checks_host_share(self) -> float:
-        """Checks over kernel time on the host, whose workload is far below the paper's."""
+        """Time of checks over time of kernels on the host; the kernels do less than the paper's."""
         return self.detection_s / self.host_compute_s
 
     @classmethod

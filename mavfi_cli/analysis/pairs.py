@@ -98,13 +98,13 @@ class Flights:
         lost: whether the mission did not end in success.
         ended: whether the fault ended a node, by a crash or a hang.
     Of its golden flight:
-        own_lost: whether that is lost; empty if it is not there.
+        own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.
         over_own: flight time over it; empty if one of the two is lost.
         added_s: flight time beyond it; empty if one of the two is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
-    Of the flight with the same fault and no detector, empty if that is not there: bare_struck,
+    Of the flight with the same fault and no detector, empty without such a flight: bare_struck,
     bare_ended, bare_lost, bare_over_own, bare_harmed.
     """
 
@@ -121,7 +121,7 @@ class Flights:
 
     @classmethod
     def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
-        """The missions of several, each once; None means all stacks."""
+        """The missions of several tables, each mission once; None means all stacks."""
         own = [each.table.select(_NOTHING_FLOWN.column_names) for each in several]
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
@@ -156,7 +156,7 @@ class Flights:
     # Rows
 
     def where(self, chosen: Iterable[bool]) -> Flights:
-        """The flights that are chosen, (n,)."""
+        """The flights for which `chosen` (n,) is true."""
         return Flights(self.table.filter(pa.array(chosen, pa.bool_())))
 
     def chosen(self, **values: Any) -> Flights:
@@ -235,7 +235,7 @@ class Flights:
         return self.grouped(zip(*map(self.__getitem__, names), strict=True))
 
     def grouped(self, keys: Iterable[Any]) -> dict[Any, Flights]:
-        """The flights of each key, in the order of their first flights; a key for each flight."""
+        """The flights by key, in the order of their first flights, given the key of each flight."""
         places: dict[Any, list[int]] = {}
         for place, key in enumerate(keys):
             places.setdefault(key, []).append(place)
@@ -244,7 +244,7 @@ class Flights:
     # Numbers
 
     def share(self, column: str = "lost", *, value: bool = True, clustered: bool = False) -> Share:
-        """The share in which a column has a value, among those in which it is not empty.
+        """The share of flights in which a column has a value, among those where it is not empty.
 
         Args:
             clustered: whether the interval has the design effect of missions of one seed.
@@ -257,7 +257,7 @@ class Flights:
 
     @property
     def ratios(self) -> FloatArray:
-        """Times over those of the golden flights of the same missions, where both succeed."""
+        """Flight times over those of the missions' golden flights, where both succeed."""
         return self.known("over_own")
 
     @property
@@ -403,7 +403,7 @@ def partners(
 
 
 def paired(rows: pa.Table, others: pa.Table, on: Sequence[str]) -> tuple[pa.Table, pa.Table]:
-    """Return the rows that have a partner, and beside each its partner; see `partners`."""
+    """Return the rows that have a partner, and the partners row by row; see `partners`."""
     places = partners(rows, others, on)
     return rows.filter(places >= 0), others.take(places[places >= 0])
 

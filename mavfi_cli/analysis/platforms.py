@@ -229,12 +229,12 @@ class CostDifference:
     """The additional cost of the same faults compared with the reference platform.
 
     Attributes:
-        pairs: faults that both platforms have a cost of.
-        differ: how many of them have another cost.
-        extra_s: mean difference of costs, and `p_value` of it, by missions.
-        p95_ratio: of the 95th percentiles over own golden.
-        largest_ratio: of the largest over own golden, of all flights of each platform.
-        longest_ratio: of the longest in seconds, of all flights of each platform.
+        pairs: faults that have a cost on both platforms.
+        differ: how many of them have different costs.
+        extra_s, p_value: mean difference of costs and its p-value, by missions.
+        p95_ratio: ratio of the 95th percentiles of flight time over own golden flight.
+        largest_ratio: the same ratio of the largest values, over all flights of each platform.
+        longest_ratio: ratio of the longest flight times, over all flights of each platform.
     """
 
     platform: str
@@ -290,7 +290,7 @@ class PlatformFigures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedTimelines:
-    """Timelines of one mission on all platforms that answered."""
+    """Timelines of one mission, on the platforms whose flight reacted to a frame."""
 
     seed: int
     platforms: list[Timeline]
@@ -446,7 +446,7 @@ class FaultCosts:
     def row(self, platform: str, setting: str, bare: FaultCosts) -> CostRow:
         """The cost of a setting's faults on a platform.
 
-        Several faults of one mission are no independent samples: intervals draw missions.
+        Several faults of one mission are not independent, so the intervals resample missions.
 
         Args:
             bare: the same without a detector on this platform, the reference of recovery.

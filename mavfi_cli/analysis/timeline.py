@@ -56,7 +56,7 @@ class Timeline:
 
 
 def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
-    """Return the timelines of the platforms whose flight reacted to a frame, equally long.
+    """Return timelines of equal length for the platforms whose flight reacted to a frame.
 
     Args:
         runs: runs with time table and trace, by platform.

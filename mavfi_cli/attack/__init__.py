@@ -1,1 +1,1 @@
-"""Attacks on native code, one fault a run: one driver for kernels, nodes, programs and plug-ins."""
+"""Attacks on native code: one driver for kernels, nodes, programs and plug-ins."""

@@ -1,6 +1,6 @@
 """Runs many faults on each of several targets: golden run, profile, fault list, runs.
 
-Fault number i of a target depends on the seed, the target's own stream and i only. So the results
+Fault number i of a target depends only on the seed, the target's own stream and i. So the results
 depend neither on the number of workers nor on the other targets. A target with several inputs uses
 them in rotation: fault i strikes input i modulo their number. A worker process keeps a target open
 and runs its faults in order.

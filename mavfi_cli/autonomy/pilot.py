@@ -1,4 +1,4 @@
-"""The mission state machine. It decides when to plan, fly on, slow down, stop and give up.
+"""The mission state machine. It decides when to plan, continue, slow down, stop and give up.
 
 Its inputs are messages: collision reports, planned trajectories and the vehicle's state. Its output
 is what to track (the trajectory, the point on it, the rate of its clock), and a request for a new

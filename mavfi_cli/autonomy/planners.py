@@ -1,12 +1,12 @@
-"""The planning stage: search a path, shorten it, smooth it into a trajectory.
+"""The planning stage: search for a path, shorten it, smooth it into a trajectory.
 
 Other packages register planners as entry points `mavfi.planners`. Ours are OMPL's: RRT* (Karaman
 and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
 
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
-search resets that sequence first and creates its generators afterwards, so its result depends on
-problem and seed only. OMPL warns that earlier generators keep their seeds; none of them is used.
-The search stops after a number of iterations, never after a time.
+search resets that sequence first and creates its generators afterwards, so its result depends only
+on problem and seed. OMPL warns that earlier generators keep their seeds; none of them is used. The
+search stops after a number of iterations, never after a time.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class PlanResult:
 
 
 class Planner(Protocol):
-    """A path planner whose result depends on problem and seed only."""
+    """A path planner whose result depends only on problem and seed."""
 
     @property
     def name(self) -> str:

@@ -8,8 +8,8 @@ The velocity is continuous. The norms of velocity and acceleration keep their li
 because the velocity inside a blend is a convex combination of the velocities at its ends.
 
 The samples of this motion at equal times are the control points of a uniform quadratic B-spline,
-and the knots of the spline are the waypoints. Interpolated as in `tracking`
-(p + v t + a t^2 / 2), the waypoints are exactly that spline. Between the waypoints, too:
+and the knots of the spline are the waypoints. Interpolated as in `tracking` (p + v t + a t^2 / 2),
+the waypoints are exactly that spline. Between the waypoints, the following holds as well:
 
 - speed and acceleration never exceed those of the motion that was sampled: each is an average
   of it;

@@ -93,7 +93,8 @@ class AttemptEnd:
             limit_s: its limit of wall time, s.
 
         Raises:
-            CampaignStopped: the machine keeps missions from being flown: a full disk.
+            CampaignStopped: the machine cannot fly any mission, for example because the disk is
+                full.
         """
         report = self.report or {}
         if self.exit == 0 and "folder" in report:
@@ -126,7 +127,7 @@ Attempt = tuple[int, Changes, Path]  # number of a mission, what it changes, own
 
 
 class LocalWorkers:
-    """Keeps up to `jobs` flights flying."""
+    """Runs up to `jobs` flights at a time."""
 
     def __init__(self, jobs: int, module: str = TASK) -> None:
         self._jobs = jobs
@@ -168,7 +169,7 @@ class LocalWorkers:
         self._flying[channel] = [number for number, _, _ in attempts]
 
     def halt(self) -> None:
-        """Let shared flights fork no further mission."""
+        """Stop shared flights from forking further missions."""
         for folder in self._shared.values():
             with contextlib.suppress(OSError):
                 (folder / HALT).touch()

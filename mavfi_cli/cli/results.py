@@ -1,4 +1,4 @@
-"""The files and the output of a command that answers with one result."""
+"""Write and print the result of a command that computes one result."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ class Executor:
 
     Attributes:
         draw_latency_s: Function from a node's name to the latency of its next invocation, s.
-        cores: Maximum number of concurrent nodes; the others wait in the order of their requests.
+        cores: Maximum number of concurrent nodes; others wait in the order of their requests.
         compute_first: Draw an invocation's latency after its computation.
         restart_s: Simulated time from a node's end until its successor is ready, s.
         watchdog_s: Simulated time after which an unfinished invocation is killed, s.
@@ -217,7 +217,7 @@ class Executor:
         """Run a node that has already worked in a separate process, as `isolate`.
 
         Args:
-            fresh: Kernels that have not worked, by node, from which the process is restarted.
+            fresh: Unused kernels by node, from which the process is restarted.
         """
         self.isolate(name)
         for node, kernel in fresh.items():

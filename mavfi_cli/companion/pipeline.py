@@ -4,9 +4,9 @@
                                      |                            |  ^
                                      +------------> planner <-----+--+
 
-A line `output = self.publish(await self._node.run(value))` submits the value to a node and goes on
-after the node's latency in simulated time. Every output passes through `publish`, where a fault may
-strike it and the detector may withhold it. A withheld message ends the turn.
+A line `output = self.publish(await self._node.run(value))` submits the value to a node and
+continues after the node's latency in simulated time. Every output passes through `publish`, where a
+fault may strike it and the detector may withhold it. A withheld message ends the turn.
 """
 
 from __future__ import annotations

@@ -357,7 +357,7 @@ class Recovery:
         """Judge changes of the active plan since the last tick, before the mission logic uses it.
 
         A new plan or a new waypoint triggers a check of the whole plan ahead. In between, each tick
-        checks the present waypoint only, because 50 checks of the whole plan per second would cost
+        checks only the present waypoint, because 50 checks of the whole plan per second would cost
         an order of magnitude more.
 
         Args:
@@ -393,7 +393,7 @@ class Recovery:
             return
 
     def drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """Drop a waypoint from a plan, also where it is the active one. Return the new plan."""
+        """Drop a waypoint from a plan, even the active one. Return the new plan."""
         bridged = without_waypoint(flown, waypoint)
         self._replace(flown, bridged)
         return bridged

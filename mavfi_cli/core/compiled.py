@@ -149,7 +149,7 @@ def choose_caches() -> None:
     Machine code stays beside the sources if they are writable. Otherwise it goes to
     XDG_CACHE_HOME/mavfi, or else to a private folder for temporary files, which a line on stderr
     names when it is made. Child processes inherit the choice through NUMBA_CACHE_DIR and
-    MPLCONFIGDIR. Writable folders that the user chose by these variables stay.
+    MPLCONFIGDIR. Writable folders that the user chose with these variables are kept.
     """
     beside = PACKAGE / "core" / "__pycache__"
     if not (can_write(Path(os.environ.get("NUMBA_CACHE_DIR") or beside)) or can_write(beside)):
@@ -191,7 +191,7 @@ def _folder() -> Path:
 
 
 def can_write(folder: Path) -> bool:
-    """Return True if a folder is writable, or can be made."""
+    """Return True if a folder is writable, or can be created."""
     place = folder.absolute()
     while place != place.parent and not os.path.lexists(place):
         place = place.parent

@@ -239,10 +239,10 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Check that a folder can be made and written, before its contents are computed.
+    """Check that a folder can be created and written, before its contents are computed.
 
     Raises:
-        RecordError: Its name is not UTF-8, as tables require, or it cannot be made or written.
+        RecordError: Its name is not UTF-8, as tables require, or it cannot be created or written.
     """
     try:
         str(folder).encode()

@@ -12,10 +12,10 @@ guard. When it ends or its time runs out, the guard kills every process that it 
 then reports. When the client dies or closes the channel of an order, the guard kills the worker.
 Killing any process leaves no orphan and no blocked peer.
 
-The fork server of `multiprocessing` does not serve: its children keep the server's pipe open, so a
+The fork server of `multiprocessing` is not suitable: its children keep the server's pipe open, so a
 child that hangs outlives a killed client; every child imports the client's main module again;
-nothing reaps the processes that a child leaves; and daemonic processes, such as dask's workers,
-may not use it.
+nothing reaps the processes that a child leaves; and daemonic processes, such as dask's workers, may
+not use it.
 
 FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s",
 "forks"}, with the descriptor of a channel. The guard sends {"pid"} on this channel at the start,

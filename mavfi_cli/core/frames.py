@@ -26,7 +26,7 @@ def is_within(limit: float, values: Iterable[float]) -> bool:
 
 
 def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
-    """Return the dot product of two vectors (n,), summed in their order.
+    """Return the dot product of two vectors (n,), summed in the order of their elements.
 
     numpy's `@`, `dot` and `linalg.norm` use BLAS, whose last digit depends on the processor.
     """

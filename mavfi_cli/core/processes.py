@@ -28,7 +28,7 @@ def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
     """Do work in a fork of this process. It exits with the returned code, or 1 on an error.
 
     Args:
-        work: None lets the fork continue where this process is, with the result 0.
+        work: Work of the fork. None lets the fork return from this call with the result 0.
         exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
             memory. The process must have one thread.
 

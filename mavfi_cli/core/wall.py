@@ -9,7 +9,7 @@ class WallClock:
     """Host seconds by name: the total and the newest measurement.
 
     Attributes:
-        skipped_s: time that counts as no measurement, because the whole flight waited.
+        skipped_s: time that no measurement includes, because the whole flight waited.
     """
 
     def __init__(self) -> None:
@@ -18,7 +18,7 @@ class WallClock:
         self.newest: dict[str, float] = {}
 
     def measure(self, name: str) -> _Measurement:
-        """A context that adds the time of its block to a name."""
+        """Return a context that adds the time of its block to a name."""
         return _Measurement(self, name)
 
     def add(self, name: str, seconds: float) -> None:

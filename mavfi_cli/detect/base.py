@@ -124,7 +124,7 @@ class Model:
 
     @property
     def training_flights(self) -> list[str]:
-        """Flights `world/seed` that the model has seen, of all parts of its split."""
+        """Flights `world/seed` from which the model was made, over all parts of its split."""
         parts = self.provenance.get("split", {})
         if not isinstance(parts, Mapping):
             return []
@@ -275,7 +275,7 @@ class FittedDetector:
         stack: Stack of the flights that the model was fitted to; None without a model file.
         extended: Ranges of the extended states in these flights; None without a model file.
         tick_judge: `preprocess.take_tick` followed by scoring and learning as in the gate.
-        plan_judge: `preprocess.plan_deltas` and the score of each step that it finds.
+        plan_judge: `preprocess.plan_deltas` and the score of each step that it returns.
     """
 
     name: ClassVar[str]
@@ -311,7 +311,7 @@ class FittedDetector:
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
         """Create the detector of a model file; see `find_detector`.
 
-        Without a file it takes the one that is shipped for the default stack.
+        Without a file it uses the model that is shipped for the default stack.
         """
         path = shipped(cls.name) if model is None else model
         loaded = Model.read(path)

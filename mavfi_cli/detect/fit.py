@@ -5,7 +5,7 @@ Flights are split by seed into three disjoint parts: `train` fits weights, means
 
 Only the autoencoder needs torch: `pip install mavfi[train]`. Adam minimises the mean squared
 reconstruction error of all distinct error-free vectors in one batch, from several initial weights.
-The threshold will be a largest error, so the training keeps the weights, over all epochs and
+The threshold will be the largest error, so the training keeps the weights, over all epochs and
 starts, with the lowest largest error on the validation vectors. It runs on one thread in double
 precision with a fixed seed, so the same data and the same version of torch give the same weights.
 """

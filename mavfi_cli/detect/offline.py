@@ -9,8 +9,8 @@ monitored state by its name (NaN or masked before the first message with the sta
 columns `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s` identify a new message with
 unchanged values. Without them a message counts as new if one of its values changes.
 
-A trace holds the present waypoint only, but the gate also judges the active plan. The replay does
-this, too, if it gets the published plans and the changes that a fault made to the active one.
+A trace contains only the present waypoint, but the gate also judges the active plan. The replay
+does the same if it gets the published plans and the changes that a fault made to the active one.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def replay(
     Nothing is recomputed; the messages are those of the flight.
 
     Args:
-        detector: New detector; None computes the deltas only.
+        detector: New detector; None computes only the deltas.
         patience: Maximum number of consecutive alarms for one kind of message. The next message is
             accepted. With 0 every message becomes the reference, so that scores do not depend on
             the threshold.
@@ -316,7 +316,7 @@ class FlightSamples:
         """Extract the samples of a flight.
 
         Args:
-            plans: All published plans. The trace holds the flown waypoints only.
+            plans: All published plans. The trace contains only the flown waypoints.
         """
         params = params or PreprocessParams()
         judged = list(replay(trace, None, params))

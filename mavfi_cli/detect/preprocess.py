@@ -89,7 +89,7 @@ STATES_DIGEST = _digest([[s.name, s.stage.value, s.dtype.value, s.unit] for s in
 class PreprocessParams:
     """Floor exponent of each group of states, and the ceiling of `time_to_collision`.
 
-    A floor is about the largest change between two samples in error-free flight: 1.5 m between
+    A floor is close to the largest change between two samples in error-free flight: 1.5 m between
     waypoints, 0.1 m/s between commands 20 ms apart. A command changes by more only at the start or
     end of a plan.
     """
@@ -139,7 +139,7 @@ class PreprocessParams:
 
 
 def extended_codes(message: Message) -> list[tuple[int, int]]:
-    """Return place in EXTENDED and code of each extended state of a message."""
+    """Return the index in EXTENDED and the code of each extended state of a message."""
     return [
         (place, min(max(int(state.read(message, 0)), -LIMIT), LIMIT))
         for place, state in enumerate(EXTENDED)

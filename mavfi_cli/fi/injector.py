@@ -1,7 +1,7 @@
 """Applies a source-level fault to the messages between kernels.
 
 Every message passes through `pass_on` when it is published. The active plan also passes through
-`strike_latched` once a tick, because a fault may hit it at any time of its long life.
+`strike_latched` once a tick, because a fault may strike it at any time of its long life.
 
 A listener is called with a strike *before* the changed message is passed on, so that the record
 survives any effect of the fault.
@@ -107,7 +107,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strike:
-    """One time at which the fault acted."""
+    """One action of the fault on the mission."""
 
     stamp_s: float
     tick: int
@@ -405,7 +405,7 @@ class Activation(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """The first receiver that worked with a corrupted value, and when."""
+    """The first receiver that used a corrupted value, and when."""
 
     name: str
     stamp_s: float

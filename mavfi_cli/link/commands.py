@@ -1,6 +1,6 @@
 """MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
 
-The caller supplies the time. An acknowledgement names the command only, so the same command is
+The caller supplies the time. An acknowledgement names only the command, so the same command is
 never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
 """
 
@@ -161,7 +161,7 @@ class Commands:
         raise CommandRefused(f"autopilot refused {command}: {result}{quoted}")
 
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
-        """Send a command until it is accepted. Return True from then on.
+        """Send a command until it is accepted. Return True once it is.
 
         If an accepted command shows no effect, further calls send it again. Raises CommandRefused
         if it was refused permanently.

@@ -1,7 +1,7 @@
 """The peers at several endpoints: receives from and sends to them in turn, in bounded time.
 
 A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
-the number of peers and of their waiting bytes. The source address of a datagram may be false, and
+the number of peers and of their waiting bytes. The source address of a datagram may be forged, and
 replies then reach a host that has sent nothing. So a UDP peer gets all messages only for a short
 time after a valid frame, then fewer and fewer. It is forgotten after 30 s of silence.
 """

@@ -49,7 +49,7 @@ class Router:
     Args:
         autopilot: URL or open transport of the autopilot.
         companion: URL of the companion's link; a listening one takes several programs.
-        passes: Decides what goes on; None passes every frame.
+        passes: Decides which frames to pass on; None passes every frame.
         signing: Refuses frames without a good signature, on both sides.
         allow_unsigned: Allow an unsigned link to reach beyond this machine.
 

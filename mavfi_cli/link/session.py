@@ -176,7 +176,7 @@ class OffboardSession:
         self._answers += text_messages(dialect.MAV_SEVERITY_WARNING, data, self._texts)
 
     def start_camera(self, interval_s: float) -> None:
-        """Request a frame of the camera every `interval_s` without end."""
+        """Request a frame from the camera every `interval_s`, without end."""
         self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
             component=CAMERA, unused=math.nan, refusals=3,
@@ -243,7 +243,7 @@ class OffboardSession:
 
         Every tick has a setpoint, because OFFBOARD requires setpoints before its entry and a
         lockstep peer waits for them. ArduCopter is the exception: it has no such handshake and
-        aborts a take-off at a setpoint, so it gets setpoints in the OFFBOARD phase only.
+        aborts a take-off at a setpoint, so it gets setpoints only in the OFFBOARD phase.
         """
         self._now_s = self.telemetry.now_s = self._commands.now_s = stamp_s
         if self._phase_since_s is None:

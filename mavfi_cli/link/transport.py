@@ -98,7 +98,7 @@ class Listener(Protocol):
         """Return the descriptor that becomes readable when `accept_ready` may return peers."""
 
     def close(self) -> None:
-        """Stop listening. This closes UDP peers, too, because they share the socket."""
+        """Stop listening. This also closes UDP peers, because they share the socket."""
 
 
 def open_transport(
@@ -585,8 +585,8 @@ class _MemoryTransport(Transport):
 def signing_from_file(path: str | Path | None) -> Signing | None:
     """Return the signing with the passphrase in a file, on this host's clock; None without a file.
 
-    White space around the passphrase does not count. Raises ConfigError if the file cannot be read
-    or is empty.
+    White space around the passphrase is ignored. Raises ConfigError if the file cannot be read or
+    is empty.
     """
     if path is None:
         return None

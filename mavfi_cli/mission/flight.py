@@ -205,7 +205,7 @@ class Flight:
         return self.companion
 
     def take(self, config: MissionConfig, tlog: Path) -> None:
-        """Go on as another mission in a fork of the process, with another fault and tlog."""
+        """Continue as another mission in a fork of the process, with another fault and tlog."""
         self._config = config
         self.link.continue_in(tlog)
 

@@ -2,9 +2,9 @@
 
 Only this module reads a result.json. Every measure is a column of a table of flights. A mission
 that crashed or hung before it could write its record has few fields; measures of missing fields are
-None. If a source-level fault struck several components, the measures join them by ";" in a common
-order, and `struck_bits` has a list of bits for every component. Of several strikes the measures
-describe the first.
+None. If a source-level fault struck several components, the measures join their values by ";" in a
+common order, and `struck_bits` has a list of bits for every component. Of several strikes the
+measures describe the first.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """One flight from which missions are forked, each at the moment of its own fault.
 
-Missions that differ in nothing but their fault fly the same way until it strikes. They fly that way
+Missions that differ only in their fault fly the same way until it strikes. They fly that way
 once: a process flies without a fault, and forks itself when a fault is due. The fork is the mission
-from there on; the flight waits until it has ended, and goes on. Missions whose fault was never due,
-and those without a fault, are forked when the flight is over.
+from there on; the flight waits until it has ended, and continues. Missions whose fault was never
+due, and those without a fault, are forked when the flight is over.
 
 Every record is that of the mission flown alone, except its host section.
 """

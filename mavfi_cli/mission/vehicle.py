@@ -47,7 +47,7 @@ class Vehicle(ABC):
 
     @staticmethod
     def start(config: MissionConfig) -> Vehicle:
-        """Start the vehicle in this process, or beside it where both run by the wall clock."""
+        """Start the vehicle in this process, or in its own if both run by the wall clock."""
         return (VehicleProcess if config.realtime else VehicleInProcess)(config)
 
     @abstractmethod

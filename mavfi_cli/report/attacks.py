@@ -384,7 +384,7 @@ def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
 def save_runs(
     folder: Path, summary: KernelsSummary | ProgramSummary, campaign: Sequence[TargetRuns]
 ) -> Sequence[str]:
-    """Write kernels.csv, a line a run, and kernels.json, the summary; of kernels a picture too.
+    """Write kernels.csv, kernels.json and, for kernels, a picture; one CSV line per run.
 
     Entries without a value are empty. The JSON of a program has its golden run and all runs.
 

@@ -53,7 +53,7 @@ class Picture:
     def of(
         cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
     ) -> Picture:
-        """The picture of a figure, and of one for narrow screens, in the page's look."""
+        """Return the chart of a figure, and of one for narrow screens, in the page's style."""
         wide, small = (_markup(part) if part else "" for part in (figure, narrow))
         return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
 
@@ -78,7 +78,7 @@ class ForestRow:
     Attributes:
         low, high: ends of the claimed range; infinite where it has no end.
         number: whether the effect is a plain number; otherwise it is a share.
-        effects: of each stack; None if it was not flown or has no number.
+        effects: by stack; None if it was not flown or has no number.
         verdict: of the first stack.
     """
 
@@ -95,7 +95,7 @@ _GAPS = {"one": "\n", "two": " "}  # between the halves of an axis label
 
 
 def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str = "two") -> Figure:
-    """A row for each claim: the claimed range as a band, the effects of the stacks upon it.
+    """Draw a row per claim: the claimed range as a band, and the effects of the stacks on it.
 
     Args:
         columns: `one` on a narrow screen, otherwise `two`.
@@ -162,7 +162,7 @@ def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, ve
 def draw_delays(
     panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float], columns: str = "two"
 ) -> Figure:
-    """The share of flights that are longer by more than so many seconds, and so many per cent.
+    """Draw the share of flights that are longer by more than given seconds and per cent.
 
     Args:
         columns: `one` on a narrow screen, otherwise `two`.
@@ -217,7 +217,7 @@ def _per_cent_of(
 
 
 def draw_arms(arms: Sequence[tuple[str, Share, float | None]]) -> Figure:
-    """The lost missions of each arm.
+    """Draw the lost missions of each arm.
 
     Args:
         arms: name, lost missions, and corrected p-value; None of the unprotected arm.
@@ -241,7 +241,7 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 
 def draw_flows(flows: Mapping[str, Mapping[str, Share]]) -> Figure:
-    """What struck kernels did: shares of each fate, by kernel."""
+    """Draw what struck kernels did: the share of each fate, by kernel."""
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)

@@ -1,4 +1,4 @@
-"""The page: fills the template. Numbers become words, and charts their places.
+"""Fills the page's template: formats the numbers and inserts the charts.
 
 The page is one file without a script. Its charts are SVG elements, which take font and colours from
 the page: light, dark, print.

@@ -68,7 +68,7 @@ class PaperColumn:
 
     Attributes:
         title: with the unit.
-        digits: behind the point.
+        digits: number of digits after the decimal point.
         ends: digits of the interval's ends; None means as many.
         sign: whether positive numbers have a plus.
     """
@@ -106,7 +106,7 @@ class PaperRow:
 
     @property
     def count(self) -> str:
-        """What the row's numbers are from: one count, or the smallest and the largest."""
+        """Sample size of the row's numbers: one count, or the smallest and the largest."""
         counts = sorted({cell.count for cell in self.cells if not math.isnan(cell.value)})
         if len(counts) < 2:
             return str(counts[0]) if counts else "0"
@@ -152,7 +152,7 @@ class PaperTable:
 
     @property
     def table(self) -> Table:
-        """Labels, n, then ours beside the paper's, from which no page separates it."""
+        """Labels, n, then our numbers, which always stay on one page with the paper's."""
         head = [*self.labels, "n"]
         parts = [1 + self.printed_in(place) for place in range(len(self.columns))]
         for column, part in zip(self.columns, parts, strict=True):
@@ -173,7 +173,7 @@ class PaperTable:
         return self.csv() if form == "csv" else FORMATS[form](self.table)
 
     def csv(self) -> str:
-        """Return one number a line, in full precision."""
+        """Return one number per line, in full precision."""
         return Table.of_records(
             {
                 "item": self.name,
@@ -208,7 +208,7 @@ _NAME = 36  # characters in a line of a row's name
 
 
 def print_axes(axes: Axes, title: str = "") -> None:
-    """The frame and the text sizes of a panel in print."""
+    """Set the frame and the text sizes of a panel for print."""
     axes.tick_params(labelsize=SMALLEST, color=GRID, length=2.5, pad=2)
     open_frame(axes, title, "x", fontsize=SMALLEST + 0.5, loc="left", pad=3)
 
@@ -217,7 +217,7 @@ def print_axes(axes: Axes, title: str = "") -> None:
 
 
 def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
-    """A panel for each column of a table: ours with its interval, the paper's as a diamond.
+    """Draw a panel per column of a table: ours with its interval, the paper's as a diamond.
 
     Args:
         table: at least one row.
@@ -310,7 +310,7 @@ class Strip:
 def draw_strips(
     panels: Mapping[str, Sequence[Strip]], quantity: str, columns: str = "one"
 ) -> Figure:
-    """Each flight as a dot, the middle half of them as a bar, the median, and the paper's largest.
+    """Draw each flight as a dot, the middle half as a bar, the median, and the paper's largest.
 
     Args:
         panels: the rows of each panel from top to bottom, by its title; all have the same labels.
@@ -368,7 +368,7 @@ _HATCHES = ("", "////", "....", "")
 
 
 def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
-    """A bar of a hundred per cent for each row, cut into the table's columns."""
+    """Draw a bar of 100 per cent for each row, divided into the table's columns."""
     rows = len(table.rows)
     figure = new_figure(WIDTHS_IN[columns], 0.85 + 1.25 * _LINE_IN * rows)
     axes = figure.subplots()
@@ -395,7 +395,7 @@ def draw_stack(table: PaperTable, columns: str = "one") -> Figure:
 def draw_histograms(
     rows: Sequence[tuple[str, FloatArray, FloatArray]], columns: str = "one"
 ) -> Figure:
-    """Two histograms for each row on one scale: values, and their deltas."""
+    """Draw two histograms per row on one scale: values, and their deltas."""
     from matplotlib.ticker import NullFormatter
 
     figure = new_figure(WIDTHS_IN[columns], 0.35 + 0.95 * len(rows))

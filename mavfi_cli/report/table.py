@@ -92,7 +92,7 @@ class Table:
     def latex(self) -> str:
         """Return a float with a plain tabular, which needs no package.
 
-        It is as wide as a column of two, or as the page, in the largest size that fits.
+        It is as wide as one of two columns, or as the page, in the largest size that fits.
         """
         head, *rows = self._padded()
         form = "".join("l" if left else "r" for left in self._left(len(head)))

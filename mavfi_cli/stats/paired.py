@@ -177,7 +177,7 @@ def paired_difference(
     second: Sequence[bool] | BoolArray,
     clusters: Sequence[Hashable],
 ) -> Interval:
-    """Rate of the second minus rate of the first, of the same missions; NaN without any.
+    """Rate of the second minus rate of the first, on the same missions; NaN without any.
 
     The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
     37, 2012): one pair is added to each kind of pair that differs, so 0 of n differences still has
@@ -208,7 +208,7 @@ def paired_difference(
 def net_share(
     before: BoolArray, after: BoolArray, clusters: Sequence[Hashable], *, seed: int = 1
 ) -> Interval:
-    """Share of the hits that a treatment undoes, less those that it causes, of the same missions.
+    """Share of the hits that a treatment undoes, minus those that it causes, on the same missions.
 
     (hits before - hits after) / hits before. It is below 0 if the treatment causes more than it
     undoes. The interval is that of percentiles of draws: of the share of missions that are hits
@@ -255,12 +255,12 @@ def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> 
 def recovered_share(
     golden: Count, faulty: Count, protected: Count, *, draws: int = DRAWS, seed: int = 1
 ) -> Interval:
-    """Share of the lost success that protection recovers, of three independent rates.
+    """Share of the lost success that protection recovers, from three independent rates.
 
-    A ratio of two differences. The three rates are drawn from their posterior distributions under
-    Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as well.
-    The interval is that of the percentiles of the ratio. Draws in which the faults cost nothing
-    belong to it.
+    It is a ratio of two differences. The three rates are drawn from their posterior distributions
+    under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as
+    well. The interval is that of the percentiles of the ratio. Draws in which the faults cost
+    nothing count as well.
 
     Args:
         golden, faulty, protected: successes and missions of each.

@@ -1,10 +1,10 @@
 """Receiver operating characteristic, precision and recall, over all thresholds.
 
-A flight's score is the highest of its messages. A threshold t raises an alarm on
-flights whose score is above t. Areas: under the ROC curve by the Mann-Whitney statistic, ties
-halved, its interval from the variance of Hanley and McNeil (Radiology 143, 1982), taken at the end
-of the interval and not at the estimate, so that an area of 1 has an interval too (method of
-R. G. Newcombe, Statistics in Medicine 25, 2006); under the precision-recall curve by average
+A flight's score is the highest score of its messages. A threshold t raises an alarm on flights
+whose score is above t. The area under the ROC curve is the Mann-Whitney statistic, with ties
+halved. Its interval has the variance of Hanley and McNeil (Radiology 143, 1982), taken at the end
+of the interval instead of the estimate, so that an area of 1 has an interval too (R. G. Newcombe,
+Statistics in Medicine 25, 2006). The area under the precision-recall curve is the average
 precision, the sum of precision times the gain in recall.
 """
 

@@ -1,9 +1,10 @@
 """Proportions with their intervals, of independent runs and of clusters; sample sizes; the layers.
 
-A run hits a cluster: a sampled window of executed instructions. Clusters are drawn uniformly from a
-stratum, such as the windows that begin at one function. Both formulas are those of W. G. Cochran,
-Sampling Techniques, 3rd edition, 1977. Few clusters tell their own spread badly. So the quantiles
-are Student's, with the degrees of freedom of F. E. Satterthwaite (Biometrics Bulletin 2, 1946).
+Each run strikes a cluster: a sampled window of executed instructions. Clusters are drawn uniformly
+from a stratum, such as the windows that begin at one function. Both formulas are those of W. G.
+Cochran, Sampling Techniques, 3rd edition, 1977. A few clusters estimate their own spread poorly. So
+the quantiles are Student's, with the degrees of freedom of F. E. Satterthwaite (Biometrics Bulletin
+2, 1946).
 """
 
 from __future__ import annotations
@@ -304,11 +305,11 @@ def _spread(
 
 
 def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
-    """The total over strata, of each of which some members were drawn uniformly.
+    """The estimated total over strata, from members drawn uniformly from each stratum.
 
     The interval has the correction for a finite population (Cochran, section 5.4). It is that of
     the logarithm, because lengths of windows are skewed, and is not lower than what was seen. One
-    member out of several does not tell its error, so there is no upper end.
+    member out of several does not reveal its error, so there is no upper end.
 
     Args:
         strata: the values of the drawn members, all above 0, and the number of all members.

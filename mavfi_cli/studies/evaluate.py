@@ -81,8 +81,8 @@ class EvaluationPlan:
     Attributes:
         detectors: names; `none` is always flown, named or not.
         flights: missions per world that are flown with a fault at each site, one per flight.
-        harmless_flights: number of them, from the first on, whose faults are all flown with the
-            detectors; only harmful faults of the others are.
+        harmless_flights: number of these missions, from the first on, whose faults are all flown
+            with the detectors; of the others only harmful faults are.
         golden_flights: error-free missions per world; the first ones also get faults.
         first_seed: seeds of missions count up from here; training flies from 10 000 on.
         models: folder of model files `NAME.json`; None takes those shipped for the stack of `base`.
@@ -188,7 +188,7 @@ class EvaluationPlan:
     def missions(
         self, detector: str = NONE, harmful: Collection[tuple[Any, ...]] = ()
     ) -> list[PlannedMission]:
-        """Golden flights, then flights with a fault, with a detector or without.
+        """Golden flights, then flights with a fault, with or without a detector.
 
         Args:
             harmful: world, seed, stage, target and field of the faults that do harm without a

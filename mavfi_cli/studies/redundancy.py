@@ -128,7 +128,7 @@ class FlightPlan:
         )
 
     def write(self) -> None:
-        """Write the files; a RecordError says why one cannot be written."""
+        """Write the files. Raises RecordError if one cannot be written."""
         for path, text in self.files.items():
             with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -185,13 +185,13 @@ class RedundancyPlan:
         missions: number per scheme and world.
         folder: folder of flights and pictures; recorded missions are not flown again.
         models: folder of the detectors' models; None takes the shipped ones.
-        train: flights of each training world to which detectors are fitted for each vehicle; 0
-            fits none.
+        train: flights in each training world to which detectors are fitted for each vehicle; 0 fits
+            none.
         stack: stack of all flights.
 
     Raises:
-        ConfigError, UnknownName: a world is missing or named twice, or the missions have seeds of
-            training flights, which no flight may share in any world.
+        ConfigError, UnknownName: no world is named, one is named twice, or the missions have seeds
+            of training flights, which no flight may share in any world.
     """
 
     vehicles: Sequence[ModelVehicle]

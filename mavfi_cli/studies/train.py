@@ -1,7 +1,7 @@
 """`mavfi train`: error-free flights, the data set of their samples, and the models fitted to it.
 
-By default the paper's training set (section VI): two obstacle densities times two obstacle sizes,
-25 flights each. Every flight has its own world seed.
+The default is the paper's training set (section VI): two obstacle densities times two obstacle
+sizes, 25 flights each. Every flight has its own world seed.
 """
 
 from __future__ import annotations

@@ -427,7 +427,7 @@ class TransportContract:
 
 
 class StreamTransportContract(TransportContract):
-    """The suite that every transport passes that reports closing to the other end, as TCP."""
+    """The suite for transports that report a closed end to the other end, such as TCP."""
 
     def test_a_closed_stream_is_a_lost_link_at_the_other_end(self, pair: Pair) -> None:
         near, far = pair

@@ -1,9 +1,8 @@
 """The F-1 model (Krishnan et al., IEEE CAL 19(1), 2020): its vehicles, boards and equations.
 
-A vehicle that sees `range_m` far and takes `response_s` from sensing to acting may fly only as
-fast as it can stop within that range. A board is the computer that it carries. A protection
-scheme costs copies of the board, or compute time. Vehicles and boards are one TOML file each. All
-units are SI.
+A vehicle that sees `range_m` far and takes `response_s` from sensing to acting must fly slowly
+enough to stop within that range. A board is the computer that it carries. A protection scheme costs
+copies of the board, or compute time. Vehicles and boards are one TOML file each. All units are SI.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class _Parameter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ratios:
-    """A scheme over the scheme REFERENCE."""
+    """Numbers of a scheme relative to those of the scheme REFERENCE."""
 
     velocity_ratio: float
     flight_time_ratio: float
@@ -130,7 +130,7 @@ class CalibratedNumber:
     """The free number that gives a vehicle its published ratio of flight times.
 
     Attributes:
-        tmr_ratio, predicted_dmr_ratio: over the scheme REFERENCE; the second is not fitted.
+        tmr_ratio, predicted_dmr_ratio: ratios to the scheme REFERENCE; the second is not fitted.
     """
 
     board: str
@@ -168,7 +168,7 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelReport:
-    """The model's numbers; names of numbers but counts and ratios end in the unit."""
+    """The model's numbers; the names of all numbers except counts and ratios end in the unit."""
 
     model: str = MODEL
     knee_velocity_over_roof_ratio: float = KNEE_SHARE

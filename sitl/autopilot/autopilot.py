@@ -43,7 +43,7 @@ class Autopilot(Links):
         trusted: MAVLink systems that may command; empty for all.
 
     Attributes:
-        restart_requested: A client has requested a reboot, which is up to the owner.
+        restart_requested: True once a client has requested a reboot, which the owner performs.
     """
 
     def __init__(self, truth: Truth, *, system_id: int = 1, trusted: Sequence[int] = ()) -> None:

@@ -53,7 +53,7 @@ class FlightMode(Enum):
     def from_numbers(cls, main: int, sub: int) -> FlightMode | None:
         """Return the mode of param2 and param3 of a DO_SET_MODE; None if there is none.
 
-        The sub mode is used for AUTO only. AUTO without a sub mode is LOITER.
+        The sub mode is used only for AUTO. AUTO without a sub mode is LOITER.
         """
         auto = main == cls.LOITER.main
         numbers = (main, (sub or cls.LOITER.sub) if auto else 0)

@@ -1,7 +1,7 @@
 """Telemetry: the state behind it, the builders of its messages, and the streams of a client.
 
-Most messages can be streamed. Those of DESCRIPTIONS, which describe the autopilot, are sent on
-request only.
+Most messages can be streamed. Those of DESCRIPTIONS, which describe the autopilot, are sent only on
+request.
 """
 
 from __future__ import annotations
@@ -395,7 +395,7 @@ class Link:
         return bool(self._fast)
 
     def due(self, snapshot: Snapshot, *, between_ticks: bool = False) -> list[Any]:
-        """Return the messages due now, between two ticks those of the fast streams only.
+        """Return the messages due now; between two ticks only those of the fast streams.
 
         A late stream skips missed messages.
         """

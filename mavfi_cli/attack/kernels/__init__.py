@@ -1,1 +1,1 @@
-"""Attacks on one kernel of the companion at a time, with one fault a run."""
+"""Attacks on one kernel of the companion at a time, with one fault per run."""

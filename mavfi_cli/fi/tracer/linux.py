@@ -170,7 +170,7 @@ def share_processor(pid: int) -> None:
 
 
 def cpu_time_s(pid: int) -> float:
-    """Return the CPU time that all threads of a process have used, s; 0 when it has ended.
+    """Return the CPU time that all threads of a process have used, s; 0 once it has ended.
 
     The clock id encoding is that of clock_getcpuclockid(3) on Linux.
     """

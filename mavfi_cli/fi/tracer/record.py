@@ -1,4 +1,4 @@
-"""The fault record, a JSON file that states what will be hit, and then what was hit.
+"""The fault record, a JSON file that states what will be struck, and then what was struck.
 
 It is flushed to the disk *before* the target runs to the trigger, so that it survives any effect
 of the fault. It is completed afterwards. Each write leaves the old file or the new one, never a

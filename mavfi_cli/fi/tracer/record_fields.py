@@ -1,4 +1,4 @@
-"""The fields of a fault record that the program reads again, without what writes them."""
+"""The fields of a fault record that mavfi reads, apart from the code that writes them."""
 
 from __future__ import annotations
 

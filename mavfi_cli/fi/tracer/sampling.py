@@ -289,7 +289,7 @@ def draw_fault(
     code_at: CodeAt,
     locate: Locate,
 ) -> InstructionFault:
-    """Draw a fault, uniformly over the executed instructions with an operand the model allows.
+    """Draw a fault uniformly from the executed instructions with an operand the model allows.
 
     If an instruction has no such operand, another is drawn, so that the rest stay equally likely.
 

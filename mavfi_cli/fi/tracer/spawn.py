@@ -58,7 +58,7 @@ class Program:
         stdin: Path = Path(os.devnull),
         memory_bytes: int | None = MEMORY_BYTES,
     ) -> Program:
-        """Make a command. Its program is searched on the PATH.
+        """Make a command. Its program is looked up on the PATH.
 
         Args:
             environment: by default the variables of this process for paths, language and number of

@@ -112,7 +112,7 @@ class ExecutionCounter:
         self._fd = _open_event(tid, address, stop_at)
 
     def read(self) -> int:
-        """Return the executions since the counter was opened, also after the thread's end."""
+        """Return the executions since the counter was opened, even after the thread has ended."""
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
@@ -233,7 +233,7 @@ class Tracee:
         If the thread is stopped in front of an execution, this execution counts as the first.
 
         Args:
-            detour: the place of a detour that can count them.
+            detour: the location of a detour that can count them.
 
         Returns:
             False if the process ended first.

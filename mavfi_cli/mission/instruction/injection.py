@@ -384,7 +384,7 @@ class InstructionInjection(NoInjection):
             fly_golden: Flies the golden mission, if its orders are not kept yet.
 
         Raises:
-            FaultError: The flight is not repeatable, or nothing in it can be hit.
+            FaultError: The flight is not repeatable, or nothing in it can be struck.
         """
         if config.link is not None:
             raise FaultError(
@@ -410,7 +410,7 @@ class InstructionInjection(NoInjection):
         return cls(fault, context, recorded=recorded, for_debugger=for_debugger)
 
     def begin(self, path: Path) -> None:
-        """Note where the tracer writes the record."""
+        """Set the path to which the tracer writes the record."""
         self._path = path
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:

@@ -54,7 +54,7 @@ class Entry:
             `note`: an event of the flight.
             `values`: the numbers of a control tick by the trace's column names; None where there
             is none yet.
-        size_m: sizes of boxes (n, 3), radius of marks, width of a line.
+        size_m: sizes of boxes (n, 3), radius of marks, or width of a line.
     """
 
     path: str
@@ -66,7 +66,7 @@ class Entry:
 
     @property
     def urgent(self) -> bool:
-        """Whether a note is of a fault, an alarm or the death of a node."""
+        """Whether a note reports a fault, an alarm or the death of a node."""
         return self.data["kind"] in ("fault", "alarm", "node")
 
 

@@ -63,7 +63,8 @@ def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     foreign autopilot the date of the flight counts.
 
     Raises:
-        RecordError: The file could not be written, or the tlog of a foreign flight not be read.
+        RecordError: The file could not be written, or the tlog of a foreign flight could not be
+            read.
     """
     run, entries = flights[0].run, entries_of(flights)
     if run.record.config.get("link") is not None:
