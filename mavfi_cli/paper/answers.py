@@ -1,4 +1,4 @@
-"""The answers on the first screen: is the paper reproduced, where not and why, what helps."""
+"""The answers on the first screen: whether the paper is reproduced, where not, and what helps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _KINDS = {  # of faults: level, and what they do to their nodes
 
 
 def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """The judgement on a stack, or of isolated kernels; None if there is none for this fate."""
+    """The judgement of a claim on a stack or in isolated kernels; None if this fate has none."""
     place = ISOLATED if judged.claim.isolated else stack
     return judged.judgements.get(place, {}).get(fate)
 
@@ -57,7 +57,7 @@ class Family:
 
     @property
     def short(self) -> str:
-        """The paper's name of it, such as `Fig. 6`."""
+        """The paper's name for it, such as `Fig. 6`."""
         return printed_name(self.name)
 
     @classmethod
@@ -74,7 +74,7 @@ class Family:
 
 
 def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
-    """One sentence about a stack and the isolated kernels."""
+    """One sentence with the verdicts on a stack and in the isolated kernels."""
     counts = _count_verdicts(claims, stack)
     yes, no, open_ = (
         counts[verdict] for verdict in (Verdict.REPRODUCED, Verdict.CONTRADICTED, Verdict.UNDECIDED)
@@ -142,7 +142,7 @@ class Disagreement:
 
     @property
     def names(self) -> Mapping[str, str]:
-        """The short names of its claims by their names; those of one item begin with it once."""
+        """The short names of its claims by their names; each item is named only once."""
         found, item = {}, ""
         for judged in self.claims:
             short, item_before, item = short_name(judged), item, judged.claim.item
@@ -168,7 +168,7 @@ def reason_of(judged: JudgedClaim, stack: str) -> str:
     """Why a claim is contradicted on a stack; empty if it is not, or if no reason is known.
 
     A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
-    for an effect that lies in the interval of that one.
+    for an effect that lies in the interval of the explained effect.
     """
     words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
     judgement = judgement_of(judged, stack)
@@ -201,7 +201,7 @@ class DetectorBalance:
     Attributes:
         level: `source` or `instruction`.
         fate: what the faults do to their nodes.
-        harmed, lost: of harmed and of lost missions.
+        harmed, lost: balances of harmed and of lost missions.
     """
 
     stack: str
@@ -214,7 +214,7 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """The balances of all levels, computers, detectors and fates with flown pairs."""
+        """The balance of every level, computer, detector and fate that has flown pairs."""
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(
             watched.by("level", "platform", "detector"), key=str
@@ -281,7 +281,7 @@ class Safeguard:
     """The effect of a detector, or of another stack, against each kind of fault, and its cost.
 
     Attributes:
-        against: by the kind of fault; None where it was not flown.
+        against: effect by the kind of fault; None where it was not flown.
         costs: mean share of the flight time, by the words of the level; empty if not measured.
     """
 
@@ -340,7 +340,7 @@ class Delays:
 
     Attributes:
         level: `source` or `instruction`.
-        added_s: by detector, None for none, (n,); infinite of a lost mission.
+        added_s: added seconds (n,) by detector, None without one; infinite for a lost mission.
         golden_s: mean flight time of the golden flights.
     """
 
@@ -351,7 +351,7 @@ class Delays:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """The delays at both levels, of the faults that were flown with every detector."""
+        """The delays at both levels, for the faults that were flown with every detector."""
         hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
         for level in ("source", "instruction"):
             mine = hit.chosen(level=level)

@@ -1,6 +1,7 @@
-"""Questions that the paper does not ask of its flights.
+"""Questions that the paper does not ask about its flights.
 
-From the kernel to the mission, where a bit hurts, failures an hour, and what each mechanism saves.
+They follow a fault from the kernel to the mission, map where a flipped bit does harm, count
+failures per hour, and compare what each mechanism saves.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ class KernelFlow:
     """From a struck kernel to the mission.
 
     Attributes:
-        fates: lost missions among those of each of FATES.
-        lost, harmed: among all missions with a fault in the kernel.
-        silent: silent corruption of the isolated kernel; None if it was not run.
+        fates: share of lost missions for each of FATES.
+        lost, harmed: shares among all missions with a fault in the kernel.
+        silent: share of silent corruption of the isolated kernel; None if it was not run.
         given_silent: probability that a mission is lost given such corruption, with the ends of its
             interval; None if it is not known.
     """
@@ -123,7 +124,7 @@ class MapCell:
 
 
 def state_map(flights: Flights) -> list[MapCell]:
-    """The cells of all states, classes of bits and phases that faults struck, sorted.
+    """The cells of all states, classes of bits and phases that faults struck, in sorted order.
 
     It counts source-level faults without a detector whose golden flights succeed. A fault in
     several components counts for their group and for the highest bit that it flips.
@@ -213,9 +214,9 @@ class Arm:
 
     Attributes:
         golden: lost golden flights.
-        lost: lost missions of all faults; `by_site` of each injection site.
-        p_value: of McNemar's exact test against the unprotected arm; None of that arm itself.
-        corrected_p: by Holm over all arms.
+        lost, by_site: lost missions over all faults, and for each injection site.
+        p_value: p-value of McNemar's exact test against the unprotected arm; None for that arm.
+        corrected_p: p-value corrected by Holm over all arms.
     """
 
     name: str

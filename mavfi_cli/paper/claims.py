@@ -41,7 +41,7 @@ def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim
     """All claims with their verdicts, in the order of CLAIMS.
 
     Args:
-        flights: of each stack.
+        flights: flights by stack.
     """
     found: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
     for _, family in groupby(CLAIMS, attrgetter("item")):

@@ -176,11 +176,11 @@ class Document:
         return self.stacks[0]
 
     def reason(self, judged: JudgedClaim) -> str:
-        """Why a claim is contradicted; empty if it is not, or that is not known."""
+        """Why a claim is contradicted; empty if it is not, or if no reason is known."""
         return reason_of(judged, self.stack)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
-        """How many claims have which verdict, by stack and of isolated kernels."""
+        """The number of claims with each verdict, by stack and for isolated kernels."""
         found = {
             place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
         }

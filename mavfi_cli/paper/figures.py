@@ -41,11 +41,11 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
     """Draw the figure of an item from its flights, or the dots of its table.
 
     Args:
-        flights: None of what was not flown. `fig13` needs their kept run folders, of one campaign.
+        flights: None if nothing was flown. `fig13` needs their kept run folders, from one campaign.
         columns: width, `one` or `two`.
 
     Raises:
-        RecordError: nothing was flown that it could show, or these folders are not there.
+        RecordError: nothing was flown that it could show, or these folders do not exist.
     """
     if not table.rows or (flights is not None and not len(flights)):
         raise RecordError(_NOTHING)
@@ -55,7 +55,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
 
 
 def panel(rows: Iterable[_Row]) -> list[Strip]:
-    """Distributions of flights over their golden ones."""
+    """Draw distributions of flight times over those of the golden flights."""
     return [
         Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
         for label, detector, flights, paper in rows

@@ -34,15 +34,15 @@ _PROFILES_BYTES = 10_000_000  # of the profiles of one golden flight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """What is left to fly, and what it takes on this machine.
+    """The missions that are left to fly, and the time and space that they take on this machine.
 
     Attributes:
-        missions, over: missions of the items; those of them that are over.
-        seconds: wall time of the rest; without missions if none is measured.
-        disk_bytes: space for the rest, profiles that are removed later included.
-        measured: number of missions that the forecast is from; 0 if few are left.
-        jobs: missions or runs at the same time.
-        runs: runs of isolated kernels that are missing.
+        missions, over: number of missions of the items, and how many of them are finished.
+        seconds: wall time of the rest; it excludes missions if none has been measured.
+        disk_bytes: space for the rest, including profiles that are removed later.
+        measured: number of missions behind the forecast; 0 if few are left.
+        jobs: number of missions or runs at the same time.
+        runs: number of missing runs of isolated kernels.
     """
 
     missions: int = 0
@@ -80,11 +80,11 @@ def reproduce(
     """Fly the missions of the items that the folder lacks, and run the kernels for Fig. 6.
 
     Args:
-        on_forecast: is called with the forecast, after a few missions and runs, before the rest.
+        on_forecast: called with the forecast, after a few missions and runs, and before the rest.
 
     Raises:
         ConfigError: the folder holds another stack, more missions, or another campaign.
-        RecordError: the disk has not enough room.
+        RecordError: the disk does not have enough room.
         MavfiError: a mission or a kernel cannot be run.
     """
     jobs = options.jobs or len(os.sched_getaffinity(0))
@@ -208,10 +208,10 @@ def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
 
 
 def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int]) -> float:
-    """Wall time of missing missions one after the other, from the mean of each kind, s.
+    """Wall time of the missing missions, flown one after another, from the mean of each kind, s.
 
     Args:
-        measured: kind and wall time of missions that are over.
+        measured: kind and wall time of finished missions.
         missing: number of missing missions of each kind. A kind that was never measured takes as
             long as the mean of all.
     """

@@ -32,7 +32,7 @@ _ROMAN = ("", "I", "II", "III", "IV", "V", "VI", "VII")
 
 
 class Source(Enum):
-    """What an item is computed from."""
+    """The source from which an item is computed."""
 
     FLIGHTS = "flights"
     KERNELS = "kernels"  # runs of isolated kernels
@@ -45,8 +45,8 @@ class Item:
 
     Attributes:
         name: as on the command line, such as `fig6`.
-        labels, columns, notes: of its table, as paper.toml explains.
-        origin: where the paper prints its numbers, and what it only draws.
+        labels, columns, notes: parts of its table, as paper.toml explains.
+        origin: where the paper prints its numbers, and which results it only plots.
         preset: the campaign that flies it; empty if its source is not flights.
     """
 
@@ -61,13 +61,13 @@ class Item:
 
     @property
     def paper(self) -> str:
-        """The paper's name of it."""
+        """The paper's name for the item."""
         return printed_name(self.name)
 
     def table(
         self, rows: Sequence[PaperRow], worlds: Sequence[str] = (), notes: Sequence[str] = ()
     ) -> PaperTable:
-        """The item's table with these rows, and with more notes."""
+        """The item's table with these rows and additional notes."""
         return PaperTable(
             name=self.name,
             title=f"{self.paper}: {self.title}",
@@ -83,7 +83,7 @@ class Item:
 
 
 def printed_name(name: str) -> str:
-    """The paper's name of a figure, table or section, such as `Fig. 6` of `fig6`."""
+    """The paper's name for a figure, table or section, such as `Fig. 6` for `fig6`."""
     kind, number = name.rstrip("0123456789"), int(name.lstrip("abcdefghijklmnopqrstuvwxyz"))
     return f"Fig. {number}" if kind == "fig" else f"{kind.capitalize()} {_ROMAN[number]}"
 
@@ -123,7 +123,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 
     Raises:
         UnknownName: there is no such item. Suggests the nearest.
-        ConfigError: the paper has it, but it is no experiment. The message names what it is.
+        ConfigError: the paper has it, but it is not an experiment. The message says what it is.
     """
     for name in names:
         if name in LEFT_OUT:
@@ -140,7 +140,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 class FlightsPlan:
     """The flights of some items on one stack.
 
-    A method that takes items applies to all items if it gets none.
+    A method that takes items applies to all items if none are given.
 
     Attributes:
         scale: fraction of the paper's number of missions.
@@ -154,7 +154,7 @@ class FlightsPlan:
 
     @classmethod
     def stored(cls, ledger: Ledger) -> FlightsPlan | None:
-        """The plan of a reproduction, with all items; None if the ledger is of another campaign."""
+        """The plan of a reproduction, with all items; None if the ledger has another campaign."""
         text = ledger.meta(_META)
         if text is None:
             return None
@@ -167,7 +167,7 @@ class FlightsPlan:
 
     @property
     def meta(self) -> dict[str, str]:
-        """What the ledger of the flights stores of the plan."""
+        """The part of the plan that the ledger of the flights stores."""
         stored = {"stack": self.stack, "scale": self.scale}
         return {"name": self.folder.name, _META: json.dumps(stored)}
 
@@ -181,7 +181,7 @@ class FlightsPlan:
         """The missions, repetition by repetition, so that all items grow together.
 
         Raises:
-            ConfigError: the scale leaves nothing, or the stack cannot be used.
+            ConfigError: the scale leaves no missions, or the stack cannot be used.
         """
         planned = [
             (mission.config.seed - spec.first_seed, mission)

@@ -1,8 +1,8 @@
-"""The layout of each item that is flown: from missions to the paper's table.
+"""The layout of each flown item: turns missions into the paper's table.
 
-A layout reads configuration and record of the item's missions only, never labels, so that it serves
-any campaign with such missions. It gives the cells of each row; paper.toml has headings, columns
-and notes.
+A layout reads only the configuration and record of the item's missions, never labels, so it works
+for any campaign with such missions. It gives the cells of each row; paper.toml has headings,
+columns and notes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NOTHING = "nothing flown yet"
 
 
 def of_flights(name: str, flights: Flights) -> PaperTable:
-    """The table of an item that is flown.
+    """The table of a flown item.
 
     Args:
         flights: the item's missions.
@@ -49,7 +49,7 @@ _SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """The flights that differ from the item's missions on a stack in _SEEDS only.
+    """The flights that differ from the item's missions on a stack only in _SEEDS.
 
     Empty if all of these are golden and the item needs flights with a fault.
     """
@@ -247,7 +247,7 @@ SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
 def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Values of SHOWN_STATES at all control ticks, and their changes from tick to tick.
 
-    Reads the traces of the successful flights whose run folders are there.
+    Reads the traces of the successful flights whose run folders exist.
     """
     runs = [Path(each) for each in flights.chosen(lost=False)["path"] if each]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]

@@ -1,4 +1,4 @@
-"""Measures: the number of some flights, or of isolated kernels, that decides a claim.
+"""Measures: the number, from flights or isolated kernels, that decides a claim.
 
 claims.toml names them. A measure takes flights, and values of columns that choose some of them. It
 counts the faults that flipped a bit. Missions of one world and seed are a cluster: the intervals of

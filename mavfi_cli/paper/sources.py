@@ -33,13 +33,13 @@ class CampaignSource:
 
     Attributes:
         path: the campaign's folder, or the exported file.
-        spec: None if a program made the list, or if no specification lies beside an export.
-        planned: missions on its list; None of an export that does not say.
+        spec: None if a program made the list, or if there is no specification beside an export.
+        planned: number of missions on its list; None if an export does not record it.
         flights: the missions that flew.
         errors: missions that could not begin.
-        versions: of the programs that flew it; empty of an export that does not say.
-        host: of the first record; empty of an export that does not say.
-        digest: SHA-256 of an exported file; empty of a folder.
+        versions: versions of the programs that flew it; empty if an export does not record them.
+        host: host of the first record; empty if an export does not record it.
+        digest: SHA-256 of an exported file; empty for a folder.
         again: command that flies the rest of its list; empty if it is not known.
     """
 
@@ -61,7 +61,7 @@ class CampaignSource:
 
     @property
     def seeds(self) -> tuple[int, int] | None:
-        """The smallest and the largest seed of its flights; None without any."""
+        """The smallest and the largest seed of its flights; None without flights."""
         found = [seed for seed in self.flights["seed"] if seed is not None]
         return (min(found), max(found)) if found else None
 
@@ -71,7 +71,8 @@ class Evidence:
     """The campaigns and the summaries of kernels that were read.
 
     Attributes:
-        problems: what could not be read, is incomplete, or does not fit, a sentence each.
+        problems: one sentence for each source that could not be read, is incomplete, or does not
+            fit.
     """
 
     campaigns: Sequence[CampaignSource]
@@ -80,7 +81,7 @@ class Evidence:
 
     @classmethod
     def gather(cls, places: Sequence[Path]) -> Evidence:
-        """Read what the places hold.
+        """Read all campaigns and summaries at the places.
 
         Args:
             places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
@@ -117,7 +118,7 @@ class Evidence:
 
     @property
     def isolated(self) -> Mapping[str, IsolatedKernel]:
-        """The summary of each attacked kernel; of several, that of the last source."""
+        """The summary of each attacked kernel; if several sources have one, that of the last."""
         return {kernel.name: kernel for source in self.kernels for kernel in source.kernels}
 
     def flights(self, stack: str | None = None) -> Flights:
@@ -205,7 +206,7 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    """Flights that tell nothing of the paper: without golden flights, or of other missions."""
+    """Flights that cannot be compared with the paper: without golden flights, or other missions."""
     pooled = Flights.pooled([source.flights for source in campaigns])
     paired = {
         changes

@@ -1,4 +1,4 @@
-"""What a campaign shows of the paper: the tables of its items, and its state on one screen."""
+"""A campaign beside the paper: the tables of its items, and its state on one screen."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
 def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
-    """The one table of a campaign, and the flights that its figure needs; None if it needs none.
+    """The main table of a campaign, and the flights that its figure needs; None if it needs none.
 
-    It is the table of the named item, or of the preset's item. An export has those items whose kind
-    of flights it holds. Without an item, a reproduction has the
-    table of its items, and another campaign that of its settings.
+    It is the table of the named item, or of the preset's item. An export has the items whose
+    flights it contains. Without an item, a reproduction has the table of its items, and another
+    campaign that of its settings.
 
     Raises:
         UnknownName: the campaign flies no item of this name.
-        ConfigError: the paper has it, but it is no experiment.
-        RecordError: the kernels were not run, or an export holds no flight of the item.
+        ConfigError: the paper has it, but it is not an experiment.
+        RecordError: the kernels were not run, or an export contains no flight of the item.
     """
     item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
     if item is None:
@@ -95,7 +95,7 @@ def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
 
 
 def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
-    """The table of each item of a plan, from what is there.
+    """The table of each item of a plan, from the flights and runs that exist.
 
     Raises:
         RecordError: nothing was flown, or the kernels were not run.
@@ -211,7 +211,7 @@ def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
 
 
 def short(table: PaperTable) -> PaperTable:
-    """The table cut to one screen: its first rows, and of settings the first columns."""
+    """The table cut to one screen: its first rows, and the first columns of a table of settings."""
     wide = len(table.columns) if table.name != _SETTINGS else _WIDE
     left = [column.title.partition(",")[0] for column in table.columns[wide:]]
     left += [f"{len(table.rows) - _ROWS} more rows"] if len(table.rows) > _ROWS else []
@@ -226,7 +226,7 @@ def short(table: PaperTable) -> PaperTable:
 
 
 def progress_lines(ledger: Ledger) -> list[str]:
-    """What is done, and the time left at the pace so far."""
+    """Lines about the progress, and the time left at the pace so far."""
     planned, over = ledger.planned(), ledger.over()
     errors = sum(ledger.errors_by_cell().values())
     name = ledger.meta("name") or ledger.folder.name

@@ -1,4 +1,4 @@
-"""Claims, and what an effect with its interval says about the range that a claim gives.
+"""Claims and their verdicts, which compare an effect with the range that a claim gives.
 
 The range was written before the data, in claims.toml. A verdict is a test of the nearest end of the
 range. The tests of one figure or table are a family, corrected by S. Holm (Scand. J. Statistics 6,
@@ -25,7 +25,7 @@ _Z = z_of(1.0 - LEVEL)
 
 
 class Verdict(Enum):
-    """What the missions say about a claim."""
+    """The verdict of the missions on a claim."""
 
     REPRODUCED = "reproduced"
     CONTRADICTED = "contradicted"
@@ -35,11 +35,11 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What the missions say about the number that decides a claim.
+    """The number that decides a claim, as computed from the missions.
 
     Attributes:
-        effect: with its 95 % interval; None if there is none.
-        counts: what the effect was computed from.
+        effect: number with its 95 % interval; None if there is none.
+        counts: description of the missions behind the effect.
         why: why there is no effect.
     """
 
@@ -50,14 +50,14 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """A claim's verdict, and what it rests on.
+    """A claim's verdict, and the numbers behind it.
 
     Attributes:
-        effect: with its 95 % interval, which is not corrected; None if there is none.
-        counts: what the effect was computed from.
-        why: why nothing can decide the claim; empty of the other verdicts.
-        p: of the test against the nearest end of the range, corrected for its family; 1 without
-            an effect.
+        effect: number with its 95 % interval, which is not corrected; None if there is none.
+        counts: description of the missions behind the effect.
+        why: why nothing can decide the claim; empty for the other verdicts.
+        p: p-value of the test against the nearest end of the range, corrected for its family; 1
+            without an effect.
         needed: observations that decide an undecided claim if the effect stays as it is; infinite
             if it lies on an end of the range.
     """
@@ -76,11 +76,11 @@ class Claim:
 
     Attributes:
         item: table, figure or section, such as `fig6`.
-        find: the finding of a stack's flights and of the isolated kernels.
+        find: function that computes the finding from a stack's flights and the isolated kernels.
         low, high: ends of the range of the effect.
         rule: the range, and where it comes from, in words.
-        isolated: whether it is about isolated kernels and no flights.
-        fates: what the faults may do to their nodes; each is judged by itself.
+        isolated: whether it is about isolated kernels instead of flights.
+        fates: what the faults may do to their nodes; each fate is judged separately.
     """
 
     name: str
@@ -104,14 +104,14 @@ class JudgedClaim:
     """A claim with its verdicts.
 
     Attributes:
-        judgements: of each stack, or of ISOLATED, by what the faults do to their nodes.
+        judgements: judgement of each stack, or of ISOLATED, by what the faults do to their nodes.
     """
 
     claim: Claim
     judgements: Mapping[str, Mapping[Fate, Judgement]]
 
     def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
-        """The verdict on a stack, or of ISOLATED; None if it is not judged there."""
+        """The verdict on a stack, or on ISOLATED; None if the claim is not judged there."""
         found = self.judgements.get(place, {}).get(fate)
         return None if found is None else found.verdict
 
@@ -120,7 +120,7 @@ def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) ->
     """Judge a family of claims.
 
     Args:
-        findings: of each claim.
+        findings: finding of each claim.
         ranges: low and high end of each claim's range, which belong to it.
     """
     z = [_z(found.effect, *ends) for found, ends in zip(findings, ranges, strict=True)]
@@ -178,7 +178,8 @@ def _two_sided(z: float) -> float:
 def margin(missions: int) -> float:
     """The smallest effect that counts, at the number of missions of each of the paper's groups.
 
-    None of so many missions rules it out in a family of four claims, so that a claim can be
+    A result of 0 of that many missions rules it out in a family of four claims, so that a claim can
+    be
     contradicted: the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to half a
     point.
     """
