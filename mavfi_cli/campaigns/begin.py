@@ -6,8 +6,9 @@ import contextlib
 import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 from mavfi_cli.campaigns.ledger import LEDGER, ExportedLedger, Ledger, is_export
 from mavfi_cli.campaigns.missions import (
@@ -97,12 +98,41 @@ def chosen_spec(
             raise ConfigError(
                 "does not take --scale, --set or --out: the folder stores them", path=folder
             )
-        stored = stored_spec(ledger)
-    if stored is None:
-        raise ConfigError("has no specification, because a program made its list", path=folder)
+        stored = stored_spec(ledger) or _Unflown.of(ledger)
     for kind in stored.kinds():
         kind.config.require_firmware(firmware)
     return stored
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Unflown(Spec):
+    """What is left of the list of a study, which has no factors."""
+
+    left: list[PlannedMission]
+
+    @classmethod
+    def of(cls, ledger: Ledger) -> Self:
+        """Read the missions that the ledger lacks.
+
+        Raises:
+            ConfigError: the ledger does not say which run folders to keep.
+        """
+        keep = ledger.meta("keep")
+        if keep is None:
+            problem = "has no specification; the command that made its list flies the rest"
+            raise ConfigError(problem, path=ledger.folder)
+        cells, pairs = ledger.cells(), {row[0]: row[2] for row in ledger.rows()}
+        left = [
+            PlannedMission(config=config, labels=cells[cell], pair=pairs[number])
+            for number, cell, config in ledger.missing(errors=True)
+        ]
+        return cls(name=ledger.folder.name, keep=Keep(keep), left=left)
+
+    def missions(self) -> list[PlannedMission]:
+        """See `Spec`."""
+        return self.left
+
+    kinds = missions
 
 
 def _folder_of(what: str) -> Path:
@@ -242,7 +272,9 @@ def begin(
     text = spec.to_toml()
     with contextlib.ExitStack() as undo:
         ledger = undo.enter_context(Ledger(folder, writing=True))
-        if begun and ledger.meta("spec") == text:  # the list is what it would expand to
+        if begun and (
+            isinstance(spec, _Unflown) or ledger.meta("spec") == text
+        ):  # the list is what it would expand to
             require_unchanged(ledger)
         else:
             stored = stored_spec(ledger)

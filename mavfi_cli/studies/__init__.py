@@ -32,6 +32,7 @@ def fly(
     """
     wanted = {mission.stored for mission in missions}
     with Ledger(folder, writing=True) as ledger:
+        ledger.set_meta({"name": folder.name, "keep": keep.value})  # `campaign run` needs them
         store_plan(ledger, missions, append=True)
         mine = [number for number, *stored in ledger.rows() if tuple(stored) in wanted]
         fly_missing(ledger, replace(options, keep=keep, only=frozenset(mine)), spectator)
