@@ -79,6 +79,11 @@ _detector, _output = section("Detector"), section("Output")
 @_mission("--time-limit", "time_limit_s", default=300.0,
           help="Limit of simulated time after take-off, s.")  # fmt: skip
 @_mission("--realtime", is_flag=True, help="Pace the simulated vehicle by the wall clock.")
+@_mission("--companion", metavar="FILE|CMD",
+          help="Fly with your own companion in place of mavfi's: a TOML file or a command line, in "
+               "which {link}, {goal} and others are filled in.")  # fmt: skip
+@_mission("--speed", type=ABOVE_ZERO, default=1.0,
+          help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @_mission("--eyes", is_flag=True,

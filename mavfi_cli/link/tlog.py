@@ -45,7 +45,7 @@ def unix_time_of_stamp_0(path: Path) -> float:
     return EPOCH_UNIX_S
 
 
-class _TlogWriter:
+class TlogWriter:
     """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
 
     Records written before `open` are buffered. Every method may raise RecordError.
@@ -143,7 +143,7 @@ class RecordedLink:
         self._transport = transport
         self._clock = clock
         self._codec = Codec(system, component, signing=signing)
-        self._tlog = _TlogWriter(EPOCH_UNIX_S if clock is None else 0)
+        self._tlog = TlogWriter(EPOCH_UNIX_S if clock is None else 0)
 
     @contextlib.contextmanager
     def recording(self, path: Path) -> Iterator[None]:

@@ -91,6 +91,7 @@ class FlightRecord:
     fault: Record = field(default_factory=dict)
     detection: Record = field(default_factory=dict)
     nodes: Record = field(default_factory=dict)
+    programs: Record = field(default_factory=dict)  # of a user's companion
     kernels: Record = field(default_factory=dict)
     response_time_s: Record = field(default_factory=dict)
     measured_platform: Record = field(default_factory=dict)

@@ -9,6 +9,7 @@ from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
+from mavfi_cli.link.telemetry import Telemetry
 
 if TYPE_CHECKING:
     from mavfi_cli.companion.injection import NoInjection
@@ -102,14 +103,7 @@ class FlightLogger:
         if phase is not self._phase:
             self._phase = phase
             self.note(stamp_s, "phase", phase.value, state)
-        texts = session.telemetry.texts
-        for received in texts.since(self._texts):
-            if self._noted_texts <= _MOST_TEXTS:
-                last = self._noted_texts == _MOST_TEXTS
-                text = "further texts are not recorded" if last else received.text
-                self.note(stamp_s, "autopilot", text, state)
-                self._noted_texts += 1
-        self._texts = texts.total
+        self.log_texts(stamp_s, session.telemetry)
         for text in injection.news():
             self.note(stamp_s, "fault", text, state)
         if companion is not None:
@@ -127,6 +121,17 @@ class FlightLogger:
                     replans=0 if pilot is None else pilot.counters.replans,
                 )
             )
+
+    def log_texts(self, stamp_s: float, telemetry: Telemetry) -> None:
+        """Log the autopilot's new texts."""
+        texts = telemetry.texts
+        for received in texts.since(self._texts):
+            if self._noted_texts <= _MOST_TEXTS:
+                last = self._noted_texts == _MOST_TEXTS
+                text = "further texts are not recorded" if last else received.text
+                self.note(stamp_s, "autopilot", text, telemetry.state)
+                self._noted_texts += 1
+        self._texts = texts.total
 
     def _log_companion(
         self, companion: Companion, stamp_s: float, session: OffboardSession

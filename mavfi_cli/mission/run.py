@@ -33,8 +33,9 @@ from mavfi_cli.core.files import (
 )
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
-from mavfi_cli.core.types import FlightTruth, Outcome, Reaction
+from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.mission.companion_flight import CompanionFlight
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
@@ -42,6 +43,7 @@ from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
 from mavfi_cli.mission.shared_flight import SharedFlight
 from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
@@ -78,6 +80,8 @@ def fly_mission(
             its record could not be written.
     """
     config = config.with_firmware()
+    if config.companion is not None:
+        return _fly_companion(config, out, watcher)
     parts = CompanionParts.of(config)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
@@ -113,6 +117,41 @@ def fly_mission(
             **_host(config, flight, truth),
         }
         _write(config, flight, companion, folder, host, truth, crash)
+    return folder
+
+
+def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder:
+    """Fly a user's companion. Raises as `fly_mission`."""
+    assert config.companion is not None
+    programs = CompanionConfig.load(config.companion)
+    started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
+    injection = NoInjection()
+    with interruptible() as interrupt, other_end(config) as (link, vehicle):
+        assert vehicle is not None
+        flight = CompanionFlight(config, programs, link, watcher, interrupt, injection)
+        with contextlib.closing(flight):
+            briefing = vehicle.await_briefing(interrupt)
+            folder = RunFolder.new(out, config.world, config.seed)
+            injection.begin(folder.fault)
+            flight_begun_s = time.perf_counter()
+            flight.fly(folder, briefing)
+        flight_wall_s = time.perf_counter() - flight_begun_s
+        if failure := vehicle.end():
+            flight.explain(str(failure))
+    host = {
+        "started": started.isoformat(timespec="seconds"),
+        "startup_s": round(flight_begun_s - begun_s, 3),
+        "flight_wall_s": round(flight_wall_s, 3),
+        **_host(config, flight, vehicle.truth),
+    }
+    goal = briefing.goal_enu_m
+    near_m = programs.success.goal_m or config.loaded_stack().goal_tolerance_m
+    config = replace(config, goal_tolerance_m=near_m)
+    result = _flown(config, flight, host, vehicle.truth, goal)
+    result |= {"pilot": {}, "plans": [], "programs": flight.programs}
+    log = None if vehicle.truth is None else vehicle.truth.log
+    write_parquet(folder.trace, flight.trace.table(log))
+    write_json(folder.result, result)
     return folder
 
 
@@ -181,7 +220,9 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 # Record -------------------------------------------------------------------------------------------
 
 
-def _host(config: MissionConfig, flight: Flight, truth: FlightTruth | None) -> dict[str, Any]:
+def _host(
+    config: MissionConfig, flight: Flight | CompanionFlight, truth: FlightTruth | None
+) -> dict[str, Any]:
     """Return measurements of this machine, which differ between repetitions."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     of_vehicle = {} if truth is None else truth.stage_wall_s
@@ -211,39 +252,22 @@ def _write(
     truth: FlightTruth | None,
     crash: str | None,
 ) -> None:
-    log, report = (None, {}) if truth is None else (truth.log, truth.report)
-    assert flight.outcome is not None
-    fault, goal = config.fault or config.instruction, companion.pilot.goal_enu_m
-    flown = flight.trace.motion() if log is None else log
+    log, goal = None if truth is None else truth.log, companion.pilot.goal_enu_m
     failures = dict(companion.plan_failures)
-    files = {name: file_digest(name) for name in config.files}
+    config = replace(config, goal_tolerance_m=flight.stack.goal_tolerance_m)
     result = {
-        "schema": 1,
-        "outcome": flight.outcome.value,
-        "reason": flight.reason,
-        "config": replace(config, goal_tolerance_m=flight.stack.goal_tolerance_m).to_dict(),
-        "seeds": {"root": config.seed, "fault": fault.seed if fault else None},
-        "simulated_s": flight.end_s - flight.begun_s,
-        "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal),
+        **_flown(config, flight, host, truth, goal),
         "pilot": asdict(companion.pilot.counters),
         **_nodes(companion),
         "images": {"received": flight.images.received, "lost": flight.images.lost},
         "measured_platform": companion.latency.summary(),
         "response_time_s": response_times(companion.reactions),
-        "events": [asdict(event) for event in flight.logger.events],
         "plans": [
             {"stamp_s": plan.stamp_s, "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist()}
             for plan in companion.plans
         ],
-        "fault": flight.injection.finish(),
         "detection": companion.protection.summary(),
-        "goal_enu_m": goal.tolist(),
-        "world": report.get("world"),
-        "referee": {key: part for key, part in report.items() if key != "world"} or None,
-        "versions": installed_versions(),
-        "host": host,
         **({"plan_failures": failures} if failures else {}),
-        **({"files": files} if files else {}),
     }
     write_parquet(folder.trace, flight.trace.table(log))
     folder.write_plans(companion.plans)
@@ -253,6 +277,37 @@ def _write(
     if errors := [text for text in tracebacks if text]:
         write_text(folder.crash, "\n".join(errors))
     write_json(folder.result, result)
+
+
+def _flown(
+    config: MissionConfig,
+    flight: Flight | CompanionFlight,
+    host: dict[str, Any],
+    truth: FlightTruth | None,
+    goal_enu_m: FloatArray,
+) -> dict[str, Any]:
+    """Return the sections that every flight's record has."""
+    assert flight.outcome is not None
+    fault, report = config.fault or config.instruction, {} if truth is None else truth.report
+    flown = flight.trace.motion() if truth is None else truth.log
+    files = {name: file_digest(name) for name in config.files}
+    return {
+        "schema": 1,
+        "outcome": flight.outcome.value,
+        "reason": flight.reason,
+        "config": config.to_dict(),
+        "seeds": {"root": config.seed, "fault": fault.seed if fault else None},
+        "simulated_s": flight.end_s - flight.begun_s,
+        "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal_enu_m),
+        "events": [asdict(event) for event in flight.logger.events],
+        "fault": flight.injection.finish(),
+        "goal_enu_m": goal_enu_m.tolist(),
+        "world": report.get("world"),
+        "referee": {key: part for key, part in report.items() if key != "world"} or None,
+        "versions": installed_versions(),
+        "host": host,
+        **({"files": files} if files else {}),
+    }
 
 
 def _nodes(companion: Companion) -> dict[str, Any]:

@@ -63,6 +63,7 @@ class RunFolder:
         self.picture = path / "flight.svg"  # the flight from above, and its height
         self.fault = path / FAULT  # fault record, on disk before the fault strikes
         self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
+        self.programs = path / "programs"  # outputs of a user's companion, by program
         self.golden = path / "golden"  # run folder of the golden run of the pair
 
     @classmethod
@@ -340,6 +341,8 @@ class Run:
             why = "an interrupted flight does not repeat"
         elif record.config.get("link") is not None:
             why = "a flight of a foreign autopilot does not repeat"
+        elif record.config.get("companion") is not None:
+            why = "a flight of a user's companion does not repeat"
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times does not repeat"
         config = structure(dict(record.config), MissionConfig, path=self.folder.result)

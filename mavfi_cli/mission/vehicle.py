@@ -14,15 +14,16 @@ import signal
 import socket
 import subprocess
 import tempfile
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mavfi_cli.core.errors import MavfiError, VehicleProcessError, described
+from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
@@ -32,6 +33,7 @@ from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionCo
 
 _START_LIMIT_S = 120.0  # of a camera; its first start compiles
 _END_LIMIT_S = 20.0
+_LOOK_S = 0.2
 
 
 class Vehicle(ABC):
@@ -48,7 +50,8 @@ class Vehicle(ABC):
     @staticmethod
     def start(config: MissionConfig) -> Vehicle:
         """Start the vehicle in this process, or in its own if both run by the wall clock."""
-        return (VehicleProcess if config.realtime else VehicleInProcess)(config)
+        by_wall = config.realtime or config.companion is not None
+        return (VehicleProcess if by_wall else VehicleInProcess)(config)
 
     @abstractmethod
     def briefing(self) -> Briefing:
@@ -57,6 +60,26 @@ class Vehicle(ABC):
         Raises:
             VehicleProcessError: There is no briefing.
         """
+
+    def await_briefing(self, interrupts: Sequence[int]) -> Briefing:
+        """Wait for the vehicle's first bytes, and return its briefing.
+
+        Raises:
+            VehicleProcessError: It has sent nothing in time, or has ended.
+            Interrupted: The user asked for the end.
+        """
+        deadline_s = time.monotonic() + _START_LIMIT_S
+        while not select.select([self.link.fileno()], [], [], _LOOK_S)[0]:
+            if interrupts:
+                raise Interrupted("interrupted")
+            if time.monotonic() > deadline_s:
+                raise VehicleProcessError(f"the vehicle sent nothing within {_START_LIMIT_S:g} s")
+        try:
+            return self.briefing()
+        except VehicleProcessError:
+            if failure := self.end():
+                raise failure from None
+            raise
 
     @abstractmethod
     def end(self) -> VehicleProcessError | None:
@@ -183,7 +206,10 @@ class VehicleProcess(Vehicle):
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
         """Return module and arguments of the process, given the descriptor of its link."""
-        line = ["sitl", *_arguments(config), "--fd", str(descriptor)]
+        line = ["sitl", *_arguments(config)]
+        if config.companion is not None:
+            return [*line, "--link", f"onboard=fd:{descriptor}", "--speed", repr(config.speed)]
+        line += ["--fd", str(descriptor)]
         if config.autopilot == OWN_AUTOPILOT:  # real firmware is paced by the wall clock alone
             line.append("--lockstep")
         return [*line, "--speed", "1"] if config.realtime else line

@@ -38,6 +38,8 @@ def outcome_line(result: dict[str, Any]) -> str:
     """Return the outcome and its reason in one line."""
     flight = record_of(result)
     text = _OUTCOMES.get(flight.outcome, flight.outcome)
+    if flight.programs:  # success and failure have the reasons of a user's companion
+        text = text.partition(":")[0]
     return f"{text} ({flight.reason})" if flight.reason else text
 
 
@@ -51,11 +53,14 @@ def summary_lines(result: dict[str, Any]) -> list[str]:
     if config["link"] is not None:
         where = f" in {config['world']}" if config["world"] else ""
         flown = f"foreign autopilot at {config['link']}{where}, seed {config['seed']}"
+    if config.get("companion"):
+        with_what = f"companion {config['companion']}, {config['speed']:g} x real time"
     lines = [outcome_line(result), "", f"Mission     {flown}; {with_what}", *_flight_lines(flight)]
     if pose := (flight.referee or {}).get("pose"):
         lines.append(f"Referee     on {pose}")
     lines += _fault_lines(flight.fault)
     lines += _node_lines(flight.nodes)
+    lines += _program_lines(flight.programs)
     lines += _detection_lines(flight.detection, DetectionCost.of(result))
     response = flight.response_time_s
     if response.get("median") is not None:
@@ -89,14 +94,19 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
     qof, counters = flight.quality_of_flight, flight.pilot
     if qof["flight_time_s"] is None:
         return ["Flight      none: the mission ended before the companion took over"]
-    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
-    wanted, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
-    why = ", ".join(f"{reason} {n}x" for reason, n in flight.plan_failures.items())
-    return [
+    lines = [
         f"Flight      {_number(qof['flight_time_s'], 's')}, "
         f"{_number(qof['distance_m'], 'm')} flown, "
         f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
+    ]
+    if not counters:  # of a user's companion
+        return lines
+    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
+    wanted, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
+    why = ", ".join(f"{reason} {n}x" for reason, n in flight.plan_failures.items())
+    return [
+        *lines,
         f"Plans       {wanted} requested: {flown} flown{f' ({again} replans)' if again else ''}, "
         f"{failed} failed{f' ({why})' if why else ''}, {wanted - flown - failed} not used",
         f"Obstacles   {counters['collisions_foreseen']} collisions predicted, "
@@ -136,6 +146,14 @@ def _node_lines(nodes: Section) -> list[str]:
             ends.append(f"hung {node['hangs']} times" if node["hangs"] > 1 else "hung once")
         if ends:
             lines.append(f"Node        {name}: {'; '.join(ends)}; restarted {node['restarts']}x")
+    return lines
+
+
+def _program_lines(programs: Section) -> list[str]:
+    lines = []
+    for name, program in programs.items():
+        ends = ", ".join(map(str, program["codes"])) or "runs until the end"
+        lines.append(f"Program     {name}: started {program['starts']}x; exit codes: {ends}")
     return lines
 
 

@@ -60,6 +60,7 @@ LIMITS = {  # minimum and maximum of each number
     "world_seed": (0, 2**31 - 1),
     "camera_columns": (4, 1024),
     "camera_rows": (4, 1024),
+    "speed": (0.01, 100.0),
 }
 
 
@@ -100,6 +101,8 @@ class MissionConfig:
         node_restart_s: Simulated time from the death of a node to its restart, s.
         node_watchdog_s: Simulated time after which a busy node counts as hung and is killed, s.
         isolate: Nodes that run in processes of their own; does not change the record.
+        companion: TOML file or command line of a user's companion, which flies in place of mavfi's.
+        speed: Pace of the vehicle that a user's companion flies, in times real time.
     """
 
     world: str = "dense"
@@ -136,6 +139,8 @@ class MissionConfig:
     detector: DetectorConfig | None = None
     isolate: tuple[str, ...] = ()
     world_seed: int | None = None
+    companion: str | None = None
+    speed: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "planner", canonical_planner(self.planner))
@@ -162,6 +167,7 @@ class MissionConfig:
         self._check_link()
         self._check_platform()
         self._check_autopilot()
+        self._check_companion()
         for node in self.isolate:
             if node not in KERNELS:
                 raise UnknownName("node", node, KERNELS)
@@ -185,6 +191,15 @@ class MissionConfig:
         for name in OF_THE_WORLD:
             if getattr(self, name) != getattr(plain, name):
                 raise ConfigError("has no effect with --link unless --eyes is given", key=name)
+
+    def _check_companion(self) -> None:
+        if self.companion is None:
+            if self.speed != 1.0:
+                raise ConfigError("needs --companion", key="speed")
+            return
+        for name in ("link", "realtime", "instruction", "detector", "isolate", "land"):
+            if getattr(self, name):
+                raise ConfigError("cannot be combined with --companion", key=name)
 
     def _check_platform(self) -> None:
         if PlatformProfile.factor_of(self.platform) is None:
@@ -227,6 +242,8 @@ class MissionConfig:
             del values["loss_limit_s"], values["eyes"], values["origin"]
         elif not self.eyes:  # the flight had no world
             values.update(dict.fromkeys(OF_THE_WORLD))
+        if self.companion is None:
+            del values["companion"], values["speed"]
         return values
 
     @property
@@ -245,6 +262,7 @@ class MissionConfig:
             or self.isolate
             or self.realtime
             or self.link is not None
+            or self.companion is not None
             or self.autopilot != OWN_AUTOPILOT
         )
         return None if alone else replace(self, fault=None)
@@ -261,7 +279,8 @@ class MissionConfig:
         stack = self.stack.partition(":")[0]  # without the differences of a variant
         named = (self.world, self.platform, stack, self.vehicle)
         files = tuple(name for name in named if name.endswith(".toml"))
-        return files + tuple(name for name in (model, self.firmware) if name)
+        companion = self.companion if (self.companion or "").endswith(".toml") else None
+        return files + tuple(name for name in (model, self.firmware, companion) if name)
 
     def loaded_stack(self) -> Stack:
         """Load the stack of the mission, with its goal tolerance. Raises as `load_stack`."""

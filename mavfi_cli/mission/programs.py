@@ -1,0 +1,275 @@
+"""Starts the programs of a user's companion, and ends them whatever happens.
+
+A worker of the fork server runs one program: it starts it, keeps its output, restarts it by its
+rule, and then stays, because a program's own children may live on. Its guard kills the worker and
+all descendants of the program when the mission ends, is killed, or closes the program.
+
+The worker reports by appending lines of JSON to a file: {"started": PID}, {"ended": CODE}, where a
+negative code is a signal, and {"ready": true}. The mission reads them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import ScratchFolder, open_own, own_folder
+from mavfi_cli.core.fork_server import PACKET, ForkServer
+
+_EVENTS = "events.jsonl"
+_STREAMS = ("stdout", "stderr")
+_MOST_BYTES = 16 << 20  # of a stream that is kept; the rest is read and dropped
+_CHUNK, _LOOK_S = 1 << 16, 0.05
+_MOST_LINE = 4096  # bytes of a line that is searched for readiness
+_LONGEST_S = 1e6
+_GRACE_S = 2.0  # time to end after SIGTERM
+
+
+# The mission's side -------------------------------------------------------------------------------
+
+
+class Programs:
+    """The running programs of one companion. Closing ends them and all of their descendants.
+
+    Args:
+        folder: Folder for the outputs of the programs, one folder per program.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._scratch = ScratchFolder("companion")
+        self._server = ForkServer(__name__)
+        self._running: dict[str, RunningProgram] = {}
+
+    def start(self, name: str, task: Mapping[str, Any]) -> RunningProgram:
+        """Start a program. `task` has the keys of `perform`'s task.
+
+        Raises:
+            MavfiError: It cannot be started.
+        """
+        place = own_folder(self._folder / name).resolve()
+        own = self._scratch.path / name
+        channel = self._server.start({**task, "out": str(place)}, own, _LONGEST_S)
+        program = self._running[name] = RunningProgram(name, place, channel)
+        return program
+
+    def close(self) -> None:
+        """Ask the programs to end, then kill what remains of them. May be called repeatedly."""
+        for program in self._running.values():
+            program.terminate()
+        deadline_s = time.monotonic() + _GRACE_S
+        for program in self._running.values():
+            while program.poll() and program.pid is not None and time.monotonic() < deadline_s:
+                time.sleep(_LOOK_S)
+            program.close()
+        self._running.clear()
+        self._server.close()
+        self._scratch.close()
+
+
+class RunningProgram:
+    """A started program, as its worker reports it.
+
+    Attributes:
+        pid: Its process, which leads a process group; None while it does not run.
+        codes: Exit codes of its processes so far; a negative one is a signal.
+        ready: The line of its readiness has appeared.
+    """
+
+    def __init__(self, name: str, folder: Path, channel: socket.socket) -> None:
+        self.name = name
+        self.pid: int | None = None
+        self.codes: list[int] = []
+        self.starts = 0
+        self.ready = False
+        self._channel, self._rest = channel, b""
+        self._events = open(open_own(folder / _EVENTS, os.O_RDONLY), "rb")  # noqa: SIM115
+
+    def poll(self) -> bool:
+        """Read the worker's reports. Return False if the worker itself is gone."""
+        *lines, self._rest = (self._rest + self._events.read()).split(b"\n")
+        for line in lines:
+            event = json.loads(line)
+            if "started" in event:
+                self.pid, self.starts = int(event["started"]), self.starts + 1
+            elif "ended" in event:
+                self.pid = None
+                self.codes.append(int(event["ended"]))
+            self.ready = self.ready or "ready" in event
+        poller = select.poll()
+        poller.register(self._channel, 0)
+        return not poller.poll(0)
+
+    def failure(self) -> str:
+        """Return why the worker is gone."""
+        while packet := self._channel.recv(PACKET):
+            if report := (json.loads(packet).get("report") or {}):
+                return str(report.get("text") or report.get("traceback"))
+        return "its process was killed"
+
+    def signal(self, number: int, *, group: bool = False) -> bool:
+        """Send a signal to its process, or to its process group. Return False if there is none."""
+        self.poll()
+        if self.pid is None:
+            return False
+        try:
+            (os.killpg if group else os.kill)(self.pid, number)
+        except ProcessLookupError:
+            return False
+        return True
+
+    def terminate(self) -> None:
+        """Ask it to end; a stopped program continues for that."""
+        for number in (signal.SIGCONT, signal.SIGTERM):
+            self.signal(number, group=True)
+
+    def close(self) -> None:
+        """Kill it and all of its descendants."""
+        self._channel.close()
+        self._events.close()
+
+
+# The worker's side --------------------------------------------------------------------------------
+
+
+def prepare() -> None:
+    """Load nothing further."""
+
+
+def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
+    """Run a program until the guard ends this process.
+
+    Args:
+        task: "argv", "folder", "environment", "restart", "restart_s" and "ready_line", as in
+            `ProgramConfig`; "out", the folder for stdout, stderr and the reports.
+    """
+    out = Path(task["out"])
+    events = open_own(out / _EVENTS, os.O_WRONLY | os.O_APPEND)
+
+    def report(**event: Any) -> None:
+        os.write(events, json.dumps(event).encode() + b"\n")
+
+    with contextlib.ExitStack() as undo:
+        kept = {name: _Kept(undo, out / name) for name in _STREAMS}
+        while True:
+            code = _run(task, kept, report)
+            report(ended=code)
+            if not (task["restart"] == "always" or (task["restart"] == "on-failure" and code)):
+                break
+            _pump(kept, report, None, time.monotonic() + float(task["restart_s"]))
+        _pump(kept, report, None, time.monotonic() + _LONGEST_S)
+    raise MavfiError("the flight outlasted its programs")
+
+
+class _Kept:
+    """The file of an output, up to a limit."""
+
+    def __init__(self, undo: contextlib.ExitStack, path: Path) -> None:
+        self._file: BinaryIO = undo.enter_context(
+            open(open_own(path, os.O_WRONLY | os.O_TRUNC), "wb")  # noqa: SIM115
+        )
+        self._left = _MOST_BYTES
+        self.pipes: list[int] = []
+
+    def write(self, data: bytes) -> None:
+        kept, self._left = data[: self._left], max(0, self._left - len(data))
+        if kept:
+            self._file.write(kept)
+            self._file.flush()
+            if not self._left:
+                self._file.write(b"\n[mavfi keeps no more of this output]\n")
+                self._file.flush()
+
+
+class _Ready:
+    """Searches the lines of stdout for the one that tells readiness."""
+
+    def __init__(self, pattern: str | None) -> None:
+        self._pattern = None if pattern is None else re.compile(pattern.encode())
+        self._line = b""
+
+    def found_in(self, data: bytes) -> bool:
+        if self._pattern is None:
+            return False
+        *lines, rest = (self._line + data).split(b"\n")
+        self._line = rest[-_MOST_LINE:]
+        if any(self._pattern.search(line) for line in (*lines, rest)):
+            self._pattern = None
+            return True
+        return False
+
+
+def _run(task: Mapping[str, Any], kept: Mapping[str, _Kept], report: Any) -> int:
+    """Start the program and keep its output until it ends. Return its exit code."""
+    try:
+        process = subprocess.Popen(
+            task["argv"], cwd=task["folder"], env={**os.environ, **task["environment"]},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            start_new_session=True,
+        )  # fmt: skip
+    except OSError as error:
+        raise MavfiError(f"cannot run {task['argv'][0]}: {error.strerror}") from None
+    report(started=process.pid)
+    for name in _STREAMS:
+        pipe = getattr(process, name)
+        os.set_blocking(pipe.fileno(), False)
+        kept[name].pipes.append(os.dup(pipe.fileno()))
+        pipe.close()
+    _pump(kept, report, _Ready(task["ready_line"]), time.monotonic() + _LONGEST_S, process)
+    return process.wait()
+
+
+def _pump(
+    kept: Mapping[str, _Kept],
+    report: Any,
+    ready: _Ready | None,
+    until_s: float,
+    process: subprocess.Popen[bytes] | None = None,
+) -> None:
+    """Keep the outputs until a process has ended, or until a time."""
+    ended = None if process is None else os.pidfd_open(process.pid)
+    try:
+        while (left_s := until_s - time.monotonic()) > 0.0:
+            poller = select.poll()
+            for descriptor in _open_pipes(kept):
+                poller.register(descriptor, select.POLLIN)
+            if ended is not None:
+                poller.register(ended, select.POLLIN)
+            events = [number for number, _ in poller.poll(1e3 * min(left_s, 3600.0))]
+            for name, output in kept.items():
+                for pipe in [pipe for pipe in output.pipes if pipe in events]:
+                    data = _read(pipe, output)
+                    output.write(data)
+                    if ready is not None and name == "stdout" and ready.found_in(data):
+                        report(ready=True)
+            if ended in events:
+                return
+    finally:
+        if ended is not None:
+            os.close(ended)
+
+
+def _open_pipes(kept: Mapping[str, _Kept]) -> Iterator[int]:
+    for output in kept.values():
+        yield from output.pipes
+
+
+def _read(pipe: int, output: _Kept) -> bytes:
+    """Return the waiting bytes of a pipe; close it at its end."""
+    with contextlib.suppress(BlockingIOError):
+        if data := os.read(pipe, _CHUNK):
+            return data
+        output.pipes.remove(pipe)
+        os.close(pipe)
+    return b""

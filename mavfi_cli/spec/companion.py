@@ -1,0 +1,184 @@
+"""A user's own companion: its programs, and when its flight has succeeded."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from mavfi_cli.core.config import load_toml
+from mavfi_cli.core.errors import ConfigError, UnknownName
+
+RESTARTS = ("never", "on-failure", "always")
+ANY_PORT = "udpin:127.0.0.1:0"
+_PLACEHOLDER = re.compile(r"\{([a-z]+)\}")
+_LONGEST_S = 3600.0
+
+
+def _require_range(key: str, value: float | None, low: float, high: float) -> None:
+    if value is not None and not low <= value <= high:
+        raise ConfigError(f"must be between {low:g} and {high:g}, got {value:g}", key=key)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProgramConfig:
+    """One program of a companion.
+
+    Attributes:
+        command: Command line. Words in braces are filled in.
+        folder: Working folder, relative to the file of the companion.
+        environment: Variables added to mavfi's own environment.
+        restart: Rule after its end: never, on-failure or always.
+        restart_s: Wall-clock time from its end to its restart, s.
+        ready_line: Regular expression of a line on stdout after which it is ready.
+        ready_port: TCP port of this machine that it opens when it is ready.
+        ready_heartbeat: It is ready when its first MAVLink heartbeat arrives.
+        ready_limit_s: Longest wall-clock time until it is ready, s.
+    """
+
+    command: str
+    folder: str = "."
+    environment: dict[str, str] = field(default_factory=dict)
+    restart: str = RESTARTS[0]
+    restart_s: float = 1.0
+    ready_line: str | None = None
+    ready_port: int | None = None
+    ready_heartbeat: bool = False
+    ready_limit_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not _words(self.command):
+            raise ConfigError("must name a program", key="command")
+        if self.restart not in RESTARTS:
+            raise UnknownName("restart rule", self.restart, RESTARTS)
+        _require_range("restart_s", self.restart_s, 0.0, _LONGEST_S)
+        _require_range("ready_port", self.ready_port, 1, 65_535)
+        _require_range("ready_limit_s", self.ready_limit_s, 0.1, _LONGEST_S)
+        try:
+            re.compile(self.ready_line or "")
+        except re.error as error:
+            raise ConfigError(f"is no regular expression: {error}", key="ready_line") from None
+
+    def argv(self, values: Mapping[str, str]) -> list[str]:
+        """Return the words of the command with the placeholders filled in.
+
+        Raises:
+            UnknownName: A word in braces is no placeholder. The message suggests the nearest.
+        """
+
+        def filled(match: re.Match[str]) -> str:
+            if match[1] not in values:
+                raise UnknownName("placeholder", match[1], values)
+            return values[match[1]]
+
+        return [_PLACEHOLDER.sub(filled, word) for word in _words(self.command)]
+
+
+def _words(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f"cannot be split into words: {error}", key="command") from None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SuccessConfig:
+    """When a flight has succeeded: all conditions that are given, and no collision.
+
+    Attributes:
+        goal_m: The vehicle is at rest within this distance of the goal, m.
+        landed: The vehicle stands on the ground, disarmed, after a flight.
+        exit: This program has ended with code 0.
+        corridor_m: The vehicle was never farther than this from the path of `golden`, m.
+        golden: Run folder of the flight whose path `corridor_m` refers to.
+    """
+
+    goal_m: float | None = None
+    landed: bool = False
+    exit: str | None = None
+    corridor_m: float | None = None
+    golden: str | None = None
+
+    def __post_init__(self) -> None:
+        _require_range("goal_m", self.goal_m, 0.1, 50.0)
+        _require_range("corridor_m", self.corridor_m, 0.01, 1e4)
+        if (self.corridor_m is None) != (self.golden is None):
+            raise ConfigError("needs both corridor_m and golden, a run folder", key="corridor_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompanionConfig:
+    """A companion: its programs by name, its link, and its success.
+
+    Attributes:
+        program: Programs in the order in which they start; each waits until the one before is
+            ready.
+        link: mavfi's end of the companion's MAVLink link. `udpin` with port 0 listens on a free
+            port; `udpout` calls a program that listens on a fixed one, as PX4 does.
+        success: When the flight has succeeded; by default when the last program has ended with
+            code 0.
+        time_limit_s: Limit of simulated time from arming, s; None for the mission's.
+        flight_s: Simulated time from arming over which random faults are drawn, s; None for the
+            straight way to the goal at the speed limit.
+    """
+
+    program: dict[str, ProgramConfig]
+    link: str = ANY_PORT
+    success: SuccessConfig = field(default_factory=SuccessConfig)
+    time_limit_s: float | None = None
+    flight_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.program:
+            raise ConfigError("must have at least one program", key="program")
+        for name in self.program:
+            if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
+                raise ConfigError(f"must have letters, digits, - and _, got {name!r}", key=name)
+        _require_range("time_limit_s", self.time_limit_s, 1.0, 86_400.0)
+        _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
+        if self.success.exit is not None and self.success.exit not in self.program:
+            raise UnknownName("program", self.success.exit, self.program)
+        if self.success == SuccessConfig():
+            last = SuccessConfig(exit=list(self.program)[-1])
+            object.__setattr__(self, "success", last)
+
+    @classmethod
+    def load(cls, given: str) -> CompanionConfig:
+        """Load a companion from a TOML file, or make one of a command line.
+
+        Raises:
+            ConfigError: The file cannot be used, or a program cannot be started.
+            UnknownName: A name in it does not exist.
+        """
+        path = Path(given)
+        if path.suffix == ".toml":
+            loaded = load_toml(path, cls)
+            base = path.resolve().parent
+        else:
+            loaded, base = cls(program={"companion": ProgramConfig(command=given)}), Path.cwd()
+        placed = {
+            name: replace(program, folder=str(base / program.folder))
+            for name, program in loaded.program.items()
+        }
+        for name, program in placed.items():
+            _require_startable(name, program)
+        return replace(loaded, program=placed)
+
+
+def _require_startable(name: str, program: ProgramConfig) -> None:
+    """Refuse a program that does not exist, or that mavfi could not end."""
+    word = _words(program.command)[0]
+    if not Path(program.folder).is_dir():
+        raise ConfigError(f"no such folder: {program.folder}", key=f"program.{name}.folder")
+    place = str(Path(program.folder) / word) if "/" in word else word
+    path = program.environment.get("PATH", os.environ.get("PATH"))
+    if (binary := shutil.which(place, path=path)) is None:
+        raise ConfigError(f"no program {word!r} that can be executed", key=f"program.{name}")
+    if os.stat(binary).st_mode & (stat.S_ISUID | stat.S_ISGID):
+        problem = f"{word} is set-uid or set-gid, so mavfi could neither end nor attack it"
+        raise ConfigError(problem, key=f"program.{name}")

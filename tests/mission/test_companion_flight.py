@@ -1,0 +1,145 @@
+"""Flights of a user's own companion: the outcome, the record, and what becomes of bad ones."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mavfi_cli import library
+from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, UnknownName
+from mavfi_cli.link.codec import Codec
+from mavfi_cli.mission.run import fly_again
+from mavfi_cli.report.summary import summary_lines
+from mavfi_cli.report.top_view import draw_top_view
+from mavfi_cli.report.view.entries import ViewedFlight
+from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.mission import MissionConfig
+
+HOP = Path(__file__).with_name("hop.py")
+SPEED = 4.0
+
+
+@pytest.fixture
+def fly(tmp_path):
+    """A function that flies the hop in an empty scene; arguments are keys of the companion."""
+
+    def flown(end, *, success="landed = true", program="", limit_s=60.0, **settings):
+        companion = tmp_path / "hop.toml"
+        companion.write_text(
+            f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} {SPEED} {end}'\n"
+            f"{program}\n[success]\n{success}\n"
+        )
+        return library.fly(
+            companion=str(companion), world="farm", speed=SPEED, time_limit_s=limit_s,
+            out=tmp_path / "runs", **settings,
+        )  # fmt: skip
+
+    return flown
+
+
+@pytest.mark.slow
+def test_a_flight_leaves_a_record_as_any_other(fly):
+    run = fly("lands", program='ready_line = "ready"')
+    record, quality = run.record, run.record.quality_of_flight
+    assert (record.outcome, record.reason) == ("success", "landed")
+    assert record.programs == {"hop": {"starts": 1, "codes": []}}
+    assert 8.0 < quality["distance_m"] < 16.0
+    assert quality["min_clearance_m"] > 0.0
+    assert record.config["companion"].endswith("hop.toml")
+    assert list(record.files.values()) != [""]
+    assert (run.folder.programs / "hop" / "stdout").read_text() == "ready\n"
+    columns = {name: run.trace[name].to_numpy() for name in run.trace.column_names}
+    commanded = columns["command_vy"][columns["phase"] == "OFFBOARD"]
+    assert {0.0, 2.0} <= set(np.round(commanded[~np.isnan(commanded)], 6))
+    assert np.nanmax(np.abs(columns["x_m"] - columns["truth_x_m"])) < 0.2
+    data = run.folder.tlog.read_bytes()
+    kinds = {m.get_type() for m in Codec(0, 0).decode(data)}
+    assert {"HEARTBEAT", "LOCAL_POSITION_NED", "SET_POSITION_TARGET_LOCAL_NED"} <= kinds
+    assert any("Program     hop: started 1x" in line for line in summary_lines(run.result))
+    draw_top_view(run)
+    assert ViewedFlight(name="flight", run=run, recorder=None).run is run
+    with pytest.raises(RecordError, match="a user's companion does not repeat"):
+        fly_again(run, run.folder.path.parent)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("end", "options", "outcome", "reason"),
+    [
+        ("crashes", {}, "collision", "ground"),
+        ("dies", {"limit_s": 30.0}, "crash", "hop was killed by SIGKILL"),
+        ("waits", {"limit_s": 3.0}, "timeout", "the companion never armed the vehicle"),
+        ("waits", {"program": "ready_port = 1\nready_limit_s = 0.5"}, "crash",
+         "hop was not ready within 0.5 s"),
+    ],
+)  # fmt: skip
+def test_every_end_is_a_result(fly, end, options, outcome, reason):
+    record = fly(end, **options).record
+    assert (record.outcome, record.reason.partition(" at")[0]) == (outcome, reason)
+
+
+@pytest.mark.slow
+def test_a_corridor_around_the_golden_path(fly):
+    golden = fly("lands")
+    near = f"landed = true\ncorridor_m = 3.0\ngolden = '{golden.folder.path}'"
+    assert fly("lands", success=near).record.outcome == "success"
+    strict = near.replace("3.0", "0.01")
+    late = fly("lands", success=strict, limit_s=15.0)
+    assert late.record.outcome == "timeout"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "problem"),
+    [
+        ("[program.a]\ncommand = 'no-such-program'", ConfigError, "no program 'no-such-program'"),
+        ("[program.a]\ncommand = ''", ConfigError, "must name a program"),
+        ("[program.a]\ncommand = \"'\"", ConfigError, "cannot be split"),
+        ("[program.a]\ncomand = 'true'", ConfigError, "did you mean 'command'"),
+        ("[program.a]\ncommand = 'true'\nrestart = 'allways'", ConfigError, "always"),
+        ("[program.a]\ncommand = 'true'\nfolder = 'none'", ConfigError, "no such folder"),
+        ("[program.a]\ncommand = 'true'\nready_line = '('", ConfigError, "no regular expression"),
+        ("[program.a]\ncommand = 'true'\n[success]\nexit = 'b'", ConfigError, "unknown program"),
+        ("[program.a]\ncommand = 'true'\n[success]\ncorridor_m = 1", ConfigError, "golden"),
+        ("link = 'udpin:127.0.0.1:0'\n[program]", ConfigError, "at least one program"),
+        ("[program.a]\ncommand = 'su'", ConfigError, "set-uid"),
+    ],
+)  # fmt: skip
+def test_a_companion_that_cannot_fly_is_refused_before_the_flight(tmp_path, text, error, problem):
+    path = tmp_path / "companion.toml"
+    path.write_text(text)
+    with pytest.raises(error, match=problem):
+        CompanionConfig.load(str(path))
+
+
+def test_a_misspelled_placeholder_names_the_nearest():
+    program = CompanionConfig.load("true {gaol}").program["companion"]
+    with pytest.raises(UnknownName, match="did you mean 'goal'"):
+        program.argv({"goal": "1,2,3", "link": "udpout:127.0.0.1:1"})
+    assert CompanionConfig.load("true {goal} '{\"a\": 1}'").program["companion"].argv(
+        {"goal": "1,2,3"}
+    ) == ["true", "1,2,3", '{"a": 1}']
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"link": "udpin:127.0.0.1:0", "goal": (1.0, 1.0, 5.0)}, {"realtime": True}, {"land": True}],
+)
+def test_settings_that_a_users_companion_cannot_have(settings):
+    with pytest.raises(ConfigError, match="cannot be combined with --companion"):
+        MissionConfig(companion="true", **settings)
+    with pytest.raises(ConfigError, match="needs --companion"):
+        MissionConfig(speed=2.0)
+
+
+def test_the_port_of_another_program_is_told(tmp_path):
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        path = tmp_path / "companion.toml"
+        path.write_text(
+            f"link = 'udpin:127.0.0.1:{taken.getsockname()[1]}'\n[program.a]\ncommand = 'true'"
+        )
+        with pytest.raises(MavfiError, match="is in use"):
+            library.fly(companion=str(path), world="farm", out=tmp_path)

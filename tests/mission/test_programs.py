@@ -1,0 +1,155 @@
+"""Programs of a companion: outputs, readiness and restarts; nothing outlives the flight."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from live_processes import LONG_S, gone
+
+from mavfi_cli.mission.programs import Programs
+
+PYTHON = sys.executable
+
+
+@pytest.fixture
+def start(tmp_path):
+    """A function that starts Python code as a program; all end with the test."""
+    programs = Programs(tmp_path)
+
+    def started(code, *arguments, **rules):
+        task = {
+            "argv": [PYTHON, "-c", code, *map(str, arguments)], "folder": str(tmp_path),
+            "environment": {}, "restart": "never", "restart_s": 0.0, "ready_line": None,
+        }  # fmt: skip
+        return programs.start("program", {**task, **rules})
+
+    started.close = programs.close
+    yield started
+    programs.close()
+
+
+def awaited(program, condition):
+    """Poll a program until a condition holds."""
+    until_s = time.monotonic() + LONG_S
+    while not condition():
+        assert time.monotonic() < until_s, "it never came"
+        assert program.poll(), program.failure()
+        time.sleep(0.01)
+
+
+def test_a_program_has_its_outputs_environment_and_exit_code(start, tmp_path):
+    code = "import os, sys; print(os.environ['COLOUR']); print('no', file=sys.stderr); sys.exit(3)"
+    program = start(code, environment={"COLOUR": "blue"})
+    awaited(program, lambda: program.codes)
+    assert (program.codes, program.starts, program.pid) == ([3], 1, None)
+    folder = tmp_path / "program"
+    assert (folder / "stdout").read_text() == "blue\n"
+    assert (folder / "stderr").read_text() == "no\n"
+
+
+def test_a_line_tells_readiness_before_the_end(start):
+    program = start("import time; print('half'); print('the port is open', flush=True)\n"
+                    "time.sleep(600)", ready_line="port is")  # fmt: skip
+    awaited(program, lambda: program.ready)
+    assert program.codes == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "code", "starts"), [("on-failure", 0, 1), ("never", 1, 1), ("on-failure", 1, 4)]
+)
+def test_restarts_follow_the_rule(start, tmp_path, rule, code, starts):
+    count = "import os, sys; n = len(os.listdir('.')); open(str(n), 'w'); "
+    program = start(f"{count}sys.exit({code} if n < 4 else 0)", restart=rule)
+    awaited(program, lambda: len(program.codes) == starts)
+    time.sleep(0.2)
+    program.poll()
+    assert program.starts == starts
+
+
+def test_a_flood_of_output_is_kept_up_to_a_limit(start, tmp_path):
+    program = start("import sys\nfor _ in range(400): sys.stdout.write('x' * 100_000)")
+    awaited(program, lambda: program.codes)
+    size = (tmp_path / "program" / "stdout").stat().st_size
+    assert (16 << 20) <= size < (16 << 20) + 100
+    assert program.codes == [0]
+
+
+FORKS = """
+import os, signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+if not os.fork():
+    os.setsid()
+    if os.fork():
+        os._exit(0)
+    with open(sys.argv[1], "w") as file:
+        file.write(str(os.getpid()))
+    os.rename(sys.argv[1], sys.argv[1] + ".done")
+    time.sleep(600)
+os.wait()
+{last}
+"""
+
+
+@pytest.mark.parametrize("last", ["time.sleep(600)", "os.kill(os.getpid(), 9)"])
+def test_daemons_and_programs_that_ignore_sigterm_end_with_the_flight(start, tmp_path, last):
+    place = tmp_path / "daemon"
+    program = start(FORKS.format(last=last), place)
+    done = tmp_path / "daemon.done"
+    awaited(program, done.exists)
+    daemon = int(done.read_text())
+    if "kill" in last:
+        awaited(program, lambda: program.codes)
+        assert program.codes == [-signal.SIGKILL]
+    pid = program.pid
+    os.kill(daemon, 0)  # it lives on after the program that started it
+    start.close()
+    assert gone(daemon)
+    assert pid is None or gone(pid)
+
+
+OWNER = """
+import sys, time
+from pathlib import Path
+from mavfi_cli.mission.programs import Programs
+task = {"argv": [sys.executable, "-c", "import time; time.sleep(600)"], "folder": ".",
+        "environment": {}, "restart": "always", "restart_s": 0.0, "ready_line": None}
+program = Programs(Path(sys.argv[1])).start("program", task)
+while program.pid is None:
+    program.poll()
+print(program.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_no_orphan_after_a_kill_of_the_mission(tmp_path):
+    owner = subprocess.Popen(
+        [PYTHON, "-c", OWNER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    pid = int(owner.stdout.readline())
+    os.kill(pid, 0)
+    owner.kill()
+    owner.wait()
+    owner.stdout.close()
+    assert gone(pid)
+
+
+def test_a_program_that_cannot_run_is_named(start):
+    program = start("", argv=["/etc/passwd"])
+    until_s = time.monotonic() + LONG_S
+    while program.poll():
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+    assert program.failure() == "cannot run /etc/passwd: Permission denied"
+
+
+def test_signals_reach_the_running_process(start):
+    program = start("import time; time.sleep(600)")
+    assert not program.signal(signal.SIGKILL) or program.starts
+    awaited(program, lambda: program.pid is not None)
+    assert program.signal(signal.SIGKILL)
+    awaited(program, lambda: program.codes)
+    assert program.codes == [-signal.SIGKILL]
+    assert not program.signal(signal.SIGKILL)
