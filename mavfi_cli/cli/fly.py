@@ -82,7 +82,7 @@ _detector, _output = section("Detector"), section("Output")
 @_mission("--companion", metavar="FILE|CMD",
           help="Fly with your own companion in place of mavfi's: a TOML file or a command line, in "
                "which {link}, {goal} and others are filled in.")  # fmt: skip
-@_mission("--speed", type=types, default=1.0,
+@_mission("--speed", type=types.ABOVE_ZERO, default=1.0,
           help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
