@@ -13,14 +13,14 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import Labels
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost
+from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost, Record
 from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
@@ -152,7 +152,7 @@ class ComputeOverhead:
 
     @classmethod
     def of(
-        cls, records: Iterable[Mapping[str, Any]], platform: str | None = None
+        cls, records: Iterable[Record], platform: str | None = None
     ) -> dict[str, ComputeOverhead]:
         """The overhead of every detector in these records, summed over its flights.
 
@@ -250,7 +250,7 @@ def recorded_overheads(
     return known
 
 
-def _records(path: Path) -> Iterator[Mapping[str, Any]]:
+def _records(path: Path) -> Iterator[Record]:
     """Records of a run folder, of all runs in a folder, or of all missions of a campaign."""
     if path.is_file() or (path / RESULT).is_file():
         yield load_run(path).result

@@ -41,6 +41,7 @@ from mavfi_cli.core.errors import (
     RecordError,
     TargetError,
 )
+from mavfi_cli.core.files import Json
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.tracer import record
@@ -67,7 +68,7 @@ class Plan:
         """Return the sampling strategy."""
         return Strategy.of(self.rule, self.model, compat=self.compat)
 
-    def to_json(self, target: AttackTarget) -> dict[str, Any]:
+    def to_json(self, target: AttackTarget) -> Json:
         """Return the entries that determine a target's results, except the number of runs."""
         return {
             "seed": self.seed,
@@ -508,7 +509,7 @@ def replay_runs(
 
 
 def _targets(
-    plan: dict[str, Any],
+    plan: Json,
     folder: Path,
     kernels: tuple[str, ...],
     program: ProgramTarget | None,

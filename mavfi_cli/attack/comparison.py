@@ -11,9 +11,9 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import Json
 
 STDOUT = "stdout"
 LARGEST_BYTES = 64 << 20  # of one compared output
@@ -41,7 +41,7 @@ class Difference:
     noticeable: bool = True
     parts: Mapping[str, float] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the entries of a record. A size that is not finite is null."""
         finite = math.isfinite(self.relative)
         return {
@@ -92,11 +92,11 @@ class OutputComparison:
             ignored=tuple(_pattern(text) for text in ignored),
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the entries that determine results."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
-        entries: dict[str, Any] = {"file": names[0] if len(names) == 1 else names}
+        entries: Json = {"file": names[0] if len(names) == 1 else names}
         if self.ignored:
             entries["ignored"] = [pattern.decode() for pattern in self.ignored]
         return entries | {"tolerance": self.tolerance}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
-from mavfi_cli.core.files import open_own, read_json, write_atomically, write_json, writing
+from mavfi_cli.core.files import Json, open_own, read_json, write_atomically, write_json, writing
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 
 PLAN, RUNS = "plan.json", "runs.jsonl"
@@ -108,7 +108,7 @@ class Journal:
             file.write(data)
 
 
-def read_plan(folder: Path) -> dict[str, Any]:
+def read_plan(folder: Path) -> Json:
     """Read the plan of a folder.
 
     Raises:

@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from mavfi_cli.attack.profile import (
 from mavfi_cli.attack.target import RunLimits, RunVerdict, judged, signal_name
 from mavfi_cli.attack.work_folder import WorkFolder
 from mavfi_cli.core.errors import TargetError
-from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.files import Json, ScratchFolder
 from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.linux import ProcessTimer
@@ -102,9 +101,9 @@ class ProgramTarget:
         """The objects in scope."""
         return self.objects or (self.name,)
 
-    def context(self) -> dict[str, Any]:
+    def context(self) -> Json:
         """Return the entries of every record about the program."""
-        entries: dict[str, Any] = {
+        entries: Json = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
             "function": self.function,
@@ -113,7 +112,7 @@ class ProgramTarget:
             entries["stdin"] = str(self.command.stdin)
         return entries
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Json:
         """Return everything that determines the results."""
         entries = self.context() | {
             "comparison": self.comparison.to_json(),
@@ -154,7 +153,7 @@ class _Workplace:
         self._folder = WorkFolder(scratch, target.folder, target.files, self.name)
         self._command = replace(target.command, directory=self._folder.path)
 
-    def context(self) -> dict[str, Any]:
+    def context(self) -> Json:
         exact = self.target.comparison.tolerance == 0.0
         return self.target.context() | (
             {"golden_sha256": self._known_golden().sha256} if exact else {}

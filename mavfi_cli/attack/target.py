@@ -17,6 +17,7 @@ import numpy as np
 from mavfi_cli.attack.comparison import Difference
 from mavfi_cli.attack.place import AttackPlace, Golden, Watch
 from mavfi_cli.attack.profile import TargetProfile
+from mavfi_cli.core.files import Json
 from mavfi_cli.fi.tracer.tracee import Ended
 
 
@@ -69,7 +70,7 @@ class JudgedPlace(AttackPlace, Protocol):
     def limits(self) -> RunLimits:
         """The limits beyond which a run counts as hung."""
 
-    def context(self) -> dict[str, Any]:
+    def context(self) -> Json:
         """Return the entries of every record about the target."""
 
     def profile(self, rng: np.random.Generator, *, windows: int, watch: Watch) -> TargetProfile:
@@ -106,7 +107,7 @@ class AttackTarget(Protocol):
     def stream(self) -> tuple[str, ...]:
         """Name of its random stream; empty if it is the only target of a campaign."""
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Json:
         """Return what determines its results; the same for all targets of a campaign."""
 
     def open(self) -> JudgedPlace:

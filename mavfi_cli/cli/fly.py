@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mavfi_cli.cli import types
-from mavfi_cli.cli.grouped import GroupedCommand, given_options, refuse_given, section, spelling
+from mavfi_cli.cli.grouped import (
+    Given,
+    GroupedCommand,
+    given_options,
+    refuse_given,
+    section,
+    spelling,
+)
 from mavfi_cli.core.errors import ConfigError, FaultSpecError
 from mavfi_cli.core.terminal import echo, echo_lines, note_error
 
@@ -256,7 +263,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
         raise click.UsageError(str(error)) from None
 
 
-def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
+def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
     from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
 
     fault, instruction = _faults(base, given)
@@ -288,7 +295,7 @@ def _replaced(base: MissionConfig, given: dict[str, Any]) -> MissionConfig:
 
 
 def _faults(
-    base: MissionConfig, given: dict[str, Any]
+    base: MissionConfig, given: Given
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
     from mavfi_cli.attack.strategy import mission_strategy
@@ -317,7 +324,7 @@ def _faults(
     return None, fault
 
 
-def _detector_of(base: MissionConfig, given: dict[str, Any]) -> DetectorConfig | None:
+def _detector_of(base: MissionConfig, given: Given) -> DetectorConfig | None:
     from mavfi_cli.spec.detector import DetectorConfig
 
     name = given.get("detector", None if base.detector is None else base.detector.name)

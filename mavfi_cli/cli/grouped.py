@@ -21,6 +21,7 @@ class _GroupedOption(click.Option):
         self.group = group
 
 
+Given = dict[str, Any]  # the values of options by parameter name
 Decorated = TypeVar("Decorated", bound=Callable[..., Any] | click.Command)
 
 
@@ -93,7 +94,7 @@ def _blamed(error: MavfiError) -> tuple[str, str]:
     return "", ""
 
 
-def given_options() -> dict[str, Any]:
+def given_options() -> Given:
     """The options that the user gave to the current command, by parameter name."""
     context = click.get_current_context()
     return {
@@ -103,7 +104,7 @@ def given_options() -> dict[str, Any]:
     }
 
 
-def given_fields(kind: type, **others: Any) -> dict[str, Any]:
+def given_fields(kind: type, **others: Any) -> Given:
     """The options that the user gave, as fields of a plan with the defaults of the command.
 
     Args:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mavfi_cli.cli import types
-from mavfi_cli.cli.grouped import GroupedCommand, given_options, refuse_given, section
+from mavfi_cli.cli.grouped import Given, GroupedCommand, given_options, refuse_given, section
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.core.option_types import Number
@@ -120,7 +120,7 @@ def kernels(**options: Any) -> None:
         _attack(options)
 
 
-def _plan(options: dict[str, Any]) -> Plan:
+def _plan(options: Given) -> Plan:
     from mavfi_cli.attack.campaign import Plan
     from mavfi_cli.fi.tracer.fault import FaultModel
 
@@ -138,7 +138,7 @@ def _plan(options: dict[str, Any]) -> Plan:
     return plan
 
 
-def _attack(options: dict[str, Any]) -> None:
+def _attack(options: Given) -> None:
     from mavfi_cli.attack.campaign import run_campaign
     from mavfi_cli.cli.progress import runs_view
     from mavfi_cli.report.attacks import save_runs, summarise
@@ -174,7 +174,7 @@ def _attack(options: dict[str, Any]) -> None:
         echo("Nothing is saved; --out FOLDER keeps records, tables and plots.")
 
 
-def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
+def _kernels(options: Given, folder: Path) -> Sequence[AttackTarget]:
     from mavfi_cli.attack.kernels.catalogue import select
     from mavfi_cli.mission.kernel_inputs import kernel_flight, kernel_targets
 
@@ -184,7 +184,7 @@ def _kernels(options: dict[str, Any], folder: Path) -> Sequence[AttackTarget]:
     return kernel_targets(kernels, config, folder, options["tolerance"])
 
 
-def _program(options: dict[str, Any]) -> ProgramTarget:
+def _program(options: Given) -> ProgramTarget:
     from mavfi_cli.attack.comparison import OutputComparison
     from mavfi_cli.attack.program import ProgramTarget
     from mavfi_cli.attack.work_folder import copied_arguments

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mavfi_cli.cli import results, types
-from mavfi_cli.cli.grouped import GroupedCommand, given_fields, given_options, refuse_given, section
+from mavfi_cli.cli.grouped import (
+    Given,
+    GroupedCommand,
+    given_fields,
+    given_options,
+    refuse_given,
+    section,
+)
 
 if TYPE_CHECKING:
     from mavfi_cli.analysis.beside_model import FlightsReport
@@ -104,7 +111,7 @@ def vpm(
         raise click.UsageError("--models cannot be combined with --train")
     chosen = [ModelVehicle.load(name) for name in vehicles or ("airsim", "spark")]
     require_named("vehicle", [vehicle.name for vehicle in chosen])
-    loaded: dict[str, Any] = {}
+    loaded: Given = {}
     for name, load in (("platform", load_platform), ("board", Board.load)):
         loaded |= {} if options[name] is None else {name: load(options[name])}
     choices = Choices(**given_fields(Choices, **loaded))

@@ -25,6 +25,7 @@ from typing import Any, BinaryIO
 from mavfi_cli.core.compiled import can_write
 from mavfi_cli.core.errors import RecordError, lack_of
 
+Json = dict[str, Any]  # an object of JSON, as plain values
 _LARGEST = 1 << 32  # bytes of a table
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
@@ -79,7 +80,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
         return file.read(limit)
 
 
-def read_json(path: Path, limit: int) -> dict[str, Any]:
+def read_json(path: Path, limit: int) -> Json:
     """Read a JSON object from a file. Raises as `read_bounded`; RecordError if it is damaged."""
     with reading(path):
         value = json.loads(read_bounded(path, limit))

@@ -49,7 +49,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.files import open_own
+from mavfi_cli.core.files import Json, open_own
 from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
@@ -216,7 +216,7 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
     return 0
 
 
-def _end_of(worker: int, reading: int, channel: socket.socket, deadline_s: float) -> dict[str, Any]:
+def _end_of(worker: int, reading: int, channel: socket.socket, deadline_s: float) -> Json:
     """Wait for the end of a worker and of its descendants. Return how it ended, and its report.
 
     Args:
@@ -228,7 +228,7 @@ def _end_of(worker: int, reading: int, channel: socket.socket, deadline_s: float
     late = _await(worker, channel, deadline_s)
     _, status = os.waitpid(worker, 0)
     _end_children()
-    end: dict[str, Any] = {"report": _report_of_worker(reading)}
+    end: Json = {"report": _report_of_worker(reading)}
     if late:
         end["timeout"] = True
     elif os.WIFSIGNALED(status):

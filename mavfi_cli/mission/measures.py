@@ -20,7 +20,7 @@ from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import KERNELS, FloatArray, Outcome, Stage
 from mavfi_cli.fi import bits
 
-Record = Mapping[str, Any]
+Record = Mapping[str, Any]  # a result.json, or a section of it
 QUALITY = (
     "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
     "goal_distance_m",  # at the end of the mission
@@ -345,7 +345,7 @@ class DetectionCost:
         return self.recovered_s / self.flight_s
 
     @classmethod
-    def of(cls, result: Mapping[str, Any]) -> DetectionCost | None:
+    def of(cls, result: Record) -> DetectionCost | None:
         """Compute the cost of detection and recovery in a flight.
 
         Returns:
@@ -370,7 +370,7 @@ class DetectionCost:
         total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
         again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 
-        def mean_s(kernel: Mapping[str, Any] | None) -> float:
+        def mean_s(kernel: Record | None) -> float:
             """Return the mean latency of an invocation, s."""
             if not kernel or not kernel["invocations"]:
                 return 0.0

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mavfi_cli.analysis.kernels import KERNELS
 from mavfi_cli.attack.campaign import Plan, TargetRuns
@@ -17,7 +17,7 @@ from mavfi_cli.attack.kernels.catalogue import Kernel
 from mavfi_cli.attack.kernels.target import KernelTarget
 from mavfi_cli.attack.null_runs import NullRuns
 from mavfi_cli.attack.target import RunOutcome, signal_name
-from mavfi_cli.core.files import write_json, write_text
+from mavfi_cli.core.files import Json, write_json, write_text
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.report.drawing import INK, NOTE, new_figure, open_frame, write_figure
 from mavfi_cli.report.table import WIDTH, Table, percent, rate
@@ -62,7 +62,7 @@ def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> S
     return clustered_share(chosen, windows, sampled)
 
 
-def _share_entry(share: Share) -> dict[str, Any]:
+def _share_entry(share: Share) -> Json:
     """A share as in `kernels.json`, where a share of nothing is None."""
     return {
         "count": share.count, "of": share.total, "share": _finite(share.share),
@@ -105,7 +105,7 @@ class _TargetCounts:
         """Upper 95 % bound of the share that differs without a flip."""
         return unseen_share(self.null_runs.reached)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Plain values, as in `kernels.json`."""
         null_runs = self.null_runs
         return {
@@ -180,7 +180,7 @@ class _KernelCounts:
         """Relative sizes of silent corruptions that have one, from the smallest."""
         return sorted(size for size in self.sdc if size is not None)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Plain values, as in `kernels.json`."""
         runs, records = self.runs, self.runs.records
         run_s = sum(entry["run_s"] for entry in records)
@@ -235,11 +235,11 @@ class KernelsSummary:
         plan: everything that the results depend on.
     """
 
-    plan: dict[str, Any]
+    plan: Json
     sampling: str
     kernels: list[_KernelCounts]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Plain values, the contents of `kernels.json`."""
         kernels = [kernel.as_dict() for kernel in self.kernels]
         return {"schema": SCHEMA, "plan": self.plan, "sampling": self.sampling, "kernels": kernels}
@@ -272,7 +272,7 @@ class ProgramSummary:
     seed: int
     counts: _TargetCounts
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Plain values, as `--json` prints them."""
         runs, profile = self.runs, self.runs.profile
         part = partial(getattr, profile) if profile is not None else lambda _name: None
@@ -364,7 +364,7 @@ def _population(runs: TargetRuns, number: int) -> str:
     return "moments of one call" if profile is None else profile.describe()
 
 
-def _input(runs: TargetRuns, number: int) -> dict[str, Any]:
+def _input(runs: TargetRuns, number: int) -> Json:
     """An input of a kernel: how much of its run was profiled, and what became of its runs."""
     profile, golden = runs.profiles[number], runs.goldens[number]
     length = None if profile is None else profile.instructions

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import pyarrow as pa
 
@@ -30,6 +30,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import label_text
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.files import Json
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.setting_table import SettingColumns, SettingRow
@@ -100,7 +101,7 @@ class CampaignReport:
             else None,
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Json:
         """Return the content of `--json`: the summary and the requested parts."""
         parts = {name: part for name, part in asdict(self).items() if part is not None}
         return {**parts.pop("summary"), **parts}

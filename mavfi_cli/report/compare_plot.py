@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mavfi_cli.analysis.platforms import (
     CostRow,
@@ -20,6 +20,7 @@ from mavfi_cli.report.drawing import (
     KERNELS,
     NOTE,
     PLATFORMS,
+    Look,
     legend_above,
     new_figure,
     note_at,
@@ -278,7 +279,7 @@ def _recovered(
     axes: Axes, rows: Sequence[CostRow], settings: Sequence[str], colours: Mapping[str, str]
 ) -> None:
     lines = {name: place for place, name in enumerate(colours)}
-    style: dict[str, Any] = {
+    style: Look = {
         "transform": axes.get_xaxis_transform(), "va": "top", "fontsize": 8.5, "ha": "center",
     }  # fmt: skip
     for row in rows:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ _STAMPS: dict[str, dict[str, str | None]] = {  # metadata that is the same at an
 _DPI = 300
 _TURN = 0.6180339887498949  # golden ratio
 
+Look = Mapping[str, Any]  # keywords of matplotlib
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"

@@ -16,12 +16,13 @@ from mavfi_cli.analysis.beside_model import (
     MeasuredOverhead,
     ModelAndFlights,
 )
-from mavfi_cli.core.files import plain
+from mavfi_cli.core.files import Json, plain
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.drawing import (
     INK,
     NOTE,
     SCHEMES,
+    Look,
     legend_above,
     new_figure,
     note_at,
@@ -75,7 +76,7 @@ def model_csv(model: ModelReport | FlightsReport) -> str:
     ).csv()
 
 
-def _with_rows(report: ModelReport | FlightsReport) -> dict[str, Any]:
+def _with_rows(report: ModelReport | FlightsReport) -> Json:
     vehicles = [
         asdict(vehicle) | {"schemes": [_cells_of(row) for row in vehicle.schemes]}
         for vehicle in report.vehicles
@@ -83,12 +84,12 @@ def _with_rows(report: ModelReport | FlightsReport) -> dict[str, Any]:
     return asdict(report) | {"vehicles": vehicles}
 
 
-def _cells_of(row: SchemeResult | FlownScheme) -> dict[str, Any]:
+def _cells_of(row: SchemeResult | FlownScheme) -> Json:
     """The cells of a scheme by the names of their columns; lists are tuples."""
     return _model_cells(row) if isinstance(row, SchemeResult) else _flown_cells(row)
 
 
-def _model_cells(row: SchemeResult) -> dict[str, Any]:
+def _model_cells(row: SchemeResult) -> Json:
     cells = asdict(row)
     problem = cells.pop("problem")
     for group, kind in (("performance", Performance), ("ratios", Ratios)):
@@ -96,9 +97,9 @@ def _model_cells(row: SchemeResult) -> dict[str, Any]:
     return {**cells, "problem": problem}
 
 
-def _flown_cells(row: FlownScheme) -> dict[str, Any]:
+def _flown_cells(row: FlownScheme) -> Json:
     common = ("scheme", "title", "boards", "overhead_percent", "mass_kg", "problem")
-    cells: dict[str, Any] = {name: getattr(row, name) for name in common}
+    cells: Json = {name: getattr(row, name) for name in common}
     if (own := row.flown) is None:
         return {**cells, "errors": (), "cut": ()}
     planned = ("errors", "cut", "v_max_mps", "a_max_mps2", "braking_velocity_mps")
@@ -393,7 +394,7 @@ def _overhead_lines(rows: Sequence[MeasuredOverhead]) -> Iterator[str]:
 _OF_COPIES = {1: "none", 2: "dmr", 3: "tmr"}
 _MOST_HZ = 1000.0
 _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
-_DASHED: Mapping[str, Any] = {"linestyle": (0, (5, 3))}
+_DASHED: Look = {"linestyle": (0, (5, 3))}
 
 
 def _draw_roofline(model: ModelReport) -> Figure:
@@ -421,7 +422,7 @@ def _draw_roofline(model: ModelReport) -> Figure:
 
 def _roofline_panel(axes: Axes, vehicle: VehicleReport, share: float) -> None:
     flying = {row.boards: own for row, own, _ in reversed(_flying(vehicle))}
-    point: Mapping[str, Any] = {"markeredgecolor": INK, "linestyle": "none"}
+    point: Look = {"markeredgecolor": INK, "linestyle": "none"}
     for copies, own in sorted(flying.items()):
         colour = SCHEMES[_OF_COPIES[copies]]
         axes.plot(
@@ -532,7 +533,7 @@ def _cost_caption(model: ModelReport) -> str:
 # Model against flight: velocity, flight time and energy of every scheme ---------------------------
 
 _STEP = 0.17
-_UPRIGHT: Mapping[str, Any] = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
+_UPRIGHT: Look = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
 
 
 def draw_flights(flights: FlightsReport) -> Figure:

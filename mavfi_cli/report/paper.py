@@ -15,6 +15,7 @@ from mavfi_cli.report.drawing import (
     GRID,
     INK,
     NOTE,
+    Look,
     legend_above,
     new_figure,
     open_frame,
@@ -198,7 +199,7 @@ WIDTHS_IN = {"one": 3.5, "two": 7.16}  # columns of an IEEE page
 SMALLEST = 7.0  # points
 PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; no two alike in grey
 MARKERS = ("o", "s", "^", "D")
-_PAPER: dict[str, Any] = {
+_PAPER: Look = {
     "marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
     "markeredgewidth": 0.9, "linestyle": "none",
 }  # fmt: skip

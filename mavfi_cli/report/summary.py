@@ -5,17 +5,15 @@ from __future__ import annotations
 import base64
 import html
 import textwrap
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mavfi_cli.fi.bits import format_distinct
 from mavfi_cli.fi.tracer.image import short_name
-from mavfi_cli.mission.measures import DetectionCost, FlightRecord, record_of
+from mavfi_cli.mission.measures import DetectionCost, FlightRecord, Record, record_of
 from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.report.table import WIDTH
 
-Section = Mapping[str, Any]
 _INDENT = 12 * " "
 _OUTCOMES = {
     "success": "SUCCESS: reached the goal",
@@ -34,7 +32,7 @@ def _number(value: Any, unit: str, digits: int = 1, per: float = 1.0) -> str:
     return "not known" if value is None else f"{value / per:.{digits}f} {unit}"
 
 
-def outcome_line(result: dict[str, Any]) -> str:
+def outcome_line(result: Record) -> str:
     """Return the outcome and its reason in one line."""
     flight = record_of(result)
     text = _OUTCOMES.get(flight.outcome, flight.outcome)
@@ -43,7 +41,7 @@ def outcome_line(result: dict[str, Any]) -> str:
     return f"{text} ({flight.reason})" if flight.reason else text
 
 
-def summary_lines(result: dict[str, Any]) -> list[str]:
+def summary_lines(result: Record) -> list[str]:
     """Return outcome, quality of flight, pipeline figures and cost on this machine."""
     flight = record_of(result)
     config = flight.config
@@ -114,7 +112,7 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
     ]
 
 
-def _clearance_and_energy(qof: Section) -> list[str]:
+def _clearance_and_energy(qof: Record) -> list[str]:
     clearance, energy = "not known", "not known"
     if qof["min_clearance_m"] is not None:
         clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} minimum"
@@ -126,7 +124,7 @@ def _clearance_and_energy(qof: Section) -> list[str]:
     return [f"Clearance   {clearance}", f"Energy      {energy}"]
 
 
-def _measured_lines(measured: Section) -> list[str]:
+def _measured_lines(measured: Record) -> list[str]:
     if not measured:
         return []
     medians = ", ".join(
@@ -136,7 +134,7 @@ def _measured_lines(measured: Section) -> list[str]:
     return [f"Measured    {medians} (medians on this host), x {measured['factor']:g} in the flight"]
 
 
-def _node_lines(nodes: Section) -> list[str]:
+def _node_lines(nodes: Record) -> list[str]:
     lines = []
     for name, node in nodes.items():
         ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
@@ -149,7 +147,7 @@ def _node_lines(nodes: Section) -> list[str]:
     return lines
 
 
-def _program_lines(programs: Section) -> list[str]:
+def _program_lines(programs: Record) -> list[str]:
     lines = []
     for name, program in programs.items():
         ends = ", ".join(map(str, program["codes"])) or "runs until the end"
@@ -157,7 +155,7 @@ def _program_lines(programs: Section) -> list[str]:
     return lines
 
 
-def _detection_lines(detection: Section, cost: DetectionCost | None) -> list[str]:
+def _detection_lines(detection: Record, cost: DetectionCost | None) -> list[str]:
     if not detection:
         return []
     responses, alarms = detection["responses"], detection["alarm_count"]
@@ -216,12 +214,12 @@ def run_html(run: Run) -> str:
     )
 
 
-def event_lines(result: dict[str, Any]) -> list[str]:
+def event_lines(result: Record) -> list[str]:
     """Return one line per event with its simulated time."""
     return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in record_of(result).events]
 
 
-def _fault_lines(fault: Section) -> list[str]:
+def _fault_lines(fault: Record) -> list[str]:
     if not fault:
         return []
     if fault["level"] == "instruction":
@@ -251,7 +249,7 @@ def _fault_lines(fault: Section) -> list[str]:
     return lines
 
 
-def _activation(fault: Section) -> str:
+def _activation(fault: Record) -> str:
     """Return the activation: whether any node read the corrupted value."""
     reader = fault["activation"]["first_reader"]
     if reader is not None:
@@ -264,7 +262,7 @@ def _activation(fault: Section) -> str:
     }[fault["activation"]["activation"]]
 
 
-def _instruction_lines(fault: Section) -> list[str]:
+def _instruction_lines(fault: Record) -> list[str]:
     lines = [
         f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
         f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "
@@ -286,7 +284,7 @@ def _instruction_lines(fault: Section) -> list[str]:
     ]
 
 
-def _place(fault: Section) -> str:
+def _place(fault: Record) -> str:
     """Return the place of an instruction: function and offset, or offset in its object."""
     if not fault["symbol"]:
         return f"{fault['object']}+{fault['offset']:#x}"
@@ -294,7 +292,7 @@ def _place(fault: Section) -> str:
     return f"{short_name(name)}{offset and '+'}{offset} in {fault['object']}"
 
 
-def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
+def _change_line(stamp_s: float, change: Record) -> str:
     place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
     bits = ", ".join(map(str, change["bits"])) or "none: the state already had that value"
     plural = "s" if len(change["bits"]) > 1 else ""
@@ -304,7 +302,7 @@ def _change_line(stamp_s: float, change: dict[str, Any]) -> str:
     )
 
 
-def _formatted(change: dict[str, Any], when: str) -> str:
+def _formatted(change: Record, when: str) -> str:
     """Format a value. Infinities and NaN, which JSON lacks, are decoded from their bits."""
     value, pattern = change[when], change[f"{when}_hex"]
     if value is None:
@@ -339,7 +337,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     return lines
 
 
-def _no_effect(fault: Section) -> str:
+def _no_effect(fault: Record) -> str:
     """Return why a fault had no effect: not injected, not activated, or masked."""
     if fault["state"] == "not_injected":
         return "none, not injected"

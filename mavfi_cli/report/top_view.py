@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.analysis.trajectories import MissionPicture
-from mavfi_cli.mission.measures import FlightRecord
+from mavfi_cli.mission.measures import FlightRecord, Record
 from mavfi_cli.mission.run_folder import Run, load_run
 from mavfi_cli.report.drawing import (
     ALARM,
@@ -24,6 +24,7 @@ from mavfi_cli.report.drawing import (
     INK,
     OBSTACLE,
     PLAN,
+    Look,
     new_figure,
     open_frame,
 )
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 _OBSTACLE_EDGE = "#8b93a1"
 _LOW = "#e3ead9"  # boxes that end below the flight, such as hedges
 # Events: label, marker and style.
-_EVENT: dict[str, Any] = {"linewidths": 0.9, "zorder": 6, "edgecolors": "#222831"}
-_MARKS: dict[str, tuple[str, str, dict[str, Any]]] = {
+_EVENT: Look = {"linewidths": 0.9, "zorder": 6, "edgecolors": "#222831"}
+_MARKS: dict[str, tuple[str, str, Look]] = {
     "replan": ("new plan", "o", {"s": 14, "facecolors": "white"}),
     "slow": ("slows down", "v", {"s": 30, "facecolors": "#f2b134"}),
     "stop": ("stops", "s", {"s": 26, "facecolors": "#e4572e"}),
@@ -98,7 +99,7 @@ def _path_of(run: Run) -> _Path:
     return places[known], speeds[known]
 
 
-def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
+def _draw_obstacles(axes: Axes, world: Record, positions: np.ndarray) -> None:
     """Draw the boxes of a world, pale if they end below the positions (n, 3) m of the flight."""
     from matplotlib.patches import Rectangle
 
@@ -113,7 +114,7 @@ def _draw_obstacles(axes: Axes, world: Mapping[str, Any], positions: np.ndarray)
         )  # fmt: skip
 
 
-def _draw_plans(axes: Axes, plans: Sequence[Mapping[str, Any]]) -> None:
+def _draw_plans(axes: Axes, plans: Sequence[Record]) -> None:
     drawn = [plan for plan in plans if len(plan["points_enu_m"])]
     label = "planned" if len(drawn) <= _PLANS else f"planned (newest {_PLANS} of {len(drawn)})"
     newest = drawn[-_PLANS:]
@@ -198,7 +199,7 @@ def _mark(
 
 def _draw_marks(
     axes: Axes,
-    events: Iterable[dict[str, Any]],
+    events: Iterable[Record],
     kind: str,
     columns: list[int] = _FROM_ABOVE,
     **style: Any,
@@ -214,7 +215,7 @@ def _draw_marks(
     return _mark(axes, places, columns, label, marker, **{**_EVENT, **look, **style})
 
 
-def _frame(axes: Axes, world: Mapping[str, Any], positions: np.ndarray) -> None:
+def _frame(axes: Axes, world: Record, positions: np.ndarray) -> None:
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
     if places:
@@ -282,7 +283,7 @@ def _treatment(flight: FlightRecord) -> list[str]:
     return textwrap.wrap("; ".join(parts), _TITLE)
 
 
-def _struck(fault: Mapping[str, Any]) -> str:
+def _struck(fault: Record) -> str:
     """Return the fault in words, with the state or the node that was drawn."""
     if fault["level"] == "instruction":
         return InstructionConfig(**fault["request"]).describe(fault["node"])

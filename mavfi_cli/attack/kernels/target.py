@@ -12,7 +12,6 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.target import RunLimits, RunOutcome, RunVerdict, judged
 from mavfi_cli.core.compiled import own_digest
 from mavfi_cli.core.errors import FaultError, TargetError
+from mavfi_cli.core.files import Json
 from mavfi_cli.core.processes import receive
 from mavfi_cli.fi.tracer.image import Image, Scope
 from mavfi_cli.fi.tracer.tracee import Ended, Mechanism, Tracee
@@ -63,7 +63,7 @@ class KernelTarget:
         """Name of the kernel's random stream: its faults do not depend on other kernels."""
         return (self.name,)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> Json:
         """Return everything that determines the results."""
         return {
             "inputs_sha256": self.inputs_sha256,
@@ -144,7 +144,7 @@ class _KernelPlace:
     def scope(self, image: Image) -> Scope:
         return image.scope(self.kernel_scope.objects)
 
-    def context(self) -> dict[str, Any]:
+    def context(self) -> Json:
         objects = list(self.kernel_scope.objects)
         return {"scope": objects, "inputs_sha256": self._target.inputs_sha256}
 

@@ -12,11 +12,11 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
+from mavfi_cli.core.files import Json
 from mavfi_cli.fi import bits
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.tracer.counted import CountedStop
@@ -87,7 +87,7 @@ class InstructionCorruption:
             return (zero,)
         return tuple(sorted([less] * below + [zero] * equal))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the corruption part of a record."""
         names = {"site": self.site.value, "role": self.role.value, "bits": list(self.bits)}
         values = asdict(self) | names
@@ -137,7 +137,7 @@ class FaultModel:
             count=bits,
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the model as plain values, without the fields of compat modes."""
         return {
             "sites": sorted(site.value for site in self.sites),

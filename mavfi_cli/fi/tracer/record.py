@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
-from mavfi_cli.core.files import write_text
+from mavfi_cli.core.files import Json, write_text
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
     InstructionCorruption,
@@ -70,7 +70,7 @@ def completed(
     record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
 ) -> FaultRecord:
     """Return the record after the run. `injection` is None if the trigger was not reached."""
-    what: dict[str, Any] = {"applied": False}
+    what: Json = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}
         what = asdict(injection) | values

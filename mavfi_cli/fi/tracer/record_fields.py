@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
+
+from mavfi_cli.core.files import Json
 
 
 class StageRecord(TypedDict):
@@ -11,7 +13,7 @@ class StageRecord(TypedDict):
     object: str
     offset: int
     count: int
-    detour: NotRequired[dict[str, Any]]
+    detour: NotRequired[Json]
 
 
 class FaultRecord(TypedDict, total=False):
@@ -26,10 +28,10 @@ class FaultRecord(TypedDict, total=False):
     instruction_bytes: str  # hexadecimal
     k: int
     trigger: list[StageRecord]  # empty if the fault is drawn at a moment
-    corruption: dict[str, Any] | None  # None: a null run
+    corruption: Json | None  # None: a null run
     build_ids: dict[str, str | None]
-    injection: dict[str, Any]
-    activation: dict[str, Any]
+    injection: Json
+    activation: Json
     not_injected_reason: str
     node: str
     kernel: str
@@ -42,4 +44,4 @@ class FaultRecord(TypedDict, total=False):
     signal: int | None
     exit_code: int
     error: str
-    magnitude: dict[str, Any]
+    magnitude: Json
