@@ -219,16 +219,6 @@ class DetectorCurves(Curves):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DetectorResults:
-    """Results of the pairs: a row per group and detector; curves by detector."""
-
-    error_free: list[ErrorFreeRow]
-    faults: list[FaultRow]
-    comparisons: list[DetectorComparison]
-    curves: dict[str, DetectorCurves]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluatedPlan:
     """What an evaluation flew.
 
@@ -252,13 +242,19 @@ class EvaluatedPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evaluation(DetectorResults):
+class Evaluation:
     """The contents of `evaluation.json`.
 
     Attributes:
+        error_free, faults: a row per group and detector.
+        curves: by detector.
         errors: labels and reason of each mission that could not begin.
     """
 
+    error_free: list[ErrorFreeRow]
+    faults: list[FaultRow]
+    comparisons: list[DetectorComparison]
+    curves: dict[str, DetectorCurves]
     schema: int
     plan: EvaluatedPlan
     versions: dict[str, str]
@@ -401,8 +397,12 @@ def harmful(faults: pa.Table) -> pa.Table:
 
 
 def results(
-    detectors: Sequence[str], error_free: pa.Table, faults: pa.Table, scored: Scored
-) -> DetectorResults:
+    detectors: Sequence[str],
+    error_free: pa.Table,
+    faults: pa.Table,
+    scored: Scored,
+    **about: Any,
+) -> Evaluation:
     """Results of the pairs.
 
     Args:
@@ -410,8 +410,10 @@ def results(
         error_free, faults: as `pairs_of` returns them.
         scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
             and the scores of its error-free flights.
+        about: what the evaluation contains besides.
     """
-    return DetectorResults(
+    return Evaluation(
+        **about,
         error_free=[
             _error_free_row(by, value, detector, part)
             for by, value, detector, part in _grouped(detectors, error_free, (ALL, "world"))

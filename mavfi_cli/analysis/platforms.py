@@ -268,8 +268,16 @@ class LongestFlight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlatformFigures:
-    """All numbers of the flights.
+class ComparedTimelines:
+    """Timelines of one mission on all platforms that answered."""
+
+    seed: int
+    platforms: list[Timeline]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlatformComparison:
+    """The contents of `compare.json`.
 
     `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
     `cost_differences` have one row per setting and platform other than the first. Shares, increases
@@ -286,20 +294,6 @@ class PlatformFigures:
     cost_differences: list[CostDifference]
     worst: list[LongestFlight]
     flights: list[dict[str, Any]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedTimelines:
-    """Timelines of one mission, on the platforms whose flight reacted to a frame."""
-
-    seed: int
-    platforms: list[Timeline]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlatformComparison(PlatformFigures):
-    """The contents of `compare.json`."""
-
     schema: int
     plan: ComparedPlan
     versions: dict[str, str]
@@ -307,14 +301,14 @@ class PlatformComparison(PlatformFigures):
     timeline: ComparedTimelines
 
 
-def figures(
-    platforms: Sequence[str], settings: Sequence[str], flights: pa.Table
-) -> PlatformFigures:
+def figures(plan: ComparedPlan, flights: pa.Table, **about: Any) -> PlatformComparison:
     """Compute all numbers of the flights.
 
     Args:
         flights: with the columns of SCHEMA.
+        about: what the comparison contains besides.
     """
+    platforms, settings = [row.platform for row in plan.platforms], plan.settings
     whole = flights.append_column("succeeded", pc.equal(flights["outcome"], "success"))
     first, *others = platforms
     faulty = [setting for setting in settings if setting != GOLDEN]
@@ -328,7 +322,9 @@ def figures(
         (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
         for platform, setting in itertools.product(platforms, faulty)
     }
-    return PlatformFigures(
+    return PlatformComparison(
+        plan=plan,
+        **about,
         settings=[
             _setting(p, s, every[p, s].num_rows, counted[p, s])
             for s, p in itertools.product(settings, platforms)

@@ -130,15 +130,14 @@ def compare(
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
         table = flights(ledger)
     flown = compared(table)
-    numbers = figures(plan.platforms, plan.settings, flown)
     seed = timeline_seed(flown, plan.platforms) or plan.first_seed
-    return PlatformComparison(
+    return figures(
+        plan.described(),
+        flown,
         schema=SCHEMA,
-        plan=plan.described(),
         versions=installed_versions(),
         errors=errors(table, "mission {number}: {reason}"),
         timeline=_timelines(plan, seed, folder / "timeline", options, spectator),
-        **{part.name: getattr(numbers, part.name) for part in fields(numbers)},
     )
 
 

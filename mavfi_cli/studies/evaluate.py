@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -284,11 +284,7 @@ def evaluation_of(
     Args:
         scored: see `analysis.detectors.results`.
     """
-    of_pairs = results((NONE, *plan.protectors), *pairs, scored)
-    return Evaluation(
-        schema=SCHEMA,
-        plan=plan.described(),
-        versions=installed_versions(),
-        errors=[*errors],
-        **{part.name: getattr(of_pairs, part.name) for part in fields(of_pairs)},
-    )
+    return results(
+        (NONE, *plan.protectors), *pairs, scored, schema=SCHEMA, plan=plan.described(),
+        versions=installed_versions(), errors=[*errors],
+    )  # fmt: skip

@@ -1,12 +1,10 @@
 """Flights of a comparison, made up."""
 
-from dataclasses import fields
-
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, PlatformComparison, figures
+from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, figures
 from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.studies.compare import ComparePlan
 
@@ -44,7 +42,7 @@ def table(flights):
 
 def figures_of(plan, flights):
     """The numbers of flights of a plan."""
-    return figures(plan.platforms, plan.settings, pa.Table.from_pylist(flights, SCHEMA))
+    return comparison(plan, flights)
 
 
 def made_up():
@@ -86,11 +84,9 @@ def panel(platform, factor):
 
 def comparison(plan, flights, *, errors=(), timelines=()):
     """All that `mavfi compare` would compute of these flights."""
-    own = figures_of(plan, flights)
-    return PlatformComparison(
-        schema=1, plan=plan.described(), versions={}, errors=[*errors],
-        timeline=ComparedTimelines(seed=4, platforms=[*timelines]),
-        **{part.name: getattr(own, part.name) for part in fields(own)},
+    return figures(
+        plan.described(), pa.Table.from_pylist(flights, SCHEMA), schema=1, versions={},
+        errors=[*errors], timeline=ComparedTimelines(seed=4, platforms=[*timelines]),
     )  # fmt: skip
 
 
