@@ -233,8 +233,8 @@ def recorded_overheads(
     Raises:
         RecordError: no such flight is recorded; the message lists the recorded ones.
     """
-    of_each = ComputeOverhead.of(_records(path), platform)
-    known = {name: overhead for name, overhead in of_each.items() if name in detectors}
+    recorded = ComputeOverhead.of(_records(path), platform)
+    known = {name: overhead for name, overhead in recorded.items() if name in detectors}
     if not known:
         everywhere = ComputeOverhead.of(_records(path)).values()
         there = [

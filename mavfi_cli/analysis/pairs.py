@@ -122,7 +122,7 @@ class Flights:
     @classmethod
     def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
         """The missions of several tables, each mission once; None means all stacks."""
-        own = [each.table.select(_NOTHING_FLOWN.column_names) for each in several]
+        own = [flights.table.select(_NOTHING_FLOWN.column_names) for flights in several]
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
         first: dict[str, int] = {}
@@ -239,7 +239,7 @@ class Flights:
         places: dict[Any, list[int]] = {}
         for place, key in enumerate(keys):
             places.setdefault(key, []).append(place)
-        return {key: Flights(self.table.take(pa.array(each))) for key, each in places.items()}
+        return {key: Flights(self.table.take(pa.array(rows))) for key, rows in places.items()}
 
     # Numbers
 
@@ -273,19 +273,19 @@ class Flights:
     @property
     def worlds(self) -> list[str]:
         """The worlds that were flown, the paper's first."""
-        found = set(self["world"])
-        return [*(world for world in WORLDS if world in found), *sorted(found - set(WORLDS))]
+        flown = set(self["world"])
+        return [*(world for world in WORLDS if world in flown), *sorted(flown - set(WORLDS))]
 
 
 def _flown(table: pa.Table) -> pa.Table:
     table = tables.flown(table)
-    configs = [json.loads(each) for each in table["changes"].to_pylist()]
-    flips = pc.is_in(table["injected"], pa.array([each.value for each in _STRUCK]))
+    configs = [json.loads(changes) for changes in table["changes"].to_pylist()]
+    flips = pc.is_in(table["injected"], pa.array([fate.value for fate in _STRUCK]))
     kills = pc.fill_null(pc.starts_with(table["fault_target"], "process."), _NO)
     lost = pc.fill_null(pc.not_equal(table["outcome"], Outcome.SUCCESS.value), _YES)
-    faults = (canonical([each.get(name) for name in _FAULTS]) for each in configs)
-    at = ((each.get("fault") or {}).get("at") for each in configs)
-    together = (bool((each.get("fault") or {}).get("together")) for each in configs)
+    faults = (canonical([config.get(name) for name in _FAULTS]) for config in configs)
+    at = ((config.get("fault") or {}).get("at") for config in configs)
+    together = (bool((config.get("fault") or {}).get("together")) for config in configs)
     return _with_columns(
         table,
         fault=pa.array(faults, pa.string()),

@@ -41,7 +41,7 @@ def scored(
     stack: str,
     folder: Path,
     pairs: tuple[pa.Table, pa.Table],
-    tell: Callable[[str], None],
+    note: Callable[[str], None],
 ) -> Scored:
     """Compute the detectors' scores of the harmful faults and of the error-free flights.
 
@@ -71,7 +71,7 @@ def scored(
         if path is not None and any(Path(path).name not in own for own in scores.values())
     ]
     if missing:
-        tell(f"replaying {len(missing)} flights through {len(names)} detectors")
+        note(f"replaying {len(missing)} flights through {len(names)} detectors")
         for path, struck_s in missing:
             seen = _seen_of(path)
             for detector in detectors:

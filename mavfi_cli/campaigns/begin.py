@@ -235,7 +235,7 @@ def stopped(ledger: Ledger) -> list[str]:
     if spec is None or spec.stop is None:
         return []
     cells = ledger.cells()
-    queue = MissionQueue(iter(()), spec.stop, ledger.cell_of_each(), ledger.fates())
+    queue = MissionQueue(iter(()), spec.stop, ledger.mission_cells(), ledger.fates())
     return [label_text(cells[cell]) for cell in sorted(queue.stopped)]
 
 

@@ -324,7 +324,7 @@ class Ledger:
             if not rows:
                 return
 
-    def cell_of_each(self) -> list[int]:
+    def mission_cells(self) -> list[int]:
         """The setting of each mission, in the order of the list."""
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 

@@ -360,7 +360,7 @@ class _Run:
         only = options.only
         missing = ledger.missing(errors=options.errors)
         wanted = (m for m in missing if only is None or m.number in only)
-        cells = ledger.cell_of_each() if stop else ()
+        cells = ledger.mission_cells() if stop else ()
         shares = options.task == TASK and not options.whole
         self._queue = MissionQueue(wanted, stop, cells, over(), shares=shares)
         self._again: list[MissingMission] = []
@@ -376,7 +376,7 @@ class _Run:
             and (options.planned is None or mission.number in options.planned)
         )
         names = [str(labels.get("setting", "")) for labels in ledger.cells()]
-        self._setting_of = [names[cell] for cell in ledger.cell_of_each()]
+        self._setting_of = [names[cell] for cell in ledger.mission_cells()]
         self._outcomes = {name: Counter[str]() for name in names}
         self._errors = self._repeated = 0
         self._inside_s = 0.0

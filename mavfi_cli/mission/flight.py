@@ -134,7 +134,7 @@ class Flight:
         self._session = self._new_session()
         self.images = ImageReceiver()
         self._frames: deque[ImageFrame] = deque(maxlen=_WAITING_FRAMES)
-        self._camera_asked = False
+        self._camera_called = False
         self._seen_s = 0.0  # when the newest frame arrived, or frames were asked for
         self._clock = None if config.link is None else ForeignClock()
         self._unspoken_s = 0.0
@@ -390,8 +390,8 @@ class Flight:
             self.link.send(self._session.tick(stamp_s), stamp_s)
         if companion is not None:
             companion.executor.compute()
-        if not self._camera_asked and self._nearly_up(state):
-            self._camera_asked = True
+        if not self._camera_called and self._nearly_up(state):
+            self._camera_called = True
             self._seen_s = stamp_s
             self._session.start_camera(1.0 / self._config.camera_rate_hz)
         self.logger.log_tick(stamp_s, self._session, companion, self.injection)
@@ -467,6 +467,6 @@ class Flight:
     @property
     def _blind_s(self) -> float:
         """Return how long the next frame of a foreign autopilot's camera is overdue, s."""
-        if not self._camera_asked or self._config.link is None:
+        if not self._camera_called or self._config.link is None:
             return 0.0
         return self.stamp_s - self._seen_s - 1.0 / self._config.camera_rate_hz

@@ -63,11 +63,11 @@ class Family:
     @classmethod
     def of(cls, claims: Sequence[JudgedClaim]) -> list[Self]:
         """The claims by figure, table or section, in order."""
-        found = []
+        families = []
         for name, members in groupby(claims, lambda judged: judged.claim.item):
             title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
-            found.append(cls(name=name, title=printed_name(name) + title, claims=[*members]))
-        return found
+            families.append(cls(name=name, title=printed_name(name) + title, claims=[*members]))
+        return families
 
 
 # Does it reproduce the paper? ---------------------------------------------------------------------
@@ -118,8 +118,8 @@ def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) 
 
 def _count_verdicts(claims: Sequence[JudgedClaim], stack: str) -> Counter[Verdict]:
     """How many claims have which verdict on a stack and for isolated kernels."""
-    found = (judgement_of(judged, stack) for judged in claims)
-    return Counter(judgement.verdict for judgement in found if judgement)
+    judgements = (judgement_of(judged, stack) for judged in claims)
+    return Counter(judgement.verdict for judgement in judgements if judgement)
 
 
 def _are(number: int) -> str:
@@ -143,12 +143,12 @@ class Disagreement:
     @property
     def names(self) -> Mapping[str, str]:
         """The short names of its claims by their names; each item is named only once."""
-        found, item = {}, ""
+        names, item = {}, ""
         for judged in self.claims:
             short, item_before, item = short_name(judged), item, judged.claim.item
             same = f"{printed_name(item)} " if item == item_before else ""
-            found[judged.claim.name] = short.removeprefix(same)
-        return found
+            names[judged.claim.name] = short.removeprefix(same)
+        return names
 
 
 def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
@@ -293,7 +293,7 @@ class Safeguard:
 def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
     """Compare protections: the detectors on the first stack, and every other stack in its place."""
     (name, first), *others = flights.items()
-    found = [
+    safeguards = [
         Safeguard(
             name=f"{title} detector",
             against={
@@ -309,8 +309,8 @@ def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
     for other, second in others:
         shares = [_harmed(*both) for both in ((first, second), (second, first))]
         against = {kind: _Against.of_shares(*(mine[kind] for mine in shares)) for kind in _KINDS}
-        found.append(Safeguard(name=f"{other} instead of {name}", against=against, costs={}))
-    return [protection for protection in found if any(protection.against.values())]
+        safeguards.append(Safeguard(name=f"{other} instead of {name}", against=against, costs={}))
+    return [protection for protection in safeguards if any(protection.against.values())]
 
 
 def _costs(flights: Flights, detector: str) -> dict[str, float]:

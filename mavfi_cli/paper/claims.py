@@ -43,31 +43,31 @@ def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim
     Args:
         flights: flights by stack.
     """
-    found: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
+    judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
     for _, family in groupby(CLAIMS, attrgetter("item")):
         members = list(family)
         alone = [claim for claim in members if claim.isolated]
         flown = [claim for claim in members if not claim.isolated]
         nothing = Flights.pooled([])
         for claim, judgement in zip(alone, _judge(alone, nothing, kernels), strict=True):
-            found[claim.name][ISOLATED] = {Fate.ALL: judgement}
+            judgements[claim.name][ISOLATED] = {Fate.ALL: judgement}
         for stack, those in flights.items():
             for fate in Fate:
-                asked = [claim for claim in flown if fate in claim.fates]
-                verdicts = _judge(asked, those.of_fate(fate), kernels)
-                for claim, judgement in zip(asked, verdicts, strict=True):
-                    cells = found[claim.name].setdefault(stack, {})
+                applicable = [claim for claim in flown if fate in claim.fates]
+                verdicts = _judge(applicable, those.of_fate(fate), kernels)
+                for claim, judgement in zip(applicable, verdicts, strict=True):
+                    cells = judgements[claim.name].setdefault(stack, {})
                     if judgement.why == NOT_FLOWN.why != cells.get(Fate.ALL, judgement).why:
                         judgement = replace(judgement, why=_NONE[fate])
                     cells[fate] = judgement
-    return [JudgedClaim(claim=claim, judgements=found[claim.name]) for claim in CLAIMS]
+    return [JudgedClaim(claim=claim, judgements=judgements[claim.name]) for claim in CLAIMS]
 
 
 def _judge(family: Sequence[Claim], flights: Flights, kernels: Kernels) -> list[Judgement]:
     ranges = [(claim.low, claim.high) for claim in family]
     findings = [claim.find(flights, kernels) for claim in family]
     verdicts = judge(findings, ranges)
-    by_name = {claim.name: each for claim, each in zip(family, verdicts, strict=True)}
+    by_name = {claim.name: verdict for claim, verdict in zip(family, verdicts, strict=True)}
     void = False
     for place, claim in enumerate(family):
         if claim.premise and by_name[claim.premise].verdict is Verdict.CONTRADICTED:
@@ -148,7 +148,7 @@ def _spread(counts: Sequence[Count]) -> Interval:
     """A rate, difference of two, recovered share of three, difference of two losses of four."""
     if len(counts) == 3:
         return recovered_share(*counts)
-    first, *others = (wilson(*each) for each in counts)
+    first, *others = (wilson(*count) for count in counts)
     if not others:
         return first.effect
     loss = first.minus(others[0])
@@ -157,15 +157,15 @@ def _spread(counts: Sequence[Count]) -> Interval:
 
 def _arguments(given: Mapping[str, Any], sets: Mapping[str, Any]) -> dict[str, Any]:
     """What a measure is given: named flights become the columns that choose them."""
-    found: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, value in given.items():
         if name == "flights":
-            found |= _arguments(sets[value], sets)
+            arguments |= _arguments(sets[value], sets)
         elif isinstance(value, Mapping):
-            found[name] = _arguments(value, sets)
+            arguments[name] = _arguments(value, sets)
         else:
-            found[name] = tuple(value) if isinstance(value, list) else value
-    return found
+            arguments[name] = tuple(value) if isinstance(value, list) else value
+    return arguments
 
 
 CLAIMS = tuple(_read(_FILE))

@@ -181,12 +181,12 @@ class Document:
 
     def verdicts(self) -> dict[str, dict[str, int]]:
         """The number of claims with each verdict, by stack and for isolated kernels."""
-        found = {
+        by_place = {
             place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
         }
         return {
             place: {verdict.value: verdicts.count(verdict) for verdict in Verdict}
-            for place, verdicts in found.items()
+            for place, verdicts in by_place.items()
         }
 
 
@@ -209,9 +209,9 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
     maps = {stack: state_map(as_paper[stack]) for stack in stacks}
     flows = {stack: kernel_flows(flights[stack], silent) for stack in stacks}
     by_arm = {
-        source.name: found
+        source.name: campaign_arms
         for source in evidence.campaigns
-        if (found := arms(source.flights.comparable))
+        if (campaign_arms := arms(source.flights.comparable))
     }
     added = [*Delays.of(stacks[0], flights[stacks[0]])]
     guards = protections(flights)
@@ -233,7 +233,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         delays=_delay_picture(added),
         delay_sentence=delay_sentence(added),
         spreads=[part for stack in stacks if (part := _spread(stack, flights[stack]))],
-        items=[*_shown_items(evidence, {stack: flown[stack] for stack in stacks})],
+        items=[*_items(evidence, {stack: flown[stack] for stack in stacks})],
         left_out={printed_name(name): why for name, why in LEFT_OUT.items()},
         flows=flows,
         flow_pictures=[_flow_picture(stack, mine) for stack, mine in flows.items() if mine],
@@ -372,13 +372,13 @@ def _flow_picture(stack: str, flows: Sequence[KernelFlow]) -> Picture:
     )
 
 
-def _arm_picture(campaign: str, found: Sequence[Arm]) -> Picture:
+def _arm_picture(campaign: str, rows: Sequence[Arm]) -> Picture:
     csv = Table.of_records(
         {"arm": arm.name, "lost": arm.lost.count, "of": arm.lost.total, "low": arm.lost.low,
          "high": arm.lost.high, "p": arm.corrected_p}
-        for arm in found
+        for arm in rows
     ).csv()  # fmt: skip
-    figure = draw_arms([(arm.name, arm.lost, arm.corrected_p) for arm in found])
+    figure = draw_arms([(arm.name, arm.lost, arm.corrected_p) for arm in rows])
     return Picture.of(f"arms-{campaign}", f"Lost missions of each arm of {campaign}", figure, csv)
 
 
@@ -459,7 +459,7 @@ _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "faul
             "detector", "protect")  # fmt: skip
 
 
-def _shown_items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_ShownItem]:
+def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_ShownItem]:
     """Every item of the paper in its order.
 
     Args:

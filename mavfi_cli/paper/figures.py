@@ -63,16 +63,16 @@ def panel(rows: Iterable[_Row]) -> list[Strip]:
 
 
 def _number(name: str, *keys: object) -> float | None:
-    found = printed(name, *keys)
-    return found if isinstance(found, float) else None
+    number = printed(name, *keys)
+    return number if isinstance(number, float) else None
 
 
 def _strips(panels: Callable[[Flights], Mapping[str, list[_Row]]]) -> _Drawing:
     def draw_panels(flights: Flights, columns: str) -> Figure:
-        found = {title: panel(rows) for title, rows in panels(flights).items()}
-        if not any(found.values()):
+        strips = {title: panel(rows) for title, rows in panels(flights).items()}
+        if not any(strips.values()):
             raise RecordError(_NOTHING)
-        return draw_strips(found, OVER_GOLDEN, columns)
+        return draw_strips(strips, OVER_GOLDEN, columns)
 
     return draw_panels
 
@@ -145,8 +145,8 @@ def _fig16(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _fig11(flights: Flights, columns: str) -> Figure:
-    found = values_and_deltas(flights.golden)
-    return draw_histograms([(name, *both) for name, both in found.items()], columns)
+    by_state = values_and_deltas(flights.golden)
+    return draw_histograms([(name, *both) for name, both in by_state.items()], columns)
 
 
 def _fig13(flights: Flights, columns: str) -> Figure:

@@ -315,8 +315,8 @@ class _KernelRuns:
             targets = _targets([_QUICKEST], scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
         run_s = (measured.wall_s - measured.prepare_s) / _QUICK_RUNS
-        of_each = self.missing() / len(select(()))
-        there_s = _PREPARE_S + _RUN_OF_EACH_S * of_each / self.jobs
+        runs = self.missing() / len(select(()))
+        there_s = _PREPARE_S + _RUN_OF_EACH_S * runs / self.jobs
         return there_s * run_s / _QUICKEST_RUN_S
 
     def run(self, spectator: Spectator, forecast_s: float) -> None:

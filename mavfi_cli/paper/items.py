@@ -90,12 +90,12 @@ def printed_name(name: str) -> str:
 
 def printed(item: str, *keys: object) -> Printed:
     """A number that the paper prints, or its words; None if it prints nothing there."""
-    found: Any = _PAPER.get(item, {})
+    entry: Any = _PAPER.get(item, {})
     for key in keys:
-        found = found.get(str(key)) if isinstance(found, Mapping) else None
-    if found is None or isinstance(found, str):
-        return found
-    return float(found)
+        entry = entry.get(str(key)) if isinstance(entry, Mapping) else None
+    if entry is None or isinstance(entry, str):
+        return entry
+    return float(entry)
 
 
 def _item(name: str, entry: Mapping[str, Any]) -> Item:
@@ -104,8 +104,8 @@ def _item(name: str, entry: Mapping[str, Any]) -> Item:
         name=name,
         title=entry["title"],
         labels=tuple(entry["labels"]),
-        columns=tuple(PaperColumn(**each) for each in entry["columns"]),
-        notes=tuple(_PAPER["notes"].get(each, each) for each in entry["notes"]),
+        columns=tuple(PaperColumn(**column) for column in entry["columns"]),
+        notes=tuple(_PAPER["notes"].get(note, note) for note in entry["notes"]),
         origin=f"paper: {entry['source']}{drawn}",
         preset=entry.get("preset", ""),
         source=Source(entry.get("computed_from", "flights")),
@@ -199,7 +199,7 @@ class FlightsPlan:
 
     def keys(self, *items: Item) -> list[Key]:
         """The configurations of the missions, as the ledger stores them."""
-        return [_key_of(each) for each in self.missions(*items)]
+        return [_key_of(mission) for mission in self.missions(*items)]
 
     def numbers(self, ledger: Ledger, *items: Item) -> list[int]:
         """The numbers of the missions in a ledger, in the order of its list."""
@@ -208,12 +208,14 @@ class FlightsPlan:
     def kept(self, ledger: Ledger) -> list[int]:
         """The numbers of the missions whose run folders any item needs."""
         specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
-        return _numbers_of(ledger, (_key_of(each) for spec in specs for each in spec.missions()))
+        return _numbers_of(
+            ledger, (_key_of(mission) for spec in specs for mission in spec.missions())
+        )
 
     def _specs(self, items: Iterable[Item], scale: float) -> list[Spec]:
         """The campaigns of items, each once, in the order of ITEMS."""
-        asked = set(items) or set(self.items)
-        presets = dict.fromkeys(item.preset for item in ITEMS if item in asked and item.preset)
+        wanted = set(items) or set(self.items)
+        presets = dict.fromkeys(item.preset for item in ITEMS if item in wanted and item.preset)
         specs = (load_spec(preset).scaled(scale) for preset in presets)
         return [replace(spec, fixed={**spec.fixed, "stack": self.stack}) for spec in specs]
 

@@ -58,7 +58,7 @@ def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
         for mission in FlightsPlan(items=[item], stack=stack).kinds()
     }
     changes = map(json.loads, flights["changes"])
-    mine = flights.where([kind_of(each, _SEEDS) in kinds for each in changes])
+    mine = flights.where([kind_of(change, _SEEDS) in kinds for change in changes])
     return (
         mine if any(mine["level"]) or item.name in _GOLDEN_ONLY else mine.where([False] * len(mine))
     )
@@ -187,7 +187,7 @@ def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[P
 
 def _fig14(flights: Flights) -> Iterator[PaperRow]:
     """Share of the worst increase that each detector recovers, by protected stages."""
-    for detector, told in DETECTOR_TITLES.items():
+    for detector, title in DETECTOR_TITLES.items():
         for stages in PROTECTED:
             paper = ("fig14", "recovered_percent", detector)
             cells = (
@@ -198,7 +198,7 @@ def _fig14(flights: Flights) -> Iterator[PaperRow]:
                 )
                 for world in flights.worlds
             )
-            yield _row(told, stages, cells=cells)
+            yield _row(title, stages, cells=cells)
 
 
 def _table5(flights: Flights) -> Iterator[PaperRow]:
@@ -249,16 +249,16 @@ def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArra
 
     Reads the traces of the successful flights whose run folders exist.
     """
-    runs = [Path(each) for each in flights.chosen(lost=False)["path"] if each]
+    runs = [Path(path) for path in flights.chosen(lost=False)["path"] if path]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
-    found = {}
+    by_state = {}
     for state in SHOWN_STATES:
         columns = [Flights(trace).known(state) for trace in traces]
-        found[state] = (
+        by_state[state] = (
             np.concatenate([np.zeros(0), *columns]),
-            np.concatenate([np.zeros(0), *(np.diff(each) for each in columns)]),
+            np.concatenate([np.zeros(0), *(np.diff(values) for values in columns)]),
         )
-    return found
+    return by_state
 
 
 def _fig11(flights: Flights) -> Iterator[PaperRow]:
@@ -267,7 +267,7 @@ def _fig11(flights: Flights) -> Iterator[PaperRow]:
         spans = [_span(values, 1.0), _span(deltas, 1.0)]
         middle = [_span(values, 0.99), _span(deltas, 0.99)]
         reduced = [_reduction(*spans), _reduction(*middle)]
-        cells = [PaperCell(value=each, count=len(values)) for each in (*spans, *reduced)]
+        cells = [PaperCell(value=value, count=len(values)) for value in (*spans, *reduced)]
         cells[2] = replace(cells[2], paper=printed("fig11", "reduction_percent", state))
         yield _row(state, cells=cells)
 
@@ -340,7 +340,7 @@ def _joined(
             `n` without a unit, the `last` of them, and the titles of the first and last column.
     """
 
-    def told(table: PaperTable) -> str:
+    def joined(table: PaperTable) -> str:
         names = [column.title for column in table.columns]
         titles = {"one": names[0], "end": names[-1]} if names else {}
         parts = []
@@ -353,31 +353,31 @@ def _joined(
                 parts.append(form.format(*row.labels, c=c, s=s, n=n, last=c[-1], **titles))
         return before.format(**titles) + between.join(parts) if parts else _NOTHING
 
-    return told
+    return joined
 
 
 def _labelled(label: str) -> Callable[[PaperTable], Sequence[PaperRow]]:
     return lambda table: [row for row in table.rows if row.labels[1] == label]
 
 
-def _worst_told(table: PaperTable) -> str:
+def _worst_and_lowest(table: PaperTable) -> str:
     """The row with the longest flight, and the one with the lowest success."""
     struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
     longest = table.ranked(2)
     if not longest:
         return _NOTHING
     lowest = min(struck, key=lambda row: row.cells[0].value)
-    told = (
+    summary = (
         f"longest flight {table.beside(longest[0], 2)} over its own golden one "
         f"({longest[0].labels[0]}); lowest success {table.beside(lowest, 0)} ({lowest.labels[0]})"
     )
     worst, lost = (printed("fig7", x) for x in ("worst_increase_percent", "success_lost_points"))
     paper = f"; paper: up to +{worst} % and -{lost} points"
-    return told + (paper if table.name == "fig7" else "")
+    return summary + (paper if table.name == "fig7" else "")
 
 
 _RESULTS: Mapping[str, Callable[[PaperTable], str]] = {
-    **dict.fromkeys(("fig7", "fig8", "fig9"), _worst_told),
+    **dict.fromkeys(("fig7", "fig8", "fig9"), _worst_and_lowest),
     "fig11": _joined("{c[2]} ({0})", "range reduced by ", ", "),
     "fig12": _joined("worst flight {c[1]} in {0}, GAD recovers {n[3]} and AAD {n[4]} points",
                      rows=lambda table: table.ranked(1)[:1]),
@@ -415,7 +415,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
     """The longest flight over the mean golden one, as increase in per cent."""
-    golden_s, times_s = (_of_successes(each, "flight_time_s") for each in (bare, flights))
+    golden_s, times_s = (_of_successes(those, "flight_time_s") for those in (bare, flights))
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)
     increase = float(times_s.max() / golden_s.mean()) - 1.0

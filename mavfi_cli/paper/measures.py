@@ -37,10 +37,10 @@ def _clustered(flights: Flights, column: str = "lost", *, value: bool = True) ->
     return flights.share(column, value=value, clustered=True)
 
 
-def _of_share(found: Share, what: str, why: str = NOT_FLOWN.why) -> Finding:
-    if not found.total:
+def _of_share(share: Share, what: str, why: str = NOT_FLOWN.why) -> Finding:
+    if not share.total:
         return Finding(why=why)
-    return Finding(effect=found.effect, counts=f"{found.counts} {what}")
+    return Finding(effect=share.effect, counts=f"{share.counts} {what}")
 
 
 def _difference(shares: Sequence[Share], counts: str) -> Finding:
@@ -67,9 +67,9 @@ def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
     if not clusters:
         return NOT_FLOWN
     means = [math.fsum(those) / len(those) for those in clusters.values()]
-    found = interval(means, resamples=TABLE_RESAMPLES)
+    average = interval(means, resamples=TABLE_RESAMPLES)
     number = sum(map(len, clusters.values()))
-    effect = Interval(value=found.value, low=found.low, high=found.high, count=number)
+    effect = Interval(value=average.value, low=average.low, high=average.high, count=number)
     return Finding(effect=effect, counts=counts)
 
 
@@ -99,8 +99,8 @@ def _delta_range(flights: Flights, state: str, why: str) -> Finding:
             reduced.append(1.0 - float(np.ptp(np.diff(values))) / float(np.ptp(values)))
         else:
             reduced.append(math.nan)
-    found = _mean(won, reduced, "golden flights")
-    return Finding(why=why) if len(won) and found.effect is None else found
+    finding = _mean(won, reduced, "golden flights")
+    return Finding(why=why) if len(won) and finding.effect is None else finding
 
 
 # Faults without a detector ------------------------------------------------------------------------
@@ -123,8 +123,9 @@ def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
     if not kernels:
         return NOT_FLOWN
     most = max(kernels, key=lambda name: kernels[name])
-    found = _success_lost(flights, **where, struck_kernel=most)
-    return Finding(effect=found.effect, counts=f"most in {most}: {found.counts}", why=found.why)
+    finding = _success_lost(flights, **where, struck_kernel=most)
+    counts = f"most in {most}: {finding.counts}"
+    return Finding(effect=finding.effect, counts=counts, why=finding.why)
 
 
 def _harm_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
@@ -145,8 +146,8 @@ def _loss_difference(
     Args:
         counts: a format of two texts.
     """
-    shares = [_clustered(flights.struck(**where, **each)) for each in (first, second)]
-    return _difference(shares, f"lost: {counts.format(*(each.counts for each in shares))}")
+    shares = [_clustered(flights.struck(**where, **chosen)) for chosen in (first, second)]
+    return _difference(shares, f"lost: {counts.format(*(share.counts for share in shares))}")
 
 
 def _longer(flights: Flights, **where: Any) -> Finding:
@@ -155,9 +156,9 @@ def _longer(flights: Flights, **where: Any) -> Finding:
     ratios = timed.ratios
     if not len(ratios):
         return NOT_FLOWN
-    found = _clustered(timed, "harmed")
+    share = _clustered(timed, "harmed")
     most = 100.0 * (ratios.max() - 1.0)
-    return _of_share(found, f"over {100 * (LONGER - 1):.0f} % longer; longest {most:+.1f} %")
+    return _of_share(share, f"over {100 * (LONGER - 1):.0f} % longer; longest {most:+.1f} %")
 
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
@@ -200,8 +201,8 @@ def _not_measured(_: Flights, why: str) -> Finding:
 
 def _net(seen: Flights, column: str, what: str) -> Finding:
     """Share of an ill that a detector undoes, less what it causes on the same faults."""
-    seen = seen.where(each is not None for each in seen[f"bare_{column}"])
-    seen = seen.where(each is not None for each in seen[column])
+    seen = seen.where(value is not None for value in seen[f"bare_{column}"])
+    seen = seen.where(value is not None for value in seen[column])
     if not len(seen):
         return NOT_FLOWN
     before, after = seen.flags(f"bare_{column}"), seen.flags(column)
@@ -209,7 +210,7 @@ def _net(seen: Flights, column: str, what: str) -> Finding:
     counts = f"of {before.sum():,} {what}, {undone:,} undone; {caused:,} newly caused"
     if before.sum() < _FEWEST:
         few = f"without the detector {before.sum():,} of {len(seen):,} are {what}"
-        return Finding(counts=counts if caused else "", why=f"{few}, too few to tell a share")
+        return Finding(counts=counts if caused else "", why=f"{few}, too few to estimate a share")
     return Finding(effect=net_share(before, after, seen.seeds), counts=counts)
 
 
@@ -232,21 +233,23 @@ def _undone_difference(
     Args:
         first, others: stages that the detector watches, joined by `+`.
     """
-    found = {
+    findings = {
         name: _net(flights.protected(detector, name, **where), "harmed", "harmful")
         for name in (first, *others)
     }
     best = None
     for name in others:
-        effect = found[name].effect
-        if effect is None or found[first].effect is None:
-            return Finding(counts=found[name].counts, why=found[name].why or found[first].why)
+        effect = findings[name].effect
+        if effect is None or findings[first].effect is None:
+            return Finding(
+                counts=findings[name].counts, why=findings[name].why or findings[first].why
+            )
         if best is None or effect.value > best.value:
             best = effect
-    effect = found[first].effect
+    effect = findings[first].effect
     assert effect is not None
     assert best is not None
-    counts = "; ".join(f"{name}: {each.counts}" for name, each in found.items())
+    counts = "; ".join(f"{name}: {finding.counts}" for name, finding in findings.items())
     return Finding(effect=effect.minus(best), counts=counts)
 
 
@@ -310,8 +313,8 @@ def _overheads(
 
 
 def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> Finding:
-    found = _mean(seen, list(costs), counts)
-    return _NO_COSTS if len(seen) and found.effect is None else found
+    finding = _mean(seen, list(costs), counts)
+    return _NO_COSTS if len(seen) and finding.effect is None else finding
 
 
 # Isolated kernels ---------------------------------------------------------------------------------
@@ -326,23 +329,23 @@ def _outcome_beside(
         extreme: `most` or `least`.
         others: none mean all.
     """
-    there = [each for each in others or kernels if each in kernels and each != kernel]
+    there = [name for name in others or kernels if name in kernels and name != kernel]
     if kernel not in kernels or not there:
         return NOT_FLOWN
     choose = max if extreme == "most" else min
-    other = choose(there, key=lambda each: kernels[each].outcomes[outcome].share)
-    shares = {each: kernels[each].outcomes[outcome] for each in (kernel, other)}
-    counts = (f"{kernels[each].title} {100 * x.share:.1f} %" for each, x in shares.items())
+    other = choose(there, key=lambda name: kernels[name].outcomes[outcome].share)
+    shares = {name: kernels[name].outcomes[outcome] for name in (kernel, other)}
+    counts = (f"{kernels[name].title} {100 * x.share:.1f} %" for name, x in shares.items())
     effect = shares[kernel].minus(shares[other])
     return Finding(effect=effect, counts=", ".join(counts))
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
     """The least share of benign runs of all kernels but one."""
-    shares = {each: kernels[each].outcomes["benign"] for each in kernels if each != but}
+    shares = {name: kernels[name].outcomes["benign"] for name in kernels if name != but}
     if not shares:
         return NOT_FLOWN
-    least = min(shares, key=lambda each: shares[each].share)
+    least = min(shares, key=lambda name: shares[name].share)
     return _of_share(shares[least], f"benign in {kernels[least].title}, the least")
 
 
@@ -366,34 +369,34 @@ def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
     }
     if len(flown) < _FEWEST:
         return NOT_FLOWN
-    if len({each.share for each in flown.values()}) == 1:
+    if len({share.share for share in flown.values()}) == 1:
         return Finding(why="in flight all kernels do the same harm")
     rng = np.random.default_rng(1)
     silent = {name: kernels[name].outcomes["sdc"] for name in flown}
     drawn = [
-        np.stack([_posterior(each, rng) for each in those])
+        np.stack([_posterior(share, rng) for share in those])
         for those in (silent.values(), flown.values())
     ]
     low, high = np.percentile(_spearman(*drawn), [2.5, 97.5])
-    shares = (np.array([[each.share] for each in those.values()]) for those in (silent, flown))
+    shares = (np.array([[share.share] for share in those.values()]) for those in (silent, flown))
     value = float(_spearman(*shares)[0])
-    count = sum(each.total for each in flown.values())
+    count = sum(share.total for share in flown.values())
     order = sorted(flown, key=lambda name: -flown[name].share)
     counts = f"harm in flight, most first: {', '.join(order)}"
     effect = Interval(value=value, low=float(low), high=float(high), count=count)
     return Finding(effect=effect, counts=counts)
 
 
-def _posterior(found: Share, rng: np.random.Generator) -> FloatArray:
-    return rng.beta(found.count + 0.5, found.total - found.count + 0.5, _DRAWS)
+def _posterior(share: Share, rng: np.random.Generator) -> FloatArray:
+    return rng.beta(share.count + 0.5, share.total - share.count + 0.5, _DRAWS)
 
 
 def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
     """Rank correlation down the columns of two arrays, (kernels, n); ties have mean ranks."""
     from scipy.stats import rankdata
 
-    ranks = [rankdata(each, axis=0) for each in (first, second)]
-    a, b = (each - each.mean(axis=0) for each in ranks)
+    ranks = [rankdata(values, axis=0) for values in (first, second)]
+    a, b = (values - values.mean(axis=0) for values in ranks)
     return np.asarray((a * b).sum(axis=0) / np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0)))
 
 

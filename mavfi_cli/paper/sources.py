@@ -62,8 +62,8 @@ class CampaignSource:
     @property
     def seeds(self) -> tuple[int, int] | None:
         """The smallest and the largest seed of its flights; None without flights."""
-        found = [seed for seed in self.flights["seed"] if seed is not None]
-        return (min(found), max(found)) if found else None
+        seeds = [seed for seed in self.flights["seed"] if seed is not None]
+        return (min(seeds), max(seeds)) if seeds else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,22 +94,22 @@ class Evidence:
         problems: list[str] = []
         for place in places:
             before = len(campaigns) + len(kernels) + len(problems)
-            for path in _found(place):
+            for path in _paths_in(place):
                 try:
                     with reading(path):
-                        each = _read(path)
+                        source = _read(path)
                 except (MavfiError, OSError) as error:
                     problems.append(f"Not read: {error}.")
                     continue
-                if isinstance(each, CampaignSource):
-                    campaigns.append(each)
+                if isinstance(source, CampaignSource):
+                    campaigns.append(source)
                 else:
-                    kernels.append(each)
+                    kernels.append(source)
             if len(campaigns) + len(kernels) + len(problems) == before:
                 problems.append(f"{place}: holds no campaign, no export and no {KERNELS}.")
-        if not any(len(each.flights) for each in campaigns) and not kernels:
-            none = (f"{each.path}: no mission has flown yet" for each in campaigns)
-            raise RecordError("; ".join(each.rstrip(".") for each in problems or none))
+        if not any(len(source.flights) for source in campaigns) and not kernels:
+            none = (f"{source.path}: no mission has flown yet" for source in campaigns)
+            raise RecordError("; ".join(problem.rstrip(".") for problem in problems or none))
         problems += [
             *_incomplete(campaigns), *_unpaired(campaigns), *_mixed(campaigns),
             *_repeated(kernels),
@@ -123,10 +123,10 @@ class Evidence:
 
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
-        return Flights.pooled([each.flights for each in self.campaigns], stack)
+        return Flights.pooled([campaign.flights for campaign in self.campaigns], stack)
 
 
-def _found(place: Path) -> Iterator[Path]:
+def _paths_in(place: Path) -> Iterator[Path]:
     """Ledgers, summaries of kernels and exports at a place, in the order of their names."""
     if not place.exists():
         raise RecordError(f"{place}: does not exist")
@@ -144,8 +144,8 @@ def _found(place: Path) -> Iterator[Path]:
 
 def _inside_campaign(path: Path, place: Path) -> bool:
     """Whether it belongs to a campaign's own folders: kept runs, the search for a world."""
-    above = [each for each in path.parent.parents if each.is_relative_to(place)]
-    return any((each / LEDGER).is_file() for each in above)
+    above = [folder for folder in path.parent.parents if folder.is_relative_to(place)]
+    return any((folder / LEDGER).is_file() for folder in above)
 
 
 def _read(path: Path) -> CampaignSource | KernelSummary:
@@ -176,9 +176,9 @@ def _campaign(
     path: Path, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any], **more: Any
 ) -> CampaignSource:
     errors = table["state"].to_pylist().count(ResultState.ERROR.value)
-    told = {each: origin[each] for each in ("planned", "versions", "host") if each in origin}
+    known = {name: origin[name] for name in ("planned", "versions", "host") if name in origin}
     more |= {"flights": Flights.of(table), "errors": errors}
-    return CampaignSource(path=path, spec=spec, **told, **more)
+    return CampaignSource(path=path, spec=spec, **known, **more)
 
 
 def _spec_beside(path: Path) -> Spec | None:
@@ -195,14 +195,15 @@ def _spec_beside(path: Path) -> Spec | None:
 
 
 def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    for each in campaigns:
-        over = len(each.flights) + each.errors
-        if each.planned is not None and over < each.planned:
-            rest = f"{each.again or 'The command that began it'} flies the rest."
-            rest = "An export holds no list." if each.digest else rest
-            yield f"{each.path}: {over:,} of {each.planned:,} missions have flown. {rest}"
-        if each.errors:
-            yield f"{each.path}: {each.errors:,} missions could not begin; they are not counted."
+    for source in campaigns:
+        over = len(source.flights) + source.errors
+        if source.planned is not None and over < source.planned:
+            rest = f"{source.again or 'The command that began it'} flies the rest."
+            rest = "An export holds no list." if source.digest else rest
+            yield f"{source.path}: {over:,} of {source.planned:,} missions have flown. {rest}"
+        if source.errors:
+            errors = f"{source.errors:,} missions could not begin"
+            yield f"{source.path}: {errors}; they are not counted."
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
@@ -238,19 +239,22 @@ def _repeated(kernels: Sequence[KernelSummary]) -> Iterator[str]:
 
 
 def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    told = [each for each in campaigns if each.versions]
-    for each in told[1:]:
-        if found := version_differences(told[0].versions, each.versions):
-            yield f"{each.path} and {told[0].path} were flown by other builds: {', '.join(found)}."
-    unnamed = [each.path.name for each in campaigns if not each.versions and len(each.flights)]
+    versioned = [source for source in campaigns if source.versions]
+    for source in versioned[1:]:
+        if differences := version_differences(versioned[0].versions, source.versions):
+            builds = f"{source.path} and {versioned[0].path} were flown by other builds"
+            yield f"{builds}: {', '.join(differences)}."
+    unnamed = [
+        source.path.name for source in campaigns if not source.versions and len(source.flights)
+    ]
     if unnamed:
         yield (
             f"{', '.join(unnamed)}: the export does not name the builds that flew it, so nothing "
             "shows whether it mixes several."
         )
     here = installed_versions()
-    if told and (found := version_differences(told[0].versions, here)):
+    if versioned and (differences := version_differences(versioned[0].versions, here)):
         yield (
-            f"{told[0].path} was flown by another build than this one, so its missions may not "
-            f"repeat here: {', '.join(found)}."
+            f"{versioned[0].path} was flown by another build than this one, so its missions may "
+            f"not repeat here: {', '.join(differences)}."
         )

@@ -82,11 +82,13 @@ def _item_of(ledger: Ledger, name: str | None) -> Item | None:
     own = [item for item in ITEMS if item.preset == preset] if preset in PRESETS.names else []
     if name is None:
         return min(own, key=lambda item: item.name != preset, default=None)
-    (found,) = items_named([name])
+    (item,) = items_named([name])
     known = own if FlightsPlan.stored(ledger) is None and ledger.export is None else ITEMS
-    if found not in known:
-        raise UnknownName("item of this campaign", name, [each.name for each in known] or ["none"])
-    return found
+    if item not in known:
+        raise UnknownName(
+            "item of this campaign", name, [other.name for other in known] or ["none"]
+        )
+    return item
 
 
 def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
@@ -135,8 +137,8 @@ def of_kernels(kernels: Iterable[IsolatedKernel]) -> PaperTable:
         rows.append(PaperRow(labels=(kernel.title,), cells=cells))
     table = BY_NAME["fig6"].table(rows)
     most = table.ranked(1)
-    told = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
-    return replace(table, result=f"{told} (paper: OctoMap)" if most else "no runs")
+    result = f"most SDC: {most[0].labels[0]}, {most[0].cells[1].value:.1f} %" if most else ""
+    return replace(table, result=f"{result} (paper: OctoMap)" if most else "no runs")
 
 
 def of_model() -> PaperTable:
@@ -170,10 +172,10 @@ _MEANS = {
 
 
 def _settings_table(ledger: Ledger) -> PaperTable:
-    found = groups(ledger)
-    settings = SettingColumns.of([group.labels for group in found])
+    merged = groups(ledger)
+    settings = SettingColumns.of([group.labels for group in merged])
     rows = []
-    for group in found:
+    for group in merged:
         won = group.succeeded[group.counted]
         success = PaperCell.of_share(wilson(int(won.sum()), len(won)))
         means = (PaperCell.of_mean(k * group.successes(name)) for name, k in _MEANS.values())
@@ -245,8 +247,8 @@ def _time_left(ledger: Ledger, missing: int) -> str:
     walls = [wall for portion in ledger.columns(["wall_s"]) for wall in portion[0]]
     if not walls:
         return f"{missing} missing; time left: not known before a mission is over"
-    jobs, each_s = len(os.sched_getaffinity(0)), sum(walls) / len(walls)
+    jobs, mission_s = len(os.sched_getaffinity(0)), sum(walls) / len(walls)
     return (
-        f"{missing} missing: about {duration(missing * each_s / jobs)} with {jobs} at a time "
-        f"({each_s:.1f} s each so far)"
+        f"{missing} missing: about {duration(missing * mission_s / jobs)} with {jobs} at a time "
+        f"({mission_s:.1f} s each so far)"
     )

@@ -112,8 +112,8 @@ class JudgedClaim:
 
     def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
         """The verdict on a stack, or on ISOLATED; None if the claim is not judged there."""
-        found = self.judgements.get(place, {}).get(fate)
-        return None if found is None else found.verdict
+        judgement = self.judgements.get(place, {}).get(fate)
+        return None if judgement is None else judgement.verdict
 
 
 def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) -> list[Judgement]:
@@ -123,29 +123,29 @@ def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) ->
         findings: finding of each claim.
         ranges: low and high end of each claim's range, which belong to it.
     """
-    z = [_z(found.effect, *ends) for found, ends in zip(findings, ranges, strict=True)]
-    tested = [place for place, each in enumerate(z) if not math.isnan(each)]
+    z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
+    tested = [place for place, value in enumerate(z) if not math.isnan(value)]
     p = dict(zip(tested, holm([_two_sided(z[place]) for place in tested]), strict=True))
     wanted_z = z_of(1.0 - LEVEL / len(tested)) if tested else _Z
     judged = []
-    for place, (found, (low, high)) in enumerate(zip(findings, ranges, strict=True)):
+    for place, (finding, (low, high)) in enumerate(zip(findings, ranges, strict=True)):
         judgement = Judgement(
             verdict=Verdict.NOT_DECIDABLE,
-            counts=found.counts,
-            why=found.why or "the flights give no interval",
+            counts=finding.counts,
+            why=finding.why or "the flights give no interval",
         )
-        if place in p and found.effect is not None:
+        if place in p and finding.effect is not None:
             undecided = p[place] >= LEVEL
-            inside = low <= found.effect.value <= high
+            inside = low <= finding.effect.value <= high
             decided = Verdict.REPRODUCED if inside else Verdict.CONTRADICTED
             more = (wanted_z / z[place]) ** 2 if z[place] else math.inf
             judgement = replace(
                 judgement,
                 verdict=Verdict.UNDECIDED if undecided else decided,
-                effect=found.effect,
+                effect=finding.effect,
                 why="",
                 p=p[place],
-                needed=found.effect.count * more if undecided else 0.0,
+                needed=finding.effect.count * more if undecided else 0.0,
             )
         judged.append(judgement)
     return judged

@@ -248,7 +248,7 @@ def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> 
         sums[key] = sums.get(key, 0.0) + residual
     if squares == 0.0 or len(sums) in (1, len(values)):
         return 1.0
-    between = math.fsum(each**2 for each in sums.values()) * len(sums) / (len(sums) - 1)
+    between = math.fsum(total**2 for total in sums.values()) * len(sums) / (len(sums) - 1)
     return max(1.0, between / squares)
 
 

@@ -196,10 +196,10 @@ def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
     """Every map that a plan was made on, and in between one a second of those checked."""
     planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
     checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
-    told_s = -math.inf
+    shown_s = -math.inf
     for start_s, snapshot, wanted in sorted(planned + checked, key=itemgetter(0)):
-        if wanted or start_s >= told_s + _MAP_EVERY_S:
-            told_s = start_s
+        if wanted or start_s >= shown_s + _MAP_EVERY_S:
+            shown_s = start_s
             leaves = occupied_leaves(snapshot.payload) * snapshot.resolution_m
             sizes = np.repeat(leaves[:, 3:], 3, axis=1)
             look = {"colour": _MAP, "size_m": sizes}
