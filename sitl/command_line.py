@@ -29,7 +29,7 @@ class Place(click.ParamType[Triple]):
         except ValueError:
             place = ()
         if len(place) != 3 or not all(math.isfinite(c) for c in place):
-            self.fail(f"{value!r}: expected x,y,z in m, such as 30,40,5", param, ctx)
+            self.fail(f"must be x,y,z in m, such as 30,40,5, got {value!r}", param, ctx)
         return place
 
 
@@ -43,7 +43,7 @@ class _Size(click.ParamType[tuple[int, int]]):
             return value
         columns, _, rows = str(value).partition("x")
         if not (columns.isdecimal() and rows.isdecimal() and int(columns) and int(rows)):
-            self.fail(f"{value!r}: expected columns x rows, such as 64x48", param, ctx)
+            self.fail(f"must be columns x rows, such as 64x48, got {value!r}", param, ctx)
         return int(columns), int(rows)
 
 

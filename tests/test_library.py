@@ -80,7 +80,7 @@ def test_a_wrong_setting_is_named():
         mavfi.fly(planer="rrt")
     with pytest.raises(ConfigError, match=r"fault\.bit.*bits"):
         mavfi.fly(fault={"target": "planning", "bit": 3})
-    with pytest.raises(ConfigError, match="expected a whole number"):
+    with pytest.raises(ConfigError, match="must be a whole number"):
         mavfi.fly(seed="3")
 
 

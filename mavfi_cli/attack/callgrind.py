@@ -81,7 +81,7 @@ def count_executions(
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     if code < 0:
-        raise TargetError(name, f"is killed by signal {-code} under callgrind")
+        raise TargetError(name, f"was killed by signal {-code} under callgrind")
     count.read_rest()
     return code, count.executions
 
@@ -151,7 +151,7 @@ def _await_end(
         with contextlib.suppress(subprocess.TimeoutExpired):
             return process.wait(min(_REPORT_EVERY_S, left_s))
         report(count.update())
-    raise TargetError(name, f"has not ended under callgrind after {count.limit_s:.0f} s")
+    raise TargetError(name, f"did not end under callgrind within {count.limit_s:.0f} s")
 
 
 def _is_complete(path: Path) -> bool:

@@ -72,15 +72,15 @@ class Journal:
         others = sorted(counts.keys() - set(kernels)) if kernels is not None else []
         if others:
             raise ConfigError(
-                f"holds runs of {' and '.join(others)} as well: name all of its kernels, or "
+                f"also holds runs of {' and '.join(others)}: name all of its kernels, or "
                 "choose another folder",
                 path=self._folder,
             )
         most = max(counts.values(), default=0)
         if most > runs:
             raise ConfigError(
-                f"holds {most} runs already: the number of runs must be at least {most}, "
-                f"got {runs}; or choose another folder",
+                f"already holds {most} runs; choose another folder, or more runs: runs must be at "
+                f"least {most}, got {runs}",
                 path=self._folder,
             )
 

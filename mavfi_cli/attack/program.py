@@ -203,7 +203,7 @@ class _Workplace:
             raise TargetError(
                 self.name,
                 f"{observed.started}, which the tracer does not follow: nothing there can be "
-                "counted or hit; attack a program with one thread (--env OMP_NUM_THREADS=1 may "
+                "counted or struck; attack a program with one thread (--env OMP_NUM_THREADS=1 may "
                 "limit it to one)",
             )
         function, limit = self.target.function, self.limits.profile_steps

@@ -96,7 +96,8 @@ def chosen_spec(
     with Ledger(folder) as ledger:
         if scale is not None or changes or out is not None:
             raise ConfigError(
-                "does not take --scale, --set or --out: the folder stores them", path=folder
+                "cannot be combined with --scale, --set or --out, because the folder stores them",
+                path=folder,
             )
         stored = stored_spec(ledger) or _Unflown.of(ledger)
     for kind in stored.kinds():

@@ -83,7 +83,7 @@ def _object(text: str | bytes) -> dict[str, Any]:
     """Read a JSON object. Raises TypeError or ValueError."""
     value = json.loads(text)
     if not isinstance(value, dict):
-        raise TypeError(f"expected a JSON object, got a {type(value).__name__}")
+        raise TypeError(f"must be a JSON object, got a {type(value).__name__}")
     return value
 
 

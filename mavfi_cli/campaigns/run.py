@@ -104,7 +104,7 @@ class Options:
             raise ConfigError(f"must be above 0 and finite, got {self.limit_s:g}", key="limit")
         if self.cluster is not None and not _is_address(self.cluster):
             # dask would retry for half a minute, and then raise a traceback
-            problem = f"expected an address such as tls://host:8786, got {self.cluster!r}"
+            problem = f"must be an address such as tls://host:8786, got {self.cluster!r}"
             raise ConfigError(problem, key="cluster")
         if (self.cluster or "").startswith("tls://") != (self.cluster_key is not None):
             problem = (

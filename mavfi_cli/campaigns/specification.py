@@ -64,7 +64,7 @@ def _fault(values: Factors, seed: int) -> Factors:
     given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
     level = given.pop("level", "source")
     if level not in [*_LEVELS]:
-        raise ConfigError(f"expected {' or '.join(_LEVELS)}, got {level!r}", key="level")
+        raise ConfigError(f"must be {' or '.join(_LEVELS)}, got {level!r}", key="level")
     targets = [name for name in _ALIASES if name in given]
     if len(targets) > 1:
         raise ConfigError("name a stage or a site for the fault, not both")
@@ -132,7 +132,9 @@ class FixedWorld:
     def __post_init__(self) -> None:
         least, most = self.replans
         if not 0 <= least <= most:
-            raise ValueError(f"replans: expected [LEAST, MOST], got [{least}, {most}]")
+            raise ValueError(
+                f"replans: must be [LEAST, MOST] with 0 <= LEAST <= MOST, got [{least}, {most}]"
+            )
         if self.flights < 1 or self.candidates < 1:
             raise ValueError(
                 "flights and candidates: must be at least 1, "
@@ -405,9 +407,9 @@ def require_named(
         UnknownName: a name is not among `known`, if that is given.
     """
     if len(names) < least:
-        raise ConfigError("name at least one", key=key)
+        raise ConfigError("must name at least one, got none", key=key)
     for place, name in enumerate(names):
         if known is not None and name not in known:
             raise UnknownName(key, name, known)
         if name in names[:place]:
-            raise ConfigError(f"{name} is named twice", key=key)
+            raise ConfigError(f"must not name {name} twice", key=key)

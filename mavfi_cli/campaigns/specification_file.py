@@ -83,7 +83,7 @@ def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
 
 def _require_table(table: Any, key: str, known: Sequence[str], path: Path) -> None:
     if not isinstance(table, dict):
-        raise ConfigError("expected a table", path=path, key=key)
+        raise ConfigError(f"must be a table, got {table!r}", path=path, key=key)
     for name in table:
         if name not in known:
             place = f"{key}.{name}" if key else name
@@ -111,9 +111,9 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
         if name == "planner":  # one planner is one setting, however it is written
             values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
         if name not in LISTS and not values:
-            raise ConfigError("an empty list of values", path=path, key=key)
+            raise ConfigError("must have at least one value, got []", path=path, key=key)
         if name not in LISTS and len(set(map(repr, values))) < len(values):
-            raise ConfigError("a value is listed twice", path=path, key=key)
+            raise ConfigError(f"must not list a value twice, got {[*values]}", path=path, key=key)
         axes[name] = values
     return axes
 

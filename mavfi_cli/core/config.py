@@ -152,9 +152,9 @@ def _strict(kind: type, *accepted: type) -> Any:
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
-            raise TypeError(f"expected {_IN_WORDS[kind]}, got {value!r}")
+            raise TypeError(f"must be {_IN_WORDS[kind]}, got {value!r}")
         if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"expected a finite number, got {value!r}")
+            raise ValueError(f"must be a finite number, got {value!r}")
         return kind(value)
 
     return hook
@@ -164,9 +164,9 @@ def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = No
     def hook(value: Any, cls: Any) -> Any:
         """Raise TypeError for the wrong type or length. A text is not an array of letters."""
         if not isinstance(value, accepted):
-            raise TypeError(f"expected {wanted}, got {value!r}")
+            raise TypeError(f"must be {wanted}, got {value!r}")
         if length is not None and len(value) != length:
-            raise TypeError(f"expected {length} values, got {len(value)}")
+            raise TypeError(f"must have {length} values, got {len(value)}")
         return structured(value, cls)
 
     return hook

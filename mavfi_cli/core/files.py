@@ -120,7 +120,8 @@ def inflate(data: bytes, limit: int) -> bytes:
     except zlib.error as error:
         raise ValueError(str(error)) from None
     if not inflater.eof:
-        raise ValueError(f"is truncated, or has more than {limit >> 20} MB")
+        too_large = len(whole) >= limit
+        raise ValueError(f"must have at most {limit >> 20} MB" if too_large else "is truncated")
     return whole
 
 
@@ -250,7 +251,7 @@ def require_folder(folder: Path) -> None:
     except UnicodeEncodeError:
         raise RecordError(f"{str(folder)!r}: not a UTF-8 name") from None
     if not can_write(folder):
-        raise RecordError(f"{folder}: not a folder that can be made or written")
+        raise RecordError(f"{folder}: not a folder that can be created or written")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -285,7 +286,7 @@ def read_parquet(path: Path, what: str) -> Any:
             groups = map(about.row_group, range(about.num_row_groups))
             packed = sum(group.total_byte_size for group in groups)
             if max(packed, 8 * about.num_rows * about.num_columns) > _LARGEST:
-                raise RecordError(f"{path}: has more than {_LARGEST >> 20} MB")
+                raise RecordError(f"{path}: must have at most {_LARGEST >> 20} MB")
         return pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise RecordError(f"{path}: the {what} cannot be read ({error})") from None

@@ -400,7 +400,7 @@ class Dataset:
     def __post_init__(self) -> None:
         keys = [(flight.world, flight.seed) for flight in self.flights]
         if len(set(keys)) != len(keys):
-            raise ModelError("a data set must hold every flight (world and seed) once")
+            raise ModelError("a data set must contain each flight (world and seed) only once")
 
     def __len__(self) -> int:
         return len(self.flights)
@@ -446,7 +446,7 @@ class Dataset:
             raise ModelError("is not a data set of mavfi", path=path)
         if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
             raise ModelError(
-                "made for another version, table of states or preprocessing; fly it again",
+                "was made for another version, table of states or preprocessing; fly it again",
                 path=path,
             )
         stack = StackMark(name=metadata["mavfi_stack"], digest=metadata["mavfi_stack_digest"])

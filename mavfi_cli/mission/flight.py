@@ -310,7 +310,7 @@ class Flight:
         elif data := self._receive(self._patience_s):
             self._tick(self._take(data))
         else:
-            raise LinkLost(f"the simulated vehicle said nothing for {self._patience_s:g} s")
+            raise LinkLost(f"the simulated vehicle sent nothing for {self._patience_s:g} s")
 
     def _turn_by_wall(self, clock: ForeignClock) -> None:
         """Run a tick for a foreign autopilot, even without a new state, until it counts as lost."""
@@ -363,7 +363,7 @@ class Flight:
         self._unspoken_s += waited_s
         limit_s = self._config.loss_limit_s
         if clock.heard and clock.silence_s >= limit_s:
-            raise LinkLost(f"{self._config.link}: no new state was heard for {limit_s:g} s")
+            raise LinkLost(f"{self._config.link}: no new state for {limit_s:g} s")
         if self._unspoken_s < IDLE_S:
             return
         self._unspoken_s = 0.0

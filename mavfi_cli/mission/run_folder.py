@@ -437,7 +437,7 @@ def load_run(path: str | Path) -> Run:
     if result.get("schema") != 1:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
-        raise RecordError(f"{folder.result}: damaged (without {', '.join(missing)})")
+        raise RecordError(f"{folder.result}: damaged (missing: {', '.join(missing)})")
     # Records from before the introduction of stacks flew the stack FIRST.
     with reading(folder.result):
         result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}

@@ -158,7 +158,7 @@ def read_briefing(folder: Path) -> Briefing:
         arrays: Any = {name: np.array(values, np.float64) for name, values in data.items()}
         return _at_flight_levels(Briefing(**arrays))
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise VehicleProcessError(f"the vehicle process left no briefing ({error})") from None
+        raise VehicleProcessError(f"the vehicle process wrote no briefing ({error})") from None
 
 
 def _read_truth(folder: Path) -> FlightTruth | None:

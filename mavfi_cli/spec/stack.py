@@ -182,7 +182,7 @@ def load_stack(text: str) -> Stack:
         changed = tomllib.loads("\n".join(_PAIR.split(changes)))
     except tomllib.TOMLDecodeError:
         raise ConfigError(
-            f"expected KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}", key="stack"
+            f"must have KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}", key="stack"
         ) from None
     sources = {**values.get("sources", {}), **dict.fromkeys(changed, "this variant's name")}
     about = {"name": text, "base": name, "description": "", "sources": sources}

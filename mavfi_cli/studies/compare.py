@@ -78,7 +78,7 @@ class ComparePlan:
             if getattr(self, key) < 0:
                 raise ConfigError(f"must be at least 0, got {getattr(self, key)}", key=key)
         if self.field is not None and not self.inject:
-            raise ConfigError(f"{self.field}: there is no fault", key="field")
+            raise ConfigError(f"has no effect without a fault, got {self.field}", key="field")
 
     @property
     def settings(self) -> tuple[str, ...]:

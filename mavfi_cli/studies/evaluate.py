@@ -152,7 +152,7 @@ class EvaluationPlan:
                 seed = flight.rpartition("/")[2]
                 if seed.isdigit() and int(seed) in self.seeds:
                     raise ModelError(
-                        f"{detector.name} was made with the flight {flight}: seeds "
+                        f"{detector.name} was fitted to the flight {flight}: seeds "
                         f"{self.seeds.start} to {self.seeds.stop - 1} are not held out, choose "
                         "another --first-seed",
                         path=path,

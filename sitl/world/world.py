@@ -256,7 +256,9 @@ def _pair_of_spec(text: str) -> _Pair | None:
     try:
         density, size = (float(part) for part in text.removeprefix("gen:").split(","))
     except ValueError:
-        raise WorldError(f"{text!r}: expected gen:density,size, such as gen:0.2,5") from None
+        raise WorldError(
+            f"world must be gen:density,size, such as gen:0.2,5, got {text!r}"
+        ) from None
     return _Pair(density=density, size_m=size)
 
 

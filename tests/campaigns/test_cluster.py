@@ -297,7 +297,7 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port,
 def test_what_is_no_address_is_wrong_usage(address, mavfi):
     run = mavfi("campaign", "run", "table4", "--cluster", address, "--quiet")
     assert (run.returncode, run.stdout) == (2, "")
-    expected = f"expected an address such as tls://host:8786, got {address!r}"
+    expected = f"must be an address such as tls://host:8786, got {address!r}"
     assert run.stderr == f"error: --cluster: {expected}\n"
 
 

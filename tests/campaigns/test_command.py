@@ -196,7 +196,7 @@ def refused(mavfi, tmp_path):
     [
         ('world = "farm"', 'world = "fram"', "unknown world 'fram'; did you mean 'farm'?"),
         ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
-        ('world = "farm"', "world = []", "factors.world: an empty list of values"),
+        ('world = "farm"', "world = []", "factors.world: must have at least one value"),
         ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, got 0"),
         ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
         ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
@@ -274,7 +274,7 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     again = invoke(command.campaign, ["run", str(changed), "--quiet"])
     assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
     both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])
-    assert "does not take --scale, --set or --out" in str(both.exception)
+    assert "cannot be combined with --scale, --set or --out" in str(both.exception)
 
 
 def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):

@@ -88,7 +88,7 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
         (("--start", "1,inf,2"), "--start: must be three finite numbers"),
         (("--stack", "mavbench:foo=3"), "foo: unknown key; known: "),
-        (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: expected true or false"),
+        (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: must be true or false"),
     ],
 )
 def test_a_number_out_of_its_range_names_the_option(refused, arguments, said):
@@ -249,13 +249,13 @@ def test_a_full_disk_in_flight(command_line):
 def test_a_folder_that_cannot_be_made(refused, tmp_path):
     (tmp_path / "file").write_text("")
     line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs", code=2)
-    assert "'--out': file/runs: not a folder that can be made or written" in line
+    assert "'--out': file/runs: not a folder that can be created or written" in line
 
 
 @pytest.mark.parametrize(
     ("out", "why"),
     [
-        ("/dev/null", "/dev/null: not a folder that can be made or written"),
+        ("/dev/null", "/dev/null: not a folder that can be created or written"),
         (b"caf\xe9".decode(errors="surrogateescape"), r"'caf\udce9': not a UTF-8 name"),
     ],
 )

@@ -159,7 +159,7 @@ def test_a_record_that_inflates_beyond_bounds_is_refused(hostile, command_line, 
         database.execute("UPDATE records SET result = ?", (bomb,))
     code, out, err = command_line("campaign", "export", hostile, "-")
     assert (code, out) == (1, "")
-    assert "has more than 1 MB" in err
+    assert "must have at most 1 MB" in err
 
 
 @pytest.mark.parametrize(

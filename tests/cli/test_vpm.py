@@ -111,7 +111,7 @@ def test_files_and_pictures(command_line, tmp_path):
     ("arguments", "said"),
     [
         (("--vehicle", "sparck"), "--vehicle: unknown vehicle 'sparck'; did you mean 'spark'?"),
-        (("--vehicle", "spark", "--vehicle", "spark"), "--vehicle: spark is named twice"),
+        (("--vehicle", "spark", "--vehicle", "spark"), "--vehicle: must not name spark twice"),
         (("--platform", "tx3"), "--platform: unknown platform 'tx3'; did you mean 'tx2'?"),
         (("--board", "xaviar"), "--board: unknown board 'xaviar'; did you mean 'xavier'?"),
         (("--overhead", "aead=1"), "unknown detector 'aead'; did you mean 'aad'?"),

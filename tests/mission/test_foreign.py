@@ -264,7 +264,7 @@ def test_a_stream_that_stops_in_flight_is_a_lost_link(autopilot_on_udp, fly_shor
     folder = fly_short(at_event("offboard", cut(link, *EVERYTHING)), link=url, loss_limit_s=0.3)
     result = load_run(folder.path).result
     assert result["outcome"] == "link_lost"
-    assert result["reason"] == f"{url}: no new state was heard for 0.3 s"
+    assert result["reason"] == f"{url}: no new state for 0.3 s"
 
 
 def test_states_that_stop_while_the_rest_goes_on_are_a_lost_link(
@@ -278,7 +278,7 @@ def test_states_that_stop_while_the_rest_goes_on_are_a_lost_link(
     )
     result = load_run(folder.path).result
     assert result["outcome"] == "link_lost"
-    assert "no new state was heard" in result["reason"]
+    assert "no new state" in result["reason"]
 
 
 def test_heartbeats_that_stop_are_no_lost_link(autopilot_on_udp, fly_short, at_event):

@@ -38,7 +38,7 @@ def test_a_file_of_one_s_own(platform_of):
     ("old", "new", "said"),
     [
         ("cores = 2", "cores = 0", r"mine\.toml.*cores must be at least 1"),
-        ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: expected a whole number"),
+        ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: must be a whole number"),
         ("cores = 2", "corse = 2", r"mine\.toml:2: corse: unknown key; did you mean 'cores'"),
         ("cores = 2", "cores = ", r"mine\.toml:2: Invalid value"),
         (

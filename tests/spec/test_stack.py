@@ -48,7 +48,7 @@ def test_a_variant_is_named_by_what_differs():
     [
         ("mavbenc", UnknownName, "did you mean 'mavbench'"),
         ("mavbench:guard=true", ConfigError, "did you mean 'guards_tracking'"),
-        ("mavbench:guards_tracking", ConfigError, "expected KEY=VALUE"),
+        ("mavbench:guards_tracking", ConfigError, "must have KEY=VALUE"),
         ("mavbench:guards_tracking=1", ConfigError, "guards_tracking"),
         ("mavbench:guards_tracking=true,tracking_guard_m=0.0", ConfigError, "tracking_guard_m"),
         ("mavbench:planner_radius_m=1.0", ConfigError, "check would reject"),

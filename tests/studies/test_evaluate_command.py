@@ -36,7 +36,7 @@ def test_bad_input_gets_one_line(mavfi, tmp_path, option, given, told):
 def test_seeds_of_the_training_are_refused_by_name(mavfi, tmp_path):
     flight = Model.read(shipped("gad")).provenance["split"]["train"][0]
     line = refused(mavfi, tmp_path, "--detector", "gad", "--first-seed", flight.split("/")[1])
-    assert "gad was made with the flight train-" in line
+    assert "gad was fitted to the flight train-" in line
 
 
 def test_usage_errors(mavfi, tmp_path):

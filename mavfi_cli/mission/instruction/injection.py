@@ -126,8 +126,8 @@ def _plan_fault(
     counts = entries.counts
     if not counts or not counts[-1]:
         raise FaultError(
-            f"the golden flight never enters {kernel}, so nothing in it can be hit: choose another "
-            "world, seed or node"
+            f"the golden flight never enters {kernel}, so nothing in it can be struck: choose "
+            "another world, seed or node"
         )
     rng = Stream.FAULT.generator(request.seed, "instruction")
     drawn = draw_invocation(node, counts, rng)

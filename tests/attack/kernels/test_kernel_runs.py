@@ -89,8 +89,8 @@ def test_another_campaign_is_not_mixed_in(attack, control_copy):
 @pytest.mark.parametrize(
     ("kernels", "runs", "problem"),
     [
-        (("control",), 29, "holds 30 runs already: .* at least 30, got 29"),
-        (("point_cloud",), 30, "holds runs of control as well"),
+        (("control",), 29, "already holds 30 runs.* at least 30, got 29"),
+        (("point_cloud",), 30, "also holds runs of control"),
     ],
 )
 def test_what_was_measured_is_never_left_out(attack, control_copy, kernels, runs, problem):

@@ -120,10 +120,10 @@ def test_unusable_places_say_why_in_one_line(arguments: dict[str, tuple[float]],
         ("goal_enu_m", "gaol_enu_m", 4, "did you mean 'goal_enu_m'"),
         ("max_enu_m", "maximum", 8, "maximum"),
         ("[8, 9, 10]", "[8, 4, 10]", 6, r"box\[0\]: max_enu_m must be above"),
-        ("[8, 9, 10]", "[8, 9]", 8, "expected 3 values, got 2"),
-        ("[20, 20, 5]", "[20, 20]", 4, "expected 3 values, got 2"),
+        ("[8, 9, 10]", "[8, 9]", 8, "must have 3 values, got 2"),
+        ("[20, 20, 5]", "[20, 20]", 4, "must have 3 values, got 2"),
         ("[20, 20, 5]", "[20, 20, nan]", 4, "finite"),
-        ("[5, 5, 0]", '["a", 5, 0]', None, "expected a number"),
+        ("[5, 5, 0]", '["a", 5, 0]', None, "must be a number"),
     ],
 )
 def test_a_malformed_file_says_where(
