@@ -436,14 +436,21 @@ def _kernel_figure(summary: KernelsSummary) -> Figure:
     axes = figure.add_subplot()
     for place, kernel in enumerate(kernels):
         _bar(axes, place, kernel.counts.outcomes)
-    axes.set_xticks(range(len(kernels)), [_tick(kernel) for kernel in kernels], fontsize=8)
+    ticks = [f"{k.kernel.title}\nn = {k.counts.outcomes['benign'].total}" for k in kernels]
+    axes.set_xticks(range(len(kernels)), ticks, fontsize=8)
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(-0.6, len(kernels) - 0.4)
     axes.set_ylabel("share of injected runs, %")
     open_frame(axes)
     handles = [axes.bar(0, 0, color=colour, label=_LABELS[n]) for n, colour in _COLOURS.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False)
-    figure.supxlabel(_caption(summary), fontsize=7, color=NOTE)
+    bits = summary.plan["model"]["bits"]
+    figure.supxlabel(
+        f"{'one bit' if bits == 1 else f'{bits} bits'} flipped a run; sampling: "
+        f"{summary.sampling}\nwhiskers: 95 % Wilson interval of a segment's share, at its upper "
+        "edge; benign is the rest",
+        fontsize=7, color=NOTE,
+    )  # fmt: skip
     return figure
 
 
@@ -461,9 +468,10 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
             )  # fmt: skip
         elif row.count:
             below = max(base + share / 2, below + _LINE)
+            text = f"{share:.1f}" if share >= 0.05 else "< 0.1"
             axes.text(
-                place + _WIDTH / 2 + 0.03, below, _small(share), color=_DARKER[name],
-                fontsize=7.5, ha="left", va="center",
+                place + _WIDTH / 2 + 0.03, below, text, color=_DARKER[name], fontsize=7.5,
+                ha="left", va="center",
             )  # fmt: skip
         low, high = 100.0 * row.low, 100.0 * row.high
         if row.count and name != "benign" and high - low >= _VISIBLE:
@@ -472,20 +480,3 @@ def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
                 color=INK, elinewidth=0.9, capsize=2.0,
             )  # fmt: skip
         base += share
-
-
-def _small(share: float) -> str:
-    return f"{share:.1f}" if share >= 0.05 else "< 0.1"
-
-
-def _tick(kernel: _KernelCounts) -> str:
-    return f"{kernel.kernel.title}\nn = {kernel.counts.outcomes['benign'].total}"
-
-
-def _caption(summary: KernelsSummary) -> str:
-    bits = summary.plan["model"]["bits"]
-    return (
-        f"{'one bit' if bits == 1 else f'{bits} bits'} flipped a run; sampling: "
-        f"{summary.sampling}\n"
-        "whiskers: 95 % Wilson interval of a segment's share, at its upper edge; benign is the rest"
-    )

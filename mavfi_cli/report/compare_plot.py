@@ -15,6 +15,7 @@ from mavfi_cli.analysis.platforms import (
 )
 from mavfi_cli.analysis.timeline import Span, Timeline
 from mavfi_cli.report.drawing import (
+    DASHED,
     GRID,
     INK,
     KERNELS,
@@ -65,18 +66,14 @@ def _draw_comparison(comparison: PlatformComparison) -> Figure:
         for row in comparison.plan.platforms
     ]  # fmt: skip
     legend_above(figure, handles=handles, ncols=min(3, len(handles)), fontsize=9.5)
-    figure.supxlabel(_caption(comparison), fontsize=8, color=NOTE)
-    return figure
-
-
-def _caption(comparison: PlatformComparison) -> str:
-    plan, share = comparison.plan, 100 * comparison.confidence
-    struck = plan.flip or "no faults"
-    return (
+    plan, struck = comparison.plan, comparison.plan.flip or "no faults"
+    figure.supxlabel(
         f"{plan.missions} {'mission' if plan.missions == 1 else 'missions'} in "
-        f"{plan.world} from seed {plan.first_seed} on, the "
-        f"same on each platform; {struck}; whiskers: {share:g} % intervals"
-    )
+        f"{plan.world} from seed {plan.first_seed} on, the same on each platform; {struck}; "
+        f"whiskers: {100 * comparison.confidence:g} % intervals",
+        fontsize=8, color=NOTE,
+    )  # fmt: skip
+    return figure
 
 
 def _frame(axes: Axes, title: str, grid: str) -> None:
@@ -228,7 +225,7 @@ def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, st
                 1.01, y, f"{ratio.value:.3f}", transform=axes.get_yaxis_transform(), fontsize=8,
                 va="center", color=colour,
             )  # fmt: skip
-    axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 3)))
+    axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=DASHED)
     axes.set_ylim(len(_RATIOS) - 0.45, -0.55)
     axes.set_yticks(range(len(_RATIOS)), [title for _, title in _RATIOS], fontsize=8.5)
     others = ", ".join(dict.fromkeys(titles[row.platform] for row in drawn)) or "one platform"
@@ -331,16 +328,13 @@ def _draw_timeline(comparison: PlatformComparison) -> Figure:
     for axes, row in zip(panels, rows, strict=True):
         _panel(axes, row, known[row.platform], window)
     panels[-1].set_xlabel("simulated time since the depth frame, s", fontsize=9)
-    figure.supxlabel(_timeline_caption(comparison), fontsize=7.5, color=NOTE)
-    return figure
-
-
-def _timeline_caption(comparison: PlatformComparison) -> str:
-    return (
+    figure.supxlabel(
         f"golden flights in {comparison.plan.world}, seed {comparison.timeline.seed}; "
         "full colour: what led from the frame to its setpoint, and to the new plan;\n"
-        "an output takes effect at the end of its bar; setpoints go out every control tick"
-    )
+        "an output takes effect at the end of its bar; setpoints go out every control tick",
+        fontsize=7.5, color=NOTE,
+    )  # fmt: skip
+    return figure
 
 
 def _panel(axes: Axes, row: Timeline, platform: PlatformSummary, window: Span) -> None:
@@ -350,7 +344,8 @@ def _panel(axes: Axes, row: Timeline, platform: PlatformSummary, window: Span) -
         axes.axhspan(lane - 0.5, lane + 0.5, color="#f7f8fa" if lane % 2 else "white", zorder=0)
         _others(axes, lane, row.lanes_s[kernel], pale, width_s)
         if kernel in row.chain_s:
-            _bar(axes, lane, row.chain_s[kernel], strong, width_s)
+            length, begin = _length(row.chain_s[kernel], width_s), row.chain_s[kernel][0]
+            axes.barh(lane, length, left=begin, height=_HEIGHT, color=strong, zorder=4)
             _duration(axes, lane, row.chain_s[kernel], strong, width_s)
     axes.vlines(row.setpoints_s, _SETPOINT - 0.16, _SETPOINT + 0.16, color="#b9c0ca", linewidth=0.7)
     _steps(axes, row)
@@ -379,10 +374,6 @@ def _others(axes: Axes, lane: int, spans: Sequence[Span], colour: str, width_s: 
     )  # fmt: skip
     long = [span[1] for span in spans if span[1] - span[0] > 2 * _THINNEST * width_s]
     axes.vlines(long, low, low + _HEIGHT, color="white", linewidth=0.8, zorder=3)
-
-
-def _bar(axes: Axes, lane: int, span: Span, colour: str, width_s: float) -> None:
-    axes.barh(lane, _length(span, width_s), left=span[0], height=_HEIGHT, color=colour, zorder=4)
 
 
 def _duration(axes: Axes, lane: int, span: Span, colour: str, width_s: float) -> None:

@@ -27,6 +27,7 @@ _DPI = 300
 _TURN = 0.6180339887498949  # golden ratio
 
 Look = Mapping[str, Any]  # keywords of matplotlib
+DASHED = (0, (5, 3))  # of lines of reference
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"

@@ -19,6 +19,7 @@ from mavfi_cli.analysis.beside_model import (
 from mavfi_cli.core.files import Json, plain
 from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.drawing import (
+    DASHED,
     INK,
     NOTE,
     SCHEMES,
@@ -37,7 +38,6 @@ from mavfi_cli.vpm.report import (
     Ratios,
     SchemeResult,
     Sensitivity,
-    SensitivityPoint,
     VehicleReport,
 )
 
@@ -86,20 +86,14 @@ def _with_rows(report: ModelReport | FlightsReport) -> Json:
 
 def _cells_of(row: SchemeResult | FlownScheme) -> Json:
     """The cells of a scheme by the names of their columns; lists are tuples."""
-    return _model_cells(row) if isinstance(row, SchemeResult) else _flown_cells(row)
-
-
-def _model_cells(row: SchemeResult) -> Json:
-    cells = asdict(row)
-    problem = cells.pop("problem")
-    for group, kind in (("performance", Performance), ("ratios", Ratios)):
-        cells |= cells.pop(group) or dict.fromkeys(part.name for part in fields(kind))
-    return {**cells, "problem": problem}
-
-
-def _flown_cells(row: FlownScheme) -> Json:
+    if isinstance(row, SchemeResult):
+        cells = asdict(row)
+        problem = cells.pop("problem")
+        for group, kind in (("performance", Performance), ("ratios", Ratios)):
+            cells |= cells.pop(group) or dict.fromkeys(part.name for part in fields(kind))
+        return {**cells, "problem": problem}
     common = ("scheme", "title", "boards", "overhead_percent", "mass_kg", "problem")
-    cells: Json = {name: getattr(row, name) for name in common}
+    cells = {name: getattr(row, name) for name in common}
     if (own := row.flown) is None:
         return {**cells, "errors": (), "cut": ()}
     planned = ("errors", "cut", "v_max_mps", "a_max_mps2", "braking_velocity_mps")
@@ -213,16 +207,12 @@ def _sensitivity_lines(rows: Sequence[Sensitivity]) -> Iterator[str]:
             f"  {row.parameter} {row.value:.4g} {row.unit}; 1 % more: velocity {velocity}, "
             f"TMR's time ratio {time}"
         )
-        yield from Table([_point_cells(point, row.unit) for point in row.points]).lines()
-
-
-def _point_cells(point: SensitivityPoint, unit: str) -> list[str]:
-    velocity, ratio = point.velocity_mps, point.tmr_flight_time_ratio
-    return [
-        f"    {point.value:.4g} {unit}",
-        "cannot lift it" if velocity is None else f"{velocity:.3f} m/s",
-        "TMR cannot be lifted" if ratio is None else f"x {ratio:.4f}",
-    ]
+        yield from Table([
+            [f"    {point.value:.4g} {row.unit}",
+             "cannot lift it" if point.velocity_mps is None else f"{point.velocity_mps:.3f} m/s",
+             "TMR cannot be lifted" if point.tmr_flight_time_ratio is None
+             else f"x {point.tmr_flight_time_ratio:.4f}"] for point in row.points
+        ]).lines()  # fmt: skip
 
 
 def _calibration_lines(rows: Sequence[CalibratedNumber]) -> Iterator[str]:
@@ -394,7 +384,6 @@ def _overhead_lines(rows: Sequence[MeasuredOverhead]) -> Iterator[str]:
 _OF_COPIES = {1: "none", 2: "dmr", 3: "tmr"}
 _MOST_HZ = 1000.0
 _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
-_DASHED: Look = {"linestyle": (0, (5, 3))}
 
 
 def _draw_roofline(model: ModelReport) -> Figure:
@@ -421,6 +410,8 @@ def _draw_roofline(model: ModelReport) -> Figure:
 
 
 def _roofline_panel(axes: Axes, vehicle: VehicleReport, share: float) -> None:
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
     flying = {row.boards: own for row, own, _ in reversed(_flying(vehicle))}
     point: Look = {"markeredgecolor": INK, "linestyle": "none"}
     for copies, own in sorted(flying.items()):
@@ -429,19 +420,15 @@ def _roofline_panel(axes: Axes, vehicle: VehicleReport, share: float) -> None:
             vehicle.curves.throughput_hz, vehicle.curves.velocity_mps[copies], color=colour,
             linewidth=1.8, label=_LABELS[copies],
         )  # fmt: skip
-        axes.axhline(own.roof_mps, color=colour, linewidth=0.8, **_DASHED)
+        axes.axhline(own.roof_mps, color=colour, linewidth=0.8, linestyle=DASHED)
         axes.plot(own.knee_hz, share * own.roof_mps, "D", markersize=5, color=colour,
                   markeredgewidth=0.6, **point)  # fmt: skip
         axes.plot(own.throughput_hz, own.velocity_mps, "o", markersize=7, color=colour, **point)
     axes.plot([], [], "D", color="white", markeredgecolor=INK, markersize=5, label="knee")
     axes.plot([], [], "o", color="white", markeredgecolor=INK, markersize=7, label="flies here")
-    axes.plot([], [], color=NOTE, linewidth=0.8, label="roof", **_DASHED)
+    axes.plot([], [], color=NOTE, linewidth=0.8, label="roof", linestyle=DASHED)
     axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="ceiling of one board")
-    _ceilings(axes, vehicle, flying[1])
-    _log_axes(axes, vehicle, flying[1])
-
-
-def _ceilings(axes: Axes, vehicle: VehicleReport, own: Performance) -> None:
+    own = flying[1]
     (sensor_hz,) = (row.value for row in vehicle.parameters if row.parameter == "sensor_hz")
     label = [f"one board\nroof {own.roof_mps:.2f} m/s, knee {own.knee_hz:.1f} Hz"]
     for name, at_hz, ceiling in (
@@ -455,11 +442,6 @@ def _ceilings(axes: Axes, vehicle: VehicleReport, own: Performance) -> None:
         0.98, 0.04, "\n".join(label), transform=axes.transAxes, ha="right", va="bottom",
         fontsize=8, color=NOTE,
     )  # fmt: skip
-
-
-def _log_axes(axes: Axes, vehicle: VehicleReport, own: Performance) -> None:
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(vehicle.curves.throughput_hz[0], _MOST_HZ)
@@ -484,12 +466,19 @@ def _draw_redundancy(model: ModelReport) -> Figure:
     vehicles = model.vehicles
     figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
     panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
+    captions = [f"{model.model}; flights of {model.distance_m:g} m at the safe velocity"]
     for axes, vehicle in zip(panels, vehicles, strict=True):
         _cost_panel(axes, vehicle)
+        if any(parameter.calibrated for parameter in vehicle.parameters):
+            own = vehicle.calibrations[0]
+            captions.append(
+                f"{vehicle.vehicle}: {own.parameter} = {own.value:.4g} {own.unit} is "
+                f"calibrated on the paper's TMR flight time x {own.published_tmr_ratio:g}"
+            )
     panels[0].set_ylabel("times that with detection (autoencoder)")
     handles, labels = panels[0].get_legend_handles_labels()
     legend_above(figure, handles, labels, ncols=len(labels))
-    figure.supxlabel(_cost_caption(model), fontsize=7.5, color=NOTE)
+    figure.supxlabel("\n".join(captions), fontsize=7.5, color=NOTE)
     return figure
 
 
@@ -507,7 +496,7 @@ def _cost_panel(axes: Axes, vehicle: VehicleReport) -> None:
             look = {"va": "bottom", "fontsize": 7.5, "rotation": 90.0 if height is None else 0.0}
             note_at(axes, text, (bar.get_x() + bar.get_width() / 2, height or 0.0), 2, **look)
             highest = max(highest, height or 0.0)
-    axes.axhline(1.0, color=INK, linewidth=0.7, **_DASHED)
+    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=DASHED)
     axes.set_xticks(range(len(_COSTS)), [title for _, title in _COSTS])
     axes.set_ylim(0.0, 1.12 * highest)
     open_frame(axes, f"{vehicle.vehicle}, board {vehicle.board}")
@@ -516,18 +505,6 @@ def _cost_panel(axes: Axes, vehicle: VehicleReport) -> None:
 def _beside(place: float, number: int, count: int, width: float) -> float:
     """Centre of one of several bars around a place."""
     return place + (number - (count - 1) / 2) * width
-
-
-def _cost_caption(model: ModelReport) -> str:
-    lines = [f"{model.model}; flights of {model.distance_m:g} m at the safe velocity"]
-    for vehicle in model.vehicles:
-        if any(parameter.calibrated for parameter in vehicle.parameters):
-            own = vehicle.calibrations[0]
-            lines.append(
-                f"{vehicle.vehicle}: {own.parameter} = {own.value:.4g} {own.unit} is "
-                f"calibrated on the paper's TMR flight time x {own.published_tmr_ratio:g}"
-            )
-    return "\n".join(lines)
 
 
 # Model against flight: velocity, flight time and energy of every scheme ---------------------------
@@ -592,7 +569,7 @@ def _ratio_panel(axes: Axes, vehicle: FlownVehicle, reference: str) -> None:
         for place, (_, field) in enumerate(_RATIOS):
             ratio = None if row.over_none is None else attrgetter(field)(row)
             _bar(axes, _beside(place, number, len(rows), _STEP), 0.9 * _STEP, row, ratio)
-    axes.axhline(1.0, color=INK, linewidth=0.7, **_DASHED)
+    axes.axhline(1.0, color=INK, linewidth=0.7, linestyle=DASHED)
     axes.set_xticks(range(len(_RATIOS)), [title for title, _ in _RATIOS])
     axes.set_ylabel(f"times that with {reference}", fontsize=8.5)
     axes.set_ylim(bottom=0.0)

@@ -46,20 +46,20 @@ def platform_lines(comparison: PlatformComparison) -> list[str]:
     plan, settings = comparison.plan, comparison.settings
     lines = _head(plan)
     lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
-    lines += _side_by_side(plan, settings, _FLIGHTS, _flight_cells, by_setting=True)
-    lines += ["", *_side_by_side(plan, settings, _WORK, _work_cells, by_setting=True)]
+    lines += _side_by_side(plan, settings, _FLIGHTS, by_setting=True)
+    lines += ["", *_side_by_side(plan, settings, _WORK, by_setting=True)]
     for platform in plan.platforms[1:]:
-        lines += _against(plan, platform, comparison.ratios, _RATIOS, _ratio_cells)
+        lines += _against(plan, platform, comparison.ratios, _RATIO_TITLE, _RATIOS)
     if comparison.costs:
         lines += [
             "",
             "What faults cost (Fig. 16), over the mission's golden flight; both successful",
-            *_side_by_side(plan, comparison.costs, _COSTS, _cost_cells),
+            *_side_by_side(plan, comparison.costs, _COSTS),
         ]
         for platform in plan.platforms[1:]:
-            lines += _against(plan, platform, comparison.cost_differences, _EXTRA, _extra_cells)
+            lines += _against(plan, platform, comparison.cost_differences, _EXTRA_TITLE, _EXTRA)
     lines += ["", "The longest successful flights"]
-    lines += _side_by_side(plan, comparison.worst, _WORST, _worst_cells)
+    lines += _side_by_side(plan, comparison.worst, _WORST)
     lines += [*_again(comparison), ""]
     if comparison.errors:
         lines.append(f"{len(comparison.errors)} missions could not be flown.")
@@ -100,13 +100,14 @@ def _head(plan: ComparedPlan) -> list[str]:
 
 OwnRow = TypeVar("OwnRow", bound=SettingFlights | CostRow | LongestFlight)
 PairedRow = TypeVar("PairedRow", bound=RatioRow | CostDifference)
+Row = TypeVar("Row")
+Columns = Mapping[str, Callable[[Row], str]]  # of a table: heading, and what a row has below it
 
 
 def _side_by_side(
     plan: ComparedPlan,
     rows: Iterable[OwnRow],
-    head: Sequence[str],
-    cells: Callable[[OwnRow], list[str]],
+    columns: Columns[OwnRow],
     *,
     by_setting: bool = False,
 ) -> list[str]:
@@ -117,92 +118,75 @@ def _side_by_side(
         group, other = titles[row.platform], _setting_title(row.setting)
         if by_setting:
             group, other = other, group
-        lines.append([group if group != last else "", other, *cells(row)])
+        lines.append([group if group != last else "", other, *(c(row) for c in columns.values())])
         last = group
-    return Table([["", "", *head], *lines], labels=2).lines()
+    return Table([["", "", *columns], *lines], labels=2).lines()
 
 
 def _against(
     plan: ComparedPlan,
     platform: PlatformSummary,
     rows: Iterable[PairedRow],
-    head: Sequence[str],
-    cells: Callable[[PairedRow], list[str]],
+    title: str,
+    columns: Columns[PairedRow],
 ) -> list[str]:
     """One line per setting of a platform, compared with the reference."""
-    title, *names = head
     lines = [
-        [_setting_title(row.setting), *cells(row)]
+        [_setting_title(row.setting), *(cell(row) for cell in columns.values())]
         for row in rows
         if row.platform == platform.platform
     ]
     return [
         "",
         title.format(platform.title, plan.platforms[0].title),
-        *Table([["", *names], *lines], labels=1).lines(),
+        *Table([["", *columns], *lines], labels=1).lines(),
     ]
 
 
-_FLIGHTS = ("flights", "success", "flight time, s", "distance, m")
-_WORK = ("energy, kJ", "replans (mean)", "response, ms", "95th perc., ms")
-_RATIOS = (
-    "{} over {}, mission by mission (flights that both succeed in; response: all)",
-    "pairs", "flight time, x", "energy, x", "response, x", "success, pts",
-)  # fmt: skip
-_COSTS = ("flights", "lost", "mean, s", "95th perc., x", "worst, x", "recovered")
-_EXTRA = (
-    "{} against {}, fault by fault (faults that both survive; worst, longest: of all)",
-    "pairs", "differ", "mean, s", "95th perc., x", "worst, x", "longest, x",
-)  # fmt: skip
-_WORST = ("longest, s", "over mean golden, x", "recovered")
-
-
-def _flight_cells(row: SettingFlights) -> list[str]:
-    medians = (row.quantities[name].median for name in ("flight_time_s", "distance_m"))
-    counts = f"{row.counted} of {row.flown}"
-    return [counts, rate(row.success), *(spread(value, 1) for value in medians)]
-
-
-def _work_cells(row: SettingFlights) -> list[str]:
-    own = row.quantities
-    return [
-        spread(own["energy_regression_j"].median, 1, 1e-3),
-        spread(own["replans"].mean, 1),
-        spread(own["response_median_s"].median, 0, 1e3),
-        spread(own["response_p95_s"].median, 0, 1e3),
-    ]
-
-
-def _ratio_cells(row: RatioRow) -> list[str]:
-    own, chance = row.quantities, p_value(row.success.p_value)
-    return [
-        f"{row.both_succeed}",
-        spread(own["flight_time_s"], 3),
-        spread(own["energy_regression_j"], 2),
-        spread(own["response_median_s"], 2),
-        number(row.success.difference, "+.1f", 100.0, f" ({chance})"),
-    ]
-
-
-def _cost_cells(row: CostRow) -> list[str]:
-    over = row.over_own
-    return [
-        f"{row.pairs}", f"{row.lost}", spread(row.cost_s.mean, 2),
-        spread(over.p95, 3), number(over.largest, ".3f"), percent(over.recovered_share),
-    ]  # fmt: skip
-
-
-def _extra_cells(row: CostDifference) -> list[str]:
-    return [
-        f"{row.pairs}", f"{row.differ}", spread(row.extra_s, 2, chance=row.p_value),
-        spread(row.p95_ratio, 3), number(row.largest_ratio, ".3f"),
-        number(row.longest_ratio, ".3f"),
-    ]  # fmt: skip
-
-
-def _worst_cells(row: LongestFlight) -> list[str]:
-    over = number(row.over_mean_ratio, ".3f")
-    return [number(row.worst_s, ".1f"), over, percent(row.over_mean_recovered_share)]
+_FLIGHTS: Columns[SettingFlights] = {
+    "flights": lambda row: f"{row.counted} of {row.flown}",
+    "success": lambda row: rate(row.success),
+    "flight time, s": lambda row: spread(row.quantities["flight_time_s"].median, 1),
+    "distance, m": lambda row: spread(row.quantities["distance_m"].median, 1),
+}
+_WORK: Columns[SettingFlights] = {
+    "energy, kJ": lambda row: spread(row.quantities["energy_regression_j"].median, 1, 1e-3),
+    "replans (mean)": lambda row: spread(row.quantities["replans"].mean, 1),
+    "response, ms": lambda row: spread(row.quantities["response_median_s"].median, 0, 1e3),
+    "95th perc., ms": lambda row: spread(row.quantities["response_p95_s"].median, 0, 1e3),
+}
+_RATIO_TITLE = "{} over {}, mission by mission (flights that both succeed in; response: all)"
+_RATIOS: Columns[RatioRow] = {
+    "pairs": lambda row: f"{row.both_succeed}",
+    "flight time, x": lambda row: spread(row.quantities["flight_time_s"], 3),
+    "energy, x": lambda row: spread(row.quantities["energy_regression_j"], 2),
+    "response, x": lambda row: spread(row.quantities["response_median_s"], 2),
+    "success, pts": lambda row: number(
+        row.success.difference, "+.1f", 100.0, f" ({p_value(row.success.p_value)})"
+    ),
+}
+_COSTS: Columns[CostRow] = {
+    "flights": lambda row: f"{row.pairs}",
+    "lost": lambda row: f"{row.lost}",
+    "mean, s": lambda row: spread(row.cost_s.mean, 2),
+    "95th perc., x": lambda row: spread(row.over_own.p95, 3),
+    "worst, x": lambda row: number(row.over_own.largest, ".3f"),
+    "recovered": lambda row: percent(row.over_own.recovered_share),
+}
+_EXTRA_TITLE = "{} against {}, fault by fault (faults that both survive; worst, longest: of all)"
+_EXTRA: Columns[CostDifference] = {
+    "pairs": lambda row: f"{row.pairs}",
+    "differ": lambda row: f"{row.differ}",
+    "mean, s": lambda row: spread(row.extra_s, 2, chance=row.p_value),
+    "95th perc., x": lambda row: spread(row.p95_ratio, 3),
+    "worst, x": lambda row: number(row.largest_ratio, ".3f"),
+    "longest, x": lambda row: number(row.longest_ratio, ".3f"),
+}
+_WORST: Columns[LongestFlight] = {
+    "longest, s": lambda row: number(row.worst_s, ".1f"),
+    "over mean golden, x": lambda row: number(row.over_mean_ratio, ".3f"),
+    "recovered": lambda row: percent(row.over_mean_recovered_share),
+}
 
 
 def _again(comparison: PlatformComparison) -> list[str]:

@@ -68,7 +68,10 @@ def draw_top_view(run: Run) -> Figure:
     for view, columns in ((axes, _FROM_ABOVE), (beside, _OVER_TIME)):
         lines = _draw_path(view, path, speeds_mps, columns, flight.config["v_max_mps"])
         if lines is not None and view is axes:
-            _explain_speed(figure, axes, lines)
+            bar = figure.colorbar(lines, ax=axes, shrink=0.6, pad=0.02, aspect=28)
+            bar.set_label("speed, m/s", fontsize=9)
+            bar.ax.tick_params(labelsize=8)
+            bar.outline.set_linewidth(0.4)
         _draw_start(view, path, columns)
         _draw_end(view, flight, path, columns)
         for kind in _MARKS:
@@ -148,13 +151,6 @@ def _draw_path(
     lines.set_clim(0.0, v_max_mps)
     axes.add_collection(lines)
     return lines
-
-
-def _explain_speed(figure: Figure, axes: Axes, lines: Any) -> None:
-    bar = figure.colorbar(lines, ax=axes, shrink=0.6, pad=0.02, aspect=28)
-    bar.set_label("speed, m/s", fontsize=9)
-    bar.ax.tick_params(labelsize=8)
-    bar.outline.set_linewidth(0.4)
 
 
 def _draw_goal(axes: Axes, flight: FlightRecord) -> None:
