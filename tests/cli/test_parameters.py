@@ -1,5 +1,7 @@
 """Every option of every command: wrong values are usage errors, and the shell completes names."""
 
+from dataclasses import fields
+
 import click
 import pytest
 from click.shell_completion import ShellComplete
@@ -12,6 +14,11 @@ from mavfi_cli.core.option_types import OutFile, OutFolder
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.paper import flying
 from mavfi_cli.studies import compare
+from mavfi_cli.studies.compare import ComparePlan
+from mavfi_cli.studies.evaluate import EvaluationPlan
+from mavfi_cli.studies.redundancy import RedundancyPlan
+from mavfi_cli.studies.train import TrainingPlan
+from mavfi_cli.vpm.report import Choices
 
 NUMBERS = (click.types.IntParamType, click.types.FloatParamType)
 ABSURD = {"nan": "nan", "inf": "inf", "least": f"-{10**30}", "most": f"{10**30}"}
@@ -165,3 +172,24 @@ def test_the_shell_completes_run_folders_and_campaigns(completed, tmp_path):
     assert completed("show ") == completed("replay run") == ["runs/farm-3-001", "runs/farm-3-002"]
     assert completed("view runs/farm-3-001") == ["runs/farm-3-001"]
     assert completed("campaign status camp") == ["campaigns/mine"]
+
+
+PLANS = [
+    (("compare",), ComparePlan),
+    (("detect", "evaluate"), EvaluationPlan),
+    (("train",), TrainingPlan),
+    (("vpm",), Choices),
+    (("vpm",), RedundancyPlan),
+    (("campaign", "run"), run.Options),
+]
+
+
+@pytest.mark.parametrize(("words", "kind"), PLANS)
+def test_a_plan_has_the_defaults_that_the_help_of_its_command_shows(words, kind):
+    """A command passes only the options that the user gave."""
+    (command,) = [command for known, command in _leaves(cli.cli) if known == words]
+    shown = command.make_context("mavfi", [], resilient_parsing=True).params
+    own = {field.name: field.default for field in fields(kind)}
+    told = {name: shown[name] for name in own.keys() & shown.keys() if shown[name]}
+    assert told
+    assert {name: own[name] for name in told} == told
