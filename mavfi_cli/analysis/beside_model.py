@@ -204,7 +204,7 @@ def side_by_side(
 
     Args:
         model: the model's report, with the overheads with which the schemes were flown.
-        setups: of each vehicle and scheme, or the reason why they cannot be flown.
+        setups: setup of each vehicle and scheme, or the reason why it cannot be flown.
         flights: as in `analysis.flights`, with the labels `group` for the vehicle and `arm` for the
             scheme.
     """

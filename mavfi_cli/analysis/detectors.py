@@ -118,7 +118,8 @@ class _WorstFlight:
         recovered: how much lower the second is, in parts of the golden flight time. Resampled
             missions never hold a worse case than the worst that was seen, so the interval says how
             much it hangs on single flights, not how bad it can become.
-        recovered_share: of the increase; NaN if no flight took more than LONGER times as long.
+        recovered_share: recovered share of the increase; NaN if no flight took more than LONGER
+            times as long.
     """
 
     faulty: float
@@ -142,7 +143,7 @@ class FaultRow:
         not_struck: those that never struck because the protected flight had diverged; they enter
             no rate of detection.
         latency_s, latency_s_p95: median and 95th percentile from strike to alarm, harmful faults.
-        detected_harmful: with an alarm at or after the strike.
+        detected_harmful: harmful faults with an alarm at or after the strike.
         detected_active: the same for all faults of complete missions.
         detected_inactive: the same for faults that struck but were not activated.
         by_chance: flights of complete missions that have an alarm in that time without their fault
@@ -154,7 +155,7 @@ class FaultRow:
         protected: the same with the detector: `share`, `low` and `high` of harmful and harmless
             faults, each with its own rate, weighted by how many there are.
         success: on complete missions, unprotected first.
-        worst: of the flown faults.
+        worst: worst case over the flown faults.
     """
 
     by: str
@@ -246,8 +247,8 @@ class Evaluation:
     """The contents of `evaluation.json`.
 
     Attributes:
-        error_free, faults: a row per group and detector.
-        curves: by detector.
+        error_free, faults: one row per group and detector.
+        curves: curves by detector.
         errors: labels and reason of each mission that could not begin.
     """
 

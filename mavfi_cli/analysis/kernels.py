@@ -38,7 +38,7 @@ class KernelSummary:
 
     Attributes:
         faults: how they were drawn: `rule`, `compat` and `model`.
-        seed: of the faults.
+        seed: seed of the faults.
         flight: the flight whose inputs the kernels had.
     """
 

@@ -42,7 +42,7 @@ class FlightOverhead:
     """The overhead of a detector in a setting. Shares are relative to flight time: 0.01 is 1 %.
 
     Attributes:
-        labels: of the setting, with the detector.
+        labels: labels of the setting, including the detector.
         flights: number of flights with checks.
         checks_per_s: checks per second of flight.
         check_host_s: mean time of a check on the host that flew.
@@ -147,7 +147,7 @@ class ComputeOverhead:
 
     @property
     def checks_host_share(self) -> float:
-        """Time of checks over time of kernels on the host; the kernels do less than the paper's."""
+        """Time of checks over time of kernels, both measured on the host."""
         return self.detection_s / self.host_compute_s
 
     @classmethod

@@ -74,7 +74,7 @@ class Balance:
         before: harmed missions without the detector.
         undone: missions that are harmed only without it.
         caused: missions that are harmed only with it.
-        p_value: of McNemar's exact test.
+        p_value: p-value of McNemar's exact test.
     """
 
     pairs: int
@@ -169,7 +169,7 @@ class Flights:
         return struck.chosen(detector=detector, **values)
 
     def struck(self, **values: object) -> Flights:
-        """The flights with a flipped bit, and no detector unless one is named."""
+        """The flights in which a bit was flipped, without a detector or with the named one."""
         return self.chosen(**{"struck": True, "detector": None, **values})
 
     def protected(self, detector: str, protect: str = EVERY_STAGE, **values: object) -> Flights:
@@ -221,7 +221,7 @@ class Flights:
 
     @property
     def timed(self) -> Flights:
-        """The flights with a fault that succeed as their golden flights do."""
+        """The flights with a fault that succeed and whose golden flights succeed too."""
         faulty, known = (pc.is_valid(self.table[name]) for name in ("level", "over_own"))
         return Flights(self.table.filter(pc.and_(faulty, known)))
 

@@ -305,7 +305,7 @@ def figures(plan: ComparedPlan, flights: pa.Table, **about: Any) -> PlatformComp
     """Compute all numbers of the flights.
 
     Args:
-        flights: with the columns of SCHEMA.
+        flights: table with the columns of SCHEMA.
         about: what the comparison contains besides.
     """
     platforms, settings = [row.platform for row in plan.platforms], plan.settings

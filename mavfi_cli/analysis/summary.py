@@ -93,8 +93,9 @@ class Quality:
     """A metric of a setting over its successful missions.
 
     Attributes:
-        least, median, most: of the flights; NaN where there are none.
-        difference: from the golden flights of the same missions; None for golden settings.
+        least, median, most: values over the flights; NaN without flights.
+        difference: difference from the golden flights of the same missions; None for golden
+            settings.
     """
 
     labels: Labels
@@ -114,7 +115,7 @@ class CampaignSummary:
     Attributes:
         missions: number on the list.
         over, missing: number with a result, and without one.
-        confidence: of all intervals.
+        confidence: confidence level of all intervals.
         faults: comparisons of settings with faults with the golden one.
         protection: comparisons of protected settings with the unprotected one with the same faults.
     """

@@ -22,8 +22,8 @@ class _DrawnFlight:
     """One flight of a picture.
 
     Attributes:
-        number: of its mission.
-        name: of its setting, as short as the other flights of the panel allow.
+        number: number of its mission.
+        name: name of its setting, as short as the other flights of the panel allow.
         flight_time_s: None if the flight has none.
         path: its run folder.
     """

@@ -258,7 +258,7 @@ def profile_run(
 
 
 def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
-    """Step one call of the function at whose entry the place's runs start.
+    """Step one call of the function at which the runs of the place start.
 
     Raises:
         WindowTooLong: too many instructions.

@@ -289,8 +289,8 @@ class Pilot:
         """Handle a plan or a failure to plan.
 
         A trajectory is ignored if it is out of order, was planned before the newest predicted
-        collision, begins at another time than requested, or arrives too late for its own start.
-        The result of an abandoned request is ignored, too.
+        collision, does not begin at the requested time, or arrives too late for its own start. The
+        result of an abandoned request is also ignored.
         """
         if not self.expects(result):
             self._abandoned.discard(result.stamp_s)

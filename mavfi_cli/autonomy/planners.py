@@ -6,7 +6,7 @@ and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
 search resets that sequence first and creates its generators afterwards, so its result depends only
 on problem and seed. OMPL warns that earlier generators keep their seeds; none of them is used. The
-search stops after a number of iterations, never after a time.
+search stops after a number of iterations; it has no time limit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Output of commands, and how they end. No text in it is a command to the terminal."""
+"""Prints the output of commands and returns their exit codes. No text can control the terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The detector interface, the registry of detectors, and the base class and model files of ours.
+"""The detector interface, the registry, and the base class and model files of our detectors.
 
 A model file is a fitted detector with its provenance in JSON. Reading is strict.
 

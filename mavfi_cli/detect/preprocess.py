@@ -71,7 +71,7 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING][0], SPANS[Stage.CONTROL][0]
 
 
 def span(stage: Stage) -> tuple[int, int]:
-    """Return the first index of a stage and the index after its last; faster than the table."""
+    """Return the first index of a stage and the index after its last, without the state table."""
     if stage is _PLANNING_STAGE:
         return _PLANNING, _CONTROL
     return (0, _PLANNING) if stage is _PERCEPTION_STAGE else (_CONTROL, COUNT)

@@ -1,4 +1,4 @@
-"""One flight of a user's own companion: mavfi is its router, its starter and its judge.
+"""One flight of a user's own companion, which mavfi starts, connects and judges.
 
 The vehicle's clock is simulated time. Programs run by the wall clock, so a flight does not repeat.
 """

@@ -1,8 +1,9 @@
-"""Starts the programs of a user's companion, and ends them whatever happens.
+"""Starts the programs of a user's companion, and ends them in every case.
 
-A worker of the fork server runs one program: it starts it, keeps its output, restarts it by its
-rule, and then stays, because a program's own children may live on. Its guard kills the worker and
-all descendants of the program when the mission ends, is killed, or closes the program.
+A worker of the fork server runs one program: it starts the program, stores its output, restarts it
+    by its
+rule, and then keeps running, because the program's children may outlive it. Its guard kills the
+worker and all descendants of the program when the mission ends, is killed, or closes the program.
 
 The worker reports by appending lines of JSON to a file: {"started": PID}, {"ended": CODE}, where a
 negative code is a signal, and {"ready": true}. The mission reads them.
@@ -135,7 +136,7 @@ class RunningProgram:
             self.signal(number, group=True)
 
     def close(self) -> None:
-        """Kill it and all of its descendants."""
+        """Kill the program and all of its descendants."""
         self._channel.close()
         self._events.close()
 
@@ -144,7 +145,7 @@ class RunningProgram:
 
 
 def prepare() -> None:
-    """Load nothing further."""
+    """Do nothing, because a worker needs no further modules."""
 
 
 def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:

@@ -30,7 +30,7 @@ _KINDS = {  # of faults: level, and what they do to their nodes
 
 
 def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """The judgement of a claim on a stack or in isolated kernels; None if this fate has none."""
+    """The judgement of a claim on a stack or in isolated kernels; None if there is none."""
     place = ISOLATED if judged.claim.isolated else stack
     return judged.judgements.get(place, {}).get(fate)
 

@@ -34,7 +34,7 @@ _MEASURES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelFlow:
-    """From a struck kernel to the mission.
+    """The missions with a fault in one kernel, by what the fault did to the kernel.
 
     Attributes:
         fates: share of lost missions for each of FATES.

@@ -463,7 +463,7 @@ def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_Show
     """Every item of the paper in its order.
 
     Args:
-        flights: of each stack, as `Evidence.flights`.
+        flights: flights by stack, from `Evidence.flights`.
     """
     for item in ITEMS:
         if item.source is Source.FLIGHTS:

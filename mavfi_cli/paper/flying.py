@@ -288,7 +288,7 @@ class _KernelRuns:
 
     Attributes:
         out: folder of all stacks; the runs are in KERNELS_FOLDER beside those.
-        runs: of each kernel.
+        runs: number of runs of each kernel.
         jobs: runs at the same time.
     """
 

@@ -81,7 +81,7 @@ class CampaignReport:
 
         Args:
             by: labels by which settings are grouped; empty means all.
-            confidence: of all intervals.
+            confidence: confidence level of all intervals.
             quality, overhead, failures: parts to add.
             kernels, upsets: arguments of `analysis.failures.setting_failures`.
 

@@ -36,7 +36,7 @@ class Picture:
     """A chart of the page.
 
     Attributes:
-        name: of its CSV file, without suffix.
+        name: name of its CSV file, without suffix.
         title: its caption and alt text.
         markup: an SVG element.
         csv: its numbers.
@@ -78,8 +78,8 @@ class ForestRow:
     Attributes:
         low, high: ends of the claimed range; infinite where it has no end.
         number: whether the effect is a plain number; otherwise it is a share.
-        effects: by stack; None if it was not flown or has no number.
-        verdict: of the first stack.
+        effects: effect by stack; None if the stack was not flown or has no number.
+        verdict: verdict on the first stack.
     """
 
     label: str

@@ -68,7 +68,7 @@ class PaperColumn:
     """A column of numbers.
 
     Attributes:
-        title: with the unit.
+        title: heading with the unit.
         digits: number of digits after the decimal point.
         ends: digits of the interval's ends; None means as many.
         sign: whether positive numbers have a plus.
@@ -119,7 +119,7 @@ class PaperTable:
     """A table of the paper, or the numbers of one of its figures.
 
     Attributes:
-        name: of the item, such as `table4`.
+        name: name of the item, such as `table4`.
         title: the paper's name of it, and what it shows.
         labels: headings of the rows' labels.
         notes: a line each.
@@ -256,7 +256,7 @@ def _panels(
     """A figure with panels of equal rows.
 
     Args:
-        names: of the rows.
+        names: names of the rows.
         panel_in, more_in: height of a panel, and of what the figure has beside panels.
     """
     panels = list(titles)
@@ -315,7 +315,7 @@ def draw_strips(
 
     Args:
         panels: the rows of each panel from top to bottom, by its title; all have the same labels.
-        quantity: of the horizontal axis, with its unit.
+        quantity: quantity on the horizontal axis, with its unit.
     """
     names = [strip.label for strip in next(iter(panels.values()))]
     height_in = 0.45 + _LINE_IN * len(names)

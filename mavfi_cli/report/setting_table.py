@@ -32,7 +32,7 @@ class SettingColumns:
 
     @classmethod
     def of(cls, settings: Sequence[Labels]) -> SettingColumns:
-        """Choose the columns that distinguish settings without their common labels.
+        """Choose the columns that distinguish settings, and leave out their common labels.
 
         A single setting has no columns, because its name is enough.
         """

@@ -260,7 +260,7 @@ def with_ends(
 
     Args:
         estimate: value, low, high.
-        shape: of the value.
+        shape: format of the value.
         ends: shape of the ends; empty means that of the value.
     """
     value, low, high = (scale * part for part in estimate)

@@ -206,7 +206,7 @@ class CrossLayer:
     """Failures of a kernel and of the missions that fly with it.
 
     Attributes:
-        corruption: share of faults in the isolated kernel that corrupt its output in silence.
+        corruption: share of faults in the isolated kernel that silently corrupt its output.
         failure: share of faults that fail the mission.
         failure_given_corruption: the second over the first, with the ends of the failure's interval
             over the corruption's point estimate. None if the estimate would be above 1 (crashes and

@@ -60,7 +60,7 @@ class FlightPlan:
 
     Attributes:
         mission: without world and seed.
-        files: of vehicle and platform, and their contents.
+        files: files of vehicle and platform, with their contents.
     """
 
     mission: MissionConfig

@@ -62,7 +62,7 @@ mavlink start -x -u {local} -r 4000000 -f -m onboard -o {remote}
 
 
 class Px4Link:
-    """One PX4 on the simulator link. The port of its connection numbers the instances of PX4."""
+    """One PX4 on the simulator link. The TCP port determines the number of the PX4 instance."""
 
     step_s = 0.004  # PX4's SITL takes inertial samples at 250 Hz
     settle_s = 12.0  # its boot ends at another time in every flight, its estimator settles by then

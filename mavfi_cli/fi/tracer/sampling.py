@@ -54,7 +54,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stratum:
-    """The windows that begin at one instruction, and those of them that were stepped."""
+    """The windows that begin at one instruction, of which some were stepped."""
 
     segments: tuple[Segment, ...]
     windows_in_run: int  # windows of the run; the stepped ones are a sample of them

@@ -59,8 +59,8 @@ _AXES = [
 def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     """Write flights as an MCAP file, atomically. Equal flights give equal bytes.
 
-    The time of a message is that of the first flight's tlog: stamp 0 is EPOCH_UNIX_S, and for a
-    foreign autopilot the date of the flight counts.
+    The time of a message is that of the first flight's tlog: stamp 0 is EPOCH_UNIX_S, or for a
+    foreign autopilot the date of the flight.
 
     Raises:
         RecordError: The file could not be written, or the tlog of a foreign flight could not be
