@@ -1,9 +1,9 @@
 """Starts the programs of a user's companion, and ends them in every case.
 
 A worker of the fork server runs one program: it starts the program, stores its output, restarts it
-    by its
-rule, and then keeps running, because the program's children may outlive it. Its guard kills the
-worker and all descendants of the program when the mission ends, is killed, or closes the program.
+by its rule, and then keeps running, because the program's children may outlive it. Its guard kills
+the worker and all descendants of the program when the mission ends, is killed, or closes the
+program.
 
 The worker reports by appending lines of JSON to a file: {"started": PID}, {"ended": CODE}, where a
 negative code is a signal, and {"ready": true}. The mission reads them.
