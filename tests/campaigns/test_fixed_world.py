@@ -130,7 +130,7 @@ def test_other_values_of_factors_keep_the_rule(begun):
     ("old", "new", "error", "told"),
     [
         ("replans = [5, 6]", "", ConfigError, "fixed_world.replans: is missing"),
-        ("replans = [5, 6]", "replans = [6, 5]", ConfigError, r"replans: expected \[LEAST, MOST\]"),
+        ("replans = [5, 6]", "replans = [6, 5]", ConfigError, r"replans: .* got \[6, 5\]"),
         ("replans = [5, 6]", "replans = 5", ConfigError, "fixed_world.replans: "),
         ("flights = 3", "flights = 0", ConfigError, "must be at least 1"),
         (
