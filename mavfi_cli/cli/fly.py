@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
     from mavfi_cli.spec.mission import MissionConfig
 
-_SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together"}
+_SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together", "direction"}
 _DYING = "needs nodes that can die: --inject process.NODE, or --level instruction"
 _EITHER = {"bits", "field", "fault_seed"}
 _INSTRUCTION = {"sites", "roles"}
@@ -114,7 +114,11 @@ _detector, _output = section("Detector"), section("Output")
 @_fault("--inject", type=types.TARGET, metavar="STAGE|STATE|GROUP",
         help="Corrupt a state: `mavfi states` lists stages, states and groups. Also detector or "
              "detector.PART (the detector's memory), queue.STATE (control's copy of the plan) and "
-             "process.NODE (kills the node's process).")  # fmt: skip
+             "process.NODE (kills the node's process). With --companion: MESSAGE.FIELD, MESSAGE or "
+             "process.PROGRAM.")  # fmt: skip
+@_fault("--stage", "direction", type=click.Choice(["output", "input"]),
+        help="Direction of a MAVLink message with --companion: from the companion, or to it  "
+             "[both].")  # fmt: skip
 @_fault("--at", default="random", metavar="random|time=S|tick=N|phase=NAME|foreseen|invocation=N",
         help="Trigger. Time and ticks count from when the companion takes control.")  # fmt: skip
 @_fault("--fault-seed", default=1, type=types.SEED, help="Seed of all random draws of the fault.")
@@ -127,7 +131,9 @@ _detector, _output = section("Detector"), section("Output")
 @_fault("--all-components", "together", is_flag=True,
         help="Corrupt all states of the group, each with its own bits.")  # fmt: skip
 @_fault("--effect", default="flip", type=types.EFFECT,
-        help="Effect: flip the bits, set the value to zero, or draw it at random.")  # fmt: skip
+        help="Effect on a value: flip the bits, zero, random or freeze. On a MAVLink message: "
+             "drop, late=S, twice or swap (with the next). On process.PROGRAM: stop or "
+             "slow=SHARE  [flip; it kills a process].")  # fmt: skip
 @_fault("--persistence", default="transient", type=types.PERSISTENCE,
         help="Persistence: transient (once), stuck-at (held) or intermittent "
              "(repeated).")  # fmt: skip
@@ -282,7 +288,7 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
         land=land,
         **{name: value for name, value in given.items() if name in own},
     )
-    if fault is not None and fault.persistence == "transient":
+    if fault is not None and fault.persistence == "transient" and not fault.killed_node:
         refuse_given({"duration_s"}, "needs --persistence stuck-at or intermittent")
     if not (instruction or mission.isolate or (fault is not None and fault.killed_node)):
         refuse_given({"node_restart_s"}, _DYING)
@@ -299,6 +305,8 @@ def _faults(
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
     from mavfi_cli.attack.strategy import mission_strategy
+    from mavfi_cli.mission.companion_faults import check_companion_fault
+    from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
     source = given.get("level", "source" if base.instruction is None else "instruction") == "source"
@@ -312,12 +320,21 @@ def _faults(
     own, other = (_SOURCE, _INSTRUCTION) if source else (_INSTRUCTION, _SOURCE)
     refuse_given(other, f"needs --level {'instruction' if source else 'source'}")
     values = {name: given[name] for name in (_EITHER | own) & set(given)}
+    direction = values.pop("direction", None)
     if "fault_seed" in values:
         values["seed"] = values.pop("fault_seed")
     kind: Any = FaultConfig if source else InstructionConfig
     fault: Any = replace(prior or kind(target=target), target=target, **values)
     if source:
-        fault.check()
+        if direction is not None:
+            if fault.wire_target is None:
+                raise click.UsageError("--stage needs a MAVLink message as --inject")
+            fault = replace(fault, target=f"{direction}.{fault.wire_target[1]}")
+        companion = given.get("companion", base.companion)
+        if companion is None:
+            fault.check()
+        else:
+            check_companion_fault(fault, CompanionConfig.load(companion).program)
         return fault, None
     mission_strategy(fault)  # reports wrong names now
     fault.node()

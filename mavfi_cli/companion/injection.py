@@ -64,7 +64,7 @@ class NoInjection:
         """End the processes of the injection."""
 
 
-class _Killer(Injector):
+class Killer(Injector):
     """Decides when the process of a node is killed. It is killed once."""
 
     _awaits = "control tick"
@@ -74,6 +74,7 @@ class _Killer(Injector):
         super().__init__(rng, config.trigger(), config.corruption(), shortest_flight_s, listener)
 
     def strike(self, moment: Moment) -> None:
+        """See `NoInjector`."""
         if self._due(moment):
             self._record(moment, moment.tick, ())
 
@@ -113,7 +114,7 @@ class SourceInjection(NoInjection):
             "listener": self._on_strike,
         }
         if config.killed_node is not None:
-            self.injector = _Killer(config, shortest_flight_s, self._on_strike)
+            self.injector = Killer(config, shortest_flight_s, self._on_strike)
             self._reader = config.killed_node
             self._stage, self._units = PROCESS, {config.target: ""}
         elif config.attacks_detector:

@@ -186,11 +186,19 @@ _STAGES: dict[type[Message], Stage] = {
 
 
 class DType(Enum):
-    """Storage type of a state, whose bits a fault flips."""
+    """Storage type of a state, or of a field of a message, whose bits a fault flips."""
 
     FLOAT64 = "float64"
     INT32 = "int32"
     BOOL = "bool"
+    FLOAT32 = "float32"
+    INT8 = "int8"
+    INT16 = "int16"
+    INT64 = "int64"
+    UINT8 = "uint8"
+    UINT16 = "uint16"
+    UINT32 = "uint32"
+    UINT64 = "uint64"
 
 
 @dataclass(frozen=True, slots=True)

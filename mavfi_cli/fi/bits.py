@@ -29,8 +29,9 @@ class Field(Enum):
 
 # Codes of struct for a value, and for the unsigned integer of the same size.
 _FORMATS = {
-    "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int16": ("<h", "<H"), "int32": ("<i", "<I"),
-    "int64": ("<q", "<Q"), "bool": ("<?", "<B"),
+    "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int8": ("<b", "<B"), "int16": ("<h", "<H"),
+    "int32": ("<i", "<I"), "int64": ("<q", "<Q"), "bool": ("<?", "<B"),
+    "uint8": ("<B", "<B"), "uint16": ("<H", "<H"), "uint32": ("<I", "<I"), "uint64": ("<Q", "<Q"),
 }  # fmt: skip
 
 
@@ -128,9 +129,12 @@ def _float_type(name: str, mantissa: int, exponent: int) -> BitType:
 
 FLOAT64 = _float_type("float64", 52, 11)
 FLOAT32 = _float_type("float32", 23, 8)
-INT16, INT32, INT64 = (
+INT8, INT16, INT32, INT64 = (
     BitType(name=f"int{w}", width=w, fields={Field.SIGN: range(w - 1, w), Field.ANY: range(w)})
-    for w in (16, 32, 64)
+    for w in (8, 16, 32, 64)
+)
+_UNSIGNED = tuple(
+    BitType(name=f"uint{w}", width=w, fields={Field.ANY: range(w)}) for w in (8, 16, 32, 64)
 )
 BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
 
@@ -146,7 +150,9 @@ def flip_bytes(data: bytes, bits: Iterable[int]) -> bytes:
     return pattern.to_bytes(len(data), "little")
 
 
-NUMPY_TYPES = {kind.name: kind for kind in (FLOAT64, FLOAT32, INT16, INT32, INT64, BOOL)}
+NUMPY_TYPES = {kind.name: kind for kind in (
+    FLOAT64, FLOAT32, INT8, INT16, INT32, INT64, BOOL, *_UNSIGNED,
+)}  # fmt: skip
 
 
 def format_distinct(*values: object) -> list[str]:

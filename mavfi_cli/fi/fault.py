@@ -10,7 +10,7 @@ taxonomy of dependable and secure computing", IEEE TDSC 1(1), 2004.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, TypeVar, cast
@@ -36,11 +36,23 @@ class When(Enum):
 
 
 class Effect(Enum):
-    """The change that a corruption makes to a value."""
+    """The change that a corruption makes to a value, to a message on a link, or to a process."""
 
-    FLIP = "flip"
+    FLIP = "flip"  # of a process: it is killed
     ZERO = "zero"
     RANDOM = "random"  # all bits are replaced by random ones
+    FREEZE = "freeze"  # the value stays as it is at the first strike
+    DROP = "drop"
+    LATE = "late"  # late=SECONDS
+    TWICE = "twice"
+    SWAP = "swap"  # the message follows the next one of its kind
+    STOP = "stop"  # the process is stopped
+    SLOW = "slow"  # slow=SHARE of a processor
+
+
+OF_VALUES = (Effect.FLIP, Effect.ZERO, Effect.RANDOM, Effect.FREEZE)
+OF_MESSAGES = (Effect.DROP, Effect.LATE, Effect.TWICE, Effect.SWAP)
+OF_PROCESSES = (Effect.FLIP, Effect.STOP, Effect.SLOW)
 
 
 class Persistence(Enum):
@@ -76,6 +88,7 @@ class Corruption:
     Attributes:
         bits: number of distinct bits of `field` that are flipped.
         duration_s: duration of a stuck-at or intermittent fault, s.
+        amount: delay of a late message, s, or share of a slow process.
     """
 
     effect: Effect = Effect.FLIP
@@ -84,6 +97,7 @@ class Corruption:
     persistence: Persistence = Persistence.TRANSIENT
     duration_s: float = math.inf
     period_s: float = 1.0
+    amount: float = 0.0
 
     def __post_init__(self) -> None:
         if self.bits < 1:
@@ -92,13 +106,23 @@ class Corruption:
             raise FaultSpecError(f"duration_s must be above 0, got {self.duration_s:g}")
         if not (self.period_s > 0.0 and math.isfinite(self.period_s)):
             raise FaultSpecError(f"period_s must be finite and above 0, got {self.period_s:g}")
+        most = {Effect.LATE: 3600.0, Effect.SLOW: 1.0}.get(self.effect)
+        if most is None and self.amount:
+            raise FaultSpecError(f"{self.effect.value} must have no number, got {self.amount:g}")
+        if most is not None and not 0.0 < self.amount <= most:
+            raise FaultSpecError(
+                f"{self.effect.value}=NUMBER must be above 0 and at most {most:g}, "
+                f"got {self.amount:g}"
+            )
 
     def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
         """Refuse a corruption of bits that a type does not have.
 
         Raises:
-            FaultError: an exact bit or the field is missing, or the field has too few bits.
+            FaultError: an exact bit or the field is missing, or the field has too few bits; or the
+                effect is not one on a value.
         """
+        require_effect(name, self.effect, OF_VALUES)
         if bits is not None:
             kind.mask(bits)
         elif self.effect is Effect.FLIP and self.bits > len(kind.field_bits(self.field)):
@@ -106,6 +130,13 @@ class Corruption:
                 f"{name} is {kind.name}: bits of its field {self.field.value} must be at most "
                 f"{len(kind.field_bits(self.field))}, got {self.bits}"
             )
+
+
+def require_effect(name: str, effect: Effect, known: Sequence[Effect]) -> None:
+    """Refuse an effect that a target does not have. Raises FaultSpecError."""
+    if effect not in known:
+        values = ", ".join(own.value for own in known)
+        raise FaultSpecError(f"{name}: effect must be one of {values}, got {effect.value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,6 +156,7 @@ class SourceFault:
     bits: tuple[tuple[int, ...], ...] | None = None
 
 
+STAGES = {stage.value: stage.states for stage in Stage}
 GROUPS = tuple(dict.fromkeys(state.group for state in BY_NAME.values()))
 
 
@@ -136,6 +168,8 @@ def draw_fault(
     corruption: Corruption,
     together: bool = False,
     bits: Sequence[int] | None = None,
+    known: Mapping[str, State] = BY_NAME,
+    wholes: Mapping[str, tuple[State, ...]] = STAGES,
 ) -> SourceFault:
     """Draw the fault of a target and a seed.
 
@@ -145,13 +179,15 @@ def draw_fault(
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
         bits: exact bits, the same for all states; None draws them at the strike.
+        known: all states by name.
+        wholes: states of each stage, or of each message.
 
     Raises:
         UnknownName: no such stage, state or group.
         FaultSpecError: a bit outside the width, a field that the type does not have.
     """
     rng = Stream.FAULT.generator(seed, "site")
-    states = _states(target, rng, together, corruption.field)
+    states = _states(target, rng, together, corruption.field, known, wholes)
     for state in states:
         corruption.require(state.name, NUMPY_TYPES[state.dtype.value], bits)
     chosen = None if bits is None else tuple(tuple(sorted(bits)) for _ in states)
@@ -159,25 +195,30 @@ def draw_fault(
 
 
 def _states(
-    target: str, rng: np.random.Generator, together: bool, field: Field
+    target: str,
+    rng: np.random.Generator,
+    together: bool,
+    field: Field,
+    known: Mapping[str, State],
+    wholes: Mapping[str, tuple[State, ...]],
 ) -> tuple[State, ...]:
-    stages = {stage.value: stage for stage in Stage}
-    if target in BY_NAME:
-        candidates: tuple[State, ...] = (BY_NAME[target],)
-    elif target in GROUPS:
-        candidates = _group(target)
-    elif target in stages:
-        whole = stages[target].states
+    def group(name: str) -> tuple[State, ...]:
+        return tuple(state for state in known.values() if state.group == name)
+
+    if target in known:
+        candidates: tuple[State, ...] = (known[target],)
+    elif members := group(target):
+        candidates = members
+    elif target in wholes:
+        whole = wholes[target]
         has = [state for state in whole if field in NUMPY_TYPES[state.dtype.value].fields]
         candidates = tuple(has) or whole
     else:
-        raise UnknownName("stage, state or group", target, {*stages, *BY_NAME, *GROUPS})
+        groups = (state.group for state in known.values())
+        kind = "stage, state or group" if known is BY_NAME else "message or field"
+        raise UnknownName(kind, target, {*wholes, *known, *groups})
     state = candidates[int(rng.integers(len(candidates)))]
-    return _group(state.group) if together else (state,)
-
-
-def _group(name: str) -> tuple[State, ...]:
-    return tuple(state for state in BY_NAME.values() if state.group == name)
+    return group(state.group) if together else (state,)
 
 
 # -- without a mission
@@ -200,7 +241,7 @@ def inject(
 
     Args:
         value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any
-            shape with dtype float64, float32, int64, int32, int16 or bool. It is not changed.
+            shape with dtype float64, float32, bool or any integer. It is not changed.
         field: Field of the bits: sign, exponent, mantissa or any.
         seed: Seed from which the element and the bits are drawn, 0 or more.
         exact_bits: Bits to flip instead of drawn ones; bit 0 is the least significant.

@@ -52,7 +52,7 @@ class Moment:
     foresees: bool = False  # a report of a foreseen collision is being passed on
 
 
-class _Pattern:
+class Pattern:
     """The corruption of one value, drawn once: its bits and their new values.
 
     Args:
@@ -89,6 +89,8 @@ class _Pattern:
         if corruption.effect is Effect.RANDOM:
             drawn = self._rng.integers(0, 2, size=kind.width, dtype=np.uint8)
             self._target = sum(int(bit) << number for number, bit in enumerate(drawn))
+        if corruption.effect is Effect.FREEZE:
+            self._target = pattern
         return tuple(range(kind.width))
 
 
@@ -253,7 +255,7 @@ class SourceInjector(Injector):
         self._invocations = 0
         self._index: int | None = None
         self._patterns = [
-            _Pattern(fault.corruption, self._rng, None if fault.bits is None else fault.bits[place])
+            Pattern(fault.corruption, self._rng, None if fault.bits is None else fault.bits[place])
             for place in range(len(fault.states))
         ]
         self._struck: Message | None = None
@@ -307,12 +309,10 @@ class SourceInjector(Injector):
         assert self._index is not None
         kind = NUMPY_TYPES[state.dtype.value]
         before = state.read(message, self._index)
-        return _change_of(state.name, self._index, before, kind, self._patterns[place])
+        return change_of(state.name, self._index, before, kind, self._patterns[place])
 
 
-def _change_of(
-    name: str, index: int, before: Scalar, kind: BitType, corruption: _Pattern
-) -> Change:
+def change_of(name: str, index: int, before: Scalar, kind: BitType, corruption: Pattern) -> Change:
     """Return the change that a strike makes to one value."""
     pattern = kind.pattern(before)
     corrupted = corruption.corrupt(pattern, kind)
@@ -379,7 +379,7 @@ class MemoryInjector(Injector):
         corruption.require(array, self._kind, bits)
         self._memory = memory
         chosen = None if bits is None else tuple(sorted(bits))
-        self._pattern = _Pattern(corruption, rng, chosen)
+        self._pattern = Pattern(corruption, rng, chosen)
 
     def strike(self, moment: Moment) -> None:
         """See `NoInjector`."""
@@ -387,7 +387,7 @@ class MemoryInjector(Injector):
             return
         place = self._memory[self.array]
         before = place.flat[self.element].item()
-        change = _change_of(self.array, self.element, before, self._kind, self._pattern)
+        change = change_of(self.array, self.element, before, self._kind, self._pattern)
         self._record(moment, moment.tick, [change])
         place.flat[self.element] = change.after
 

@@ -83,6 +83,10 @@ class Signing:
         self._next_timestamp = max(self._next_timestamp, timestamp)
         return True
 
+    def renew(self, frame: bytes, block: bytes) -> bytes:
+        """Return the signature block of a changed frame, with link id and time of the old block."""
+        return block[:7] + self._digest(frame + block[:7])
+
     def authenticates(self, data: bytes) -> bool:
         """Return True if data begins with a signed frame that is authentic and not a replay.
 
@@ -349,6 +353,29 @@ class Codec:
             message._link_id = frame[-SIGNATURE_LENGTH]
         messages.append(message)
         return True
+
+
+def renewed(message: Message, signing: Signing | None = None) -> Message | None:
+    """Return a received message, whose fields were changed, with a frame that is valid again.
+
+    The header stays. Checksum and signature are made anew. Fields that the dialect lacks are lost.
+
+    Returns:
+        None if the frame is signed and there is no key.
+    """
+    old, kind = frame_of(message), _kind(type(message).id)
+    assert kind is not None
+    payload, signed = kind.payload(message), old[0] == _V2 and bool(old[2] & _SIGNED)
+    if signed and signing is None:
+        return None
+    if old[0] == _V1:  # it has no extensions, and keeps its trailing zeros
+        payload = payload.ljust(old[1], b"\0")[: old[1]]
+    checked = bytes([len(payload)]) + old[2 : _V2_HEADER if old[0] == _V2 else _V1_HEADER] + payload
+    frame = old[:1] + checked + _crc(checked + kind.crc_extra).to_bytes(2, "little")
+    if signed and signing is not None:
+        frame += signing.renew(frame, old[-SIGNATURE_LENGTH:])
+    message._msgbuf = frame
+    return message
 
 
 def begins_with_frame(data: bytes) -> bool:

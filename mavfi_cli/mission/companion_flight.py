@@ -22,12 +22,14 @@ from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, Command, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.fi.injector import Moment
 from mavfi_cli.link.codec import Message, dialect, frame_of
 from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
 from mavfi_cli.link.router import Router, Side
 from mavfi_cli.link.telemetry import AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
 from mavfi_cli.link.transport import Transport
+from mavfi_cli.mission.companion_faults import CompanionInjection, Throttle
 from mavfi_cli.mission.programs import Programs, RunningProgram
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace
@@ -82,6 +84,8 @@ class CompanionFlight:
         self._heard_s = time.monotonic()
         self._command: Command | None = None
         self._commanders: set[tuple[int, int]] = set()
+        self._ticks = 0  # since the first arming
+        self._faults = injection if isinstance(injection, CompanionInjection) else None
         self._mode, self._failsafe = "", False
         self._next_progress_s = 0.0
         self._crew = _Crew(companion, self.logger)
@@ -102,13 +106,23 @@ class CompanionFlight:
         self._goal_enu_m = self._verdict.goal_enu_m = briefing.goal_enu_m
         self._tlog.open(folder.tlog)
         programs = Programs(folder.programs)
-        with contextlib.closing(self._tlog), contextlib.closing(programs):
+        with (
+            contextlib.closing(self._tlog),
+            contextlib.closing(programs),
+            contextlib.closing(self._crew),
+            contextlib.closing(self.injection),
+        ):
             self._crew.prepare(programs, self._placeholders(briefing))
+            if self._faults is not None:
+                self._faults.running = self._crew.running
+                self._faults.aim_at(self._shortest_flight_s(briefing))
+                self._faults.begin(folder.fault)
             try:
                 while self.outcome is None:
                     self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
                     if self.telemetry.ready or self.stamp_s > _BOOT_S:
                         self._crew.manage(self.stamp_s, self.telemetry.state)
+                    self._strike()
                     self._judge()
             except LinkLost as error:
                 self._end(Outcome.LINK_LOST, str(error))
@@ -118,6 +132,11 @@ class CompanionFlight:
         """Add the failure of the vehicle's process to the reason for a lost link."""
         if self.outcome is Outcome.LINK_LOST:
             self.reason = f"{self.reason}: {why}"
+
+    def _shortest_flight_s(self, briefing: Briefing) -> float:
+        """Return the time over which a random fault is drawn, s."""
+        way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
+        return self._companion.flight_s or way_m / self._config.v_max_mps
 
     def _placeholders(self, briefing: Briefing) -> dict[str, str]:
         """Return the text of every placeholder of a command."""
@@ -142,11 +161,36 @@ class CompanionFlight:
     def _pass(self, message: Message, side: Side) -> Iterable[bytes]:
         if side is Side.AUTOPILOT:
             self._hear(message)
-        else:
+        link = None if self._faults is None else self._faults.link
+        passed = [message] if link is None else link.pass_between(message, side, self._moment)
+        return [frame for own in passed for frame in self._deliver(own, side)]
+
+    def _deliver(self, message: Message, side: Side) -> Iterable[bytes]:
+        """Record a message that reaches its receiver, and return its frames."""
+        if side is Side.COMPANION:
             self._watch(message)
         frames = (frame_of(message),)
         self._tlog.write(self.stamp_s, *frames)
+        if self._faults is not None and self._faults.link is not None:
+            self._faults.link.deliver(message, side, self.stamp_s)
         return frames
+
+    @property
+    def _moment(self) -> Moment:
+        flight_s = self.stamp_s - self.takeover_s
+        return Moment(stamp_s=self.stamp_s, flight_s=flight_s, tick=self._ticks, phase=self._mode)
+
+    def _strike(self) -> None:
+        """Strike a process if it is due, pass late messages on, and log the fault."""
+        if self._faults is None:
+            return
+        self._faults.tick(self._moment)
+        if self._faults.link is not None:
+            for message, side in self._faults.link.release(self.stamp_s):
+                for frame in self._deliver(message, side):
+                    self._router.send(frame, side)
+        for text in self._faults.news():
+            self.logger.note(self.stamp_s, "fault", text, self.telemetry.state)
 
     def _hear(self, message: Message) -> None:
         """Handle a message of the vehicle's side."""
@@ -181,6 +225,7 @@ class CompanionFlight:
 
     def _tick(self, state: VehicleState) -> None:
         """Record a new state, and report progress once per simulated second."""
+        self._ticks += self.takeover_s < math.inf
         self.trace.add(state.stamp_s, self._mode, state, None, None, self._command)
         self._verdict.see(state)
         if state.stamp_s < self._next_progress_s:
@@ -289,6 +334,7 @@ class _Crew:
         self.unready = ""
         self._started_s = self._looked_s = 0.0  # of the newest program; wall clock
         self._known: dict[str, tuple[int, int]] = {}  # starts and ends that the log has
+        self._throttles: list[Throttle] = []
 
     def prepare(self, programs: Programs, values: dict[str, str]) -> None:
         """Fill in the placeholders of all commands. Raises UnknownName for an unknown one."""
@@ -299,6 +345,13 @@ class _Crew:
         name, _ = self._waiting[0]
         self.running[name] = self._programs.start(name, self._tasks[name])
         self._started_s = time.monotonic()
+        if (share := self._companion.program[name].share) < 1.0:
+            self._throttles.append(Throttle(self.running[name], share))
+
+    def close(self) -> None:
+        """Let slowed programs run, so that they can end."""
+        for throttle in self._throttles:
+            throttle.end()
 
     def manage(self, stamp_s: float, state: VehicleState | None) -> None:
         """Log starts and ends of programs, and start the next one if the newest is ready.

@@ -35,6 +35,8 @@ from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.link.transport import signing_from_file
+from mavfi_cli.mission.companion_faults import CompanionInjection
 from mavfi_cli.mission.companion_flight import CompanionFlight
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
@@ -125,14 +127,16 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     assert config.companion is not None
     programs = CompanionConfig.load(config.companion)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
-    injection = NoInjection()
+    injection: NoInjection = NoInjection()
+    if config.fault is not None:
+        key = signing_from_file(programs.key_file)
+        injection = CompanionInjection(config.fault, programs.program, key)
     with interruptible() as interrupt, other_end(config) as (link, vehicle):
         assert vehicle is not None
         flight = CompanionFlight(config, programs, link, watcher, interrupt, injection)
         with contextlib.closing(flight):
             briefing = vehicle.await_briefing(interrupt)
             folder = RunFolder.new(out, config.world, config.seed)
-            injection.begin(folder.fault)
             flight_begun_s = time.perf_counter()
             flight.fly(folder, briefing)
         flight_wall_s = time.perf_counter() - flight_begun_s

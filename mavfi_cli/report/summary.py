@@ -236,7 +236,10 @@ def _fault_lines(fault: Record) -> list[str]:
     request, states = fault["request"], ", ".join(fault["states"])
     what = f"{fault['stage']} stage, {states}: {request['persistence']} {request['effect']}"
     if fault["stage"] == "process":
-        what = f"{states} is killed"
+        struck = {"flip": "is killed", "stop": "is stopped"}
+        what = f"{states} {struck.get(request['effect'], request['effect'])}"
+    elif not fault["units"][0]:  # a whole message
+        what = f"{fault['stage']}, {states}: {request['persistence']} {request['effect']}"
     lines = [f"Fault       {what}, {when}"]
     if fault["state"] == "not_injected":
         lines.append(f"            not injected: {fault['reason']}")
@@ -244,7 +247,7 @@ def _fault_lines(fault: Record) -> list[str]:
         lines += [_change_line(strike["stamp_s"], change) for change in strike["changes"]]
     if fault["strike_count"] > 3:
         lines.append(f"            and {fault['strike_count'] - 3} more strikes")
-    if fault["state"] == "applied" and fault["stage"] != "process":
+    if fault["state"] == "applied" and fault["units"][0]:  # a value
         lines.append(f"            {_activation(fault)}")
     return lines
 

@@ -39,6 +39,8 @@ class ProgramConfig:
         ready_port: TCP port of this machine that it opens when it is ready.
         ready_heartbeat: It is ready when its first MAVLink heartbeat arrives.
         ready_limit_s: Longest wall-clock time until it is ready, s.
+        share: Share of the time for which it runs; below 1 it is stopped for the rest of every
+            20 ms, as on a slower computer.
     """
 
     command: str
@@ -50,6 +52,7 @@ class ProgramConfig:
     ready_port: int | None = None
     ready_heartbeat: bool = False
     ready_limit_s: float = 60.0
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         if not _words(self.command):
@@ -58,6 +61,7 @@ class ProgramConfig:
             raise UnknownName("restart rule", self.restart, RESTARTS)
         _require_range("restart_s", self.restart_s, 0.0, _LONGEST_S)
         _require_range("ready_port", self.ready_port, 1, 65_535)
+        _require_range("share", self.share, 0.01, 1.0)
         _require_range("ready_limit_s", self.ready_limit_s, 0.1, _LONGEST_S)
         try:
             re.compile(self.ready_line or "")
@@ -125,6 +129,8 @@ class CompanionConfig:
         time_limit_s: Limit of simulated time from arming, s; None for the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
             straight way to the goal at the speed limit.
+        key_file: File with the signing passphrase of the link, relative to this file. A message
+            that a fault changes is signed again with it.
     """
 
     program: dict[str, ProgramConfig]
@@ -132,6 +138,7 @@ class CompanionConfig:
     success: SuccessConfig = field(default_factory=SuccessConfig)
     time_limit_s: float | None = None
     flight_s: float | None = None
+    key_file: str | None = None
 
     def __post_init__(self) -> None:
         if not self.program:
@@ -167,7 +174,8 @@ class CompanionConfig:
         }
         for name, program in placed.items():
             _require_startable(name, program)
-        return replace(loaded, program=placed)
+        key_file = None if loaded.key_file is None else str(base / loaded.key_file)
+        return replace(loaded, program=placed, key_file=key_file)
 
 
 def _require_startable(name: str, program: ProgramConfig) -> None:

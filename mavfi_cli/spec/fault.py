@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
@@ -11,6 +13,9 @@ from mavfi_cli.core.types import BY_NAME, KERNELS, Stage
 from mavfi_cli.fi.bits import Field
 from mavfi_cli.fi.fault import (
     GROUPS,
+    OF_MESSAGES,
+    OF_PROCESSES,
+    OF_VALUES,
     Corruption,
     Effect,
     Persistence,
@@ -18,12 +23,17 @@ from mavfi_cli.fi.fault import (
     Trigger,
     When,
     draw_fault,
+    require_effect,
 )
+
+if TYPE_CHECKING:
+    from mavfi_cli.link.fields import WireFields
 
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
 PROCESS = "process"  # target prefix: process of a node
 QUEUE = "queue"  # target prefix: control's copy of the plan
+DIRECTIONS = ("output", "input")  # target prefixes: messages of a companion, and to it
 _QUEUED = [name for name in dict.fromkeys((*BY_NAME, *GROUPS)) if name.startswith("waypoint_")]
 
 
@@ -34,7 +44,9 @@ class FaultConfig:
     Attributes:
         target: Injection site: a stage, a state or a group of states; `detector` or `detector.PART`
             for the detector's memory, such as `detector.threshold`; `process.NODE` to kill the
-            node's process; `queue.STATE` for a waypoint's state in control's copy of the plan.
+            node's process; `queue.STATE` for a waypoint's state in control's copy of the plan. Of a
+            user's companion: `process.PROGRAM`, `MESSAGE.FIELD` of MAVLink, `MESSAGE.FIELD[INDEX]`
+            of an array, or `MESSAGE`; `output.` or `input.` before it selects a direction.
         seed: Root seed of the fault's random streams.
         at: Trigger: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".
         together: Corrupt all components of the group at once.
@@ -45,7 +57,7 @@ class FaultConfig:
     seed: int = 1
     at: str = "random"
     together: bool = False
-    effect: str = "flip"  # flip, zero or random
+    effect: str = "flip"  # flip, zero, random, freeze, drop, late=S, twice, swap, stop, slow=SHARE
     bits: int = 1  # number of distinct bits to flip
     field: str = "any"  # field of the bits: sign, exponent, mantissa or any
     exact_bits: tuple[int, ...] | None = None
@@ -66,6 +78,13 @@ class FaultConfig:
         """Node whose process is killed; None for a fault in a value."""
         what, dot, node = self.target.partition(".")
         return node if what == PROCESS and dot else None
+
+    @property
+    def wire_target(self) -> tuple[str | None, str] | None:
+        """Direction (None: any) and MESSAGE[.FIELD] of a fault in MAVLink messages; else None."""
+        first, _, rest = self.target.partition(".")
+        direction, target = (first, rest) if first in DIRECTIONS else (None, self.target)
+        return (direction, target) if direction or target[:1].isupper() else None
 
     @property
     def strikes_queue(self) -> bool:
@@ -91,20 +110,33 @@ class FaultConfig:
         if self.exact_bits:
             numbers = " and ".join(map(str, self.exact_bits))
             bits = f"bit{'s'[len(self.exact_bits) == 1 :]} {numbers}"
+        effect, _, amount = self.effect.partition("=")
+        if self.killed_node is not None:
+            where = f"the process of {self.killed_node}"
         what = {
-            Effect.FLIP.value: f"{bits} of {where}",
+            Effect.FLIP.value: f"{bits} of {where}" if self.killed_node is None
+                               else f"{where} is killed",
             Effect.ZERO.value: f"{where} set to zero",
             Effect.RANDOM.value: f"{where} drawn anew",
-        }[self.effect]
-        if self.killed_node is not None:
-            what = f"the process of {self.killed_node} is killed"
+            Effect.FREEZE.value: f"{where} frozen",
+            Effect.DROP.value: f"{where} dropped",
+            Effect.LATE.value: f"{where} late by {amount} s",
+            Effect.TWICE.value: f"{where} sent twice",
+            Effect.SWAP.value: f"{where} after the next one",
+            Effect.STOP.value: f"{where} is stopped",
+            Effect.SLOW.value: f"{where} has {amount} of a processor",
+        }[effect]  # fmt: skip
         held = [self.persistence] if self.persistence != Persistence.TRANSIENT.value else []
         when = [f"at {self.at.replace('=', ' ')}"] if self.at != When.RANDOM.value else []
-        return ", ".join([what.replace("_", " "), *held, *when])
+        if self.wire_target is None:
+            what = what.replace("_", " ")
+        return ", ".join([what, *held, *when])
 
     def check(self) -> None:
         """Validate the configuration. Raises as `draw`."""
-        if self.killed_node is not None:
+        if self.wire_target is not None:
+            self.draw_wire()
+        elif self.killed_node is not None:
             self._check_kill(self.killed_node)
         elif self.attacks_detector:  # its memory is only known during the mission
             self.trigger()
@@ -121,6 +153,58 @@ class FaultConfig:
             )
         if self.trigger().when is When.INVOCATION:
             raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
+
+    def check_program(self, programs: Collection[str]) -> None:
+        """Validate the fault in a process of a user's companion, given its programs.
+
+        Raises:
+            UnknownName: No program has this name, or no effect.
+            FaultSpecError: A process does not have this effect or trigger.
+        """
+        name = self.killed_node
+        if name not in programs:
+            raise UnknownName("program", name or "", programs)
+        corruption = self.corruption()
+        require_effect(self.target, corruption.effect, OF_PROCESSES)
+        if self.trigger().when in (When.INVOCATION, When.FORESEEN):
+            raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
+        if corruption.persistence is not Persistence.TRANSIENT:
+            raise FaultSpecError(
+                f"{self.target}: persistence must be transient, got {self.persistence}"
+            )
+
+    def draw_wire(self) -> tuple[WireFields, SourceFault | None]:
+        """Draw the fault in a MAVLink message.
+
+        Returns:
+            The message, and the fault in its fields; None if the message itself is struck.
+
+        Raises:
+            UnknownName: No message or field has this name. The message suggests the nearest.
+            FaultError: Values contradict each other.
+        """
+        from mavfi_cli.link.fields import WireFields  # loads pymavlink
+
+        assert self.wire_target is not None
+        target = self.wire_target[1]
+        trigger, corruption = self.trigger(), self.corruption()
+        if trigger.when is When.FORESEEN:
+            raise FaultSpecError(f"{self.target}: at must be anything but foreseen, got {self.at}")
+        fields = WireFields.of(target.partition(".")[0])
+        if corruption.effect in OF_MESSAGES:
+            if "." in target:
+                raise FaultSpecError(
+                    f"{self.target}: {corruption.effect.value} must have a whole message, got a "
+                    "field"
+                )
+            return fields, None
+        require_effect(self.target, corruption.effect, (*OF_VALUES, *OF_MESSAGES))
+        drawn = draw_fault(
+            target, seed=self.seed, trigger=trigger, corruption=corruption,
+            together=self.together, bits=self.exact_bits, known=fields.states,
+            wholes={fields.name: tuple(fields.states.values())},
+        )  # fmt: skip
+        return fields, drawn
 
     def check_within(self, time_limit_s: float) -> None:
         """Reject a trigger beyond the mission's time limit. Also raises as `trigger`.
@@ -151,6 +235,8 @@ class FaultConfig:
         when = named_member(When, "trigger", kind)
         if when in (When.RANDOM, When.FORESEEN):
             return Trigger(when=when)
+        if when is When.PHASE and (self.wire_target or value.isupper()):
+            return Trigger(when=when, phase=value)  # flight mode of the autopilot
         if when is When.PHASE:
             return Trigger(when=when, phase=named_member(PilotMode, "phase", value).value)
         try:
@@ -162,8 +248,14 @@ class FaultConfig:
 
     def corruption(self) -> Corruption:
         """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
+        effect, _, amount = self.effect.partition("=")
+        try:
+            number = float(amount or 0.0)
+        except ValueError:
+            raise FaultSpecError(f"effect {effect}= must have a number, got {amount!r}") from None
         return Corruption(
-            effect=named_member(Effect, "effect", self.effect),
+            effect=named_member(Effect, "effect", effect),
+            amount=number,
             bits=self.bits,
             field=named_member(Field, "field", self.field),
             persistence=named_member(Persistence, "persistence", self.persistence),

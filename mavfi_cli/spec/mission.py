@@ -196,6 +196,8 @@ class MissionConfig:
         if self.companion is None:
             if self.speed != 1.0:
                 raise ConfigError("needs --companion", key="speed")
+            if self.fault is not None and self.fault.wire_target is not None:
+                raise ConfigError("a MAVLink message needs --companion", key="inject")
             return
         for name in ("link", "realtime", "instruction", "detector", "isolate", "land"):
             if getattr(self, name):

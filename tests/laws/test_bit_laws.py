@@ -21,9 +21,8 @@ KINDS = [
 VALUES = {
     "float64": st.floats(),
     "float32": st.floats(width=32, allow_nan=False),
-    "int16": st.integers(-(2**15), 2**15 - 1),
-    "int32": st.integers(-(2**31), 2**31 - 1),
-    "int64": st.integers(-(2**63), 2**63 - 1),
+    **{f"int{w}": st.integers(-(2 ** (w - 1)), 2 ** (w - 1) - 1) for w in (8, 16, 32, 64)},
+    **{f"uint{w}": st.integers(0, 2**w - 1) for w in (8, 16, 32, 64)},
     "bool": st.booleans(),
 }
 kinds = st.sampled_from(KINDS)
@@ -61,7 +60,7 @@ def test_fields_of_a_float_partition_its_bits(kind):
     assert (len(parts[0]), len(parts[1])) == (info.nmant, info.nexp)
 
 
-@given(st.sampled_from([b.FLOAT64, b.FLOAT32, b.INT16, b.INT32, b.INT64]), st.data())
+@given(st.sampled_from([kind for kind in b.NUMPY_TYPES.values() if kind is not b.BOOL]), st.data())
 def test_patterns_are_numpys(kind, data):
     value = data.draw(VALUES[kind.name])
     array = np.array([value], dtype=kind.name)

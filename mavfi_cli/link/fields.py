@@ -1,0 +1,88 @@
+"""The numeric fields of MAVLink messages as states that a fault can strike.
+
+A state is named MESSAGE.FIELD, or MESSAGE.FIELD[INDEX] for an element of an array. The elements of
+an array are a group, and so are the fields whose names differ in a last x, y or z only.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from dataclasses import dataclass
+from typing import Any
+
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.types import DType, Scalar, State
+from mavfi_cli.link.codec import ADDED, Message, dialect
+
+_TYPES = {"float": DType.FLOAT32, "double": DType.FLOAT64, "uint8_t_mavlink_version": DType.UINT8}
+_SETPOINTS = ("SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT")
+# Bits of their type_mask, which make the autopilot ignore a field; see POSITION_TARGET_TYPEMASK.
+_IGNORED = {
+    "x": 1, "y": 2, "z": 4, "lat_int": 1, "lon_int": 2, "alt": 4, "vx": 8, "vy": 16, "vz": 32,
+    "afx": 64, "afy": 128, "afz": 256, "yaw": 1024, "yaw_rate": 2048,
+}  # fmt: skip
+
+
+class _WireState(State):
+    """A field of a message, or one element of an array in it."""
+
+    __slots__ = ()
+
+    def read(self, message: Message, index: int) -> Scalar:
+        """Return the value in a received message."""
+        value: Any = getattr(message, self.source)
+        number: Scalar = value if self.column is None else value[self.column]
+        return number
+
+    def write(self, message: Message, index: int, value: Scalar) -> Message:
+        """Return a copy of a received message with the value. Its frame stays the old one."""
+        changed, field = copy.copy(message), getattr(message, self.source)
+        if self.column is not None:
+            field = [*field[: self.column], value, *field[self.column + 1 :]]
+        setattr(changed, self.source, value if self.column is None else field)
+        return changed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireFields:
+    """A message of MAVLink, and its numeric fields as states by name."""
+
+    name: str
+    number: int  # message id
+    states: dict[str, State]
+
+    @classmethod
+    def of(cls, name: str) -> WireFields:
+        """Return the fields of a message.
+
+        Raises:
+            UnknownName: The dialect has no such message. The message suggests the nearest.
+        """
+        kinds = {kind.msgname: kind for kind in (*dialect.mavlink_map.values(), *ADDED.values())}
+        if name not in kinds:
+            near = difflib.get_close_matches(name, kinds, 6, 0.0)
+            raise UnknownName("message", name, near)
+        kind: Any = kinds[name]
+        states: dict[str, State] = {}
+        of_fields = zip(kind.fieldnames, kind.fieldtypes, strict=True)
+        counts = dict(zip(kind.ordered_fieldnames, kind.lengths, strict=True))
+        for field, wire in of_fields:
+            if wire == "char":  # a text has no value
+                continue
+            unit = getattr(kind, "fieldunits_by_name", {}).get(field, "1")
+            dtype = _TYPES.get(wire) or DType(wire.removesuffix("_t"))
+            shared = f"{field[:-1]}*" if field[-1] in "xyz" else field
+            count = counts[field]
+            for column in [None] if count == 1 else range(count):
+                full = f"{name}.{field}" + ("" if column is None else f"[{column}]")
+                states[full] = _WireState(
+                    full, kind, field, unit, column=column, dtype=dtype, group=f"{name}.{shared}"
+                )
+        return cls(name=name, number=kind.id, states=states)
+
+
+def is_ignored(message: Message, state: State) -> bool:
+    """Return True if the setpoint's own mask makes the autopilot ignore a field."""
+    mask = getattr(message, "type_mask", 0) if message.get_type() in _SETPOINTS else 0
+    return bool(mask & _IGNORED.get(state.source, 0))

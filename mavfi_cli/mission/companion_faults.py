@@ -1,0 +1,240 @@
+"""Faults in the messages and in the processes of a user's companion."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any
+
+from mavfi_cli.companion.injection import Killer, SourceInjection
+from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.seeds import Stream
+from mavfi_cli.fi.bits import NUMPY_TYPES
+from mavfi_cli.fi.fault import Effect
+from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, Strike, change_of
+from mavfi_cli.link.codec import Message, Signing, renewed
+from mavfi_cli.link.fields import is_ignored
+from mavfi_cli.link.router import Side
+from mavfi_cli.mission.programs import RunningProgram
+from mavfi_cli.spec.fault import PROCESS, FaultConfig
+
+_SIDES = {None: None, "output": Side.COMPANION, "input": Side.AUTOPILOT}
+_RECEIVERS = {Side.COMPANION: "autopilot", Side.AUTOPILOT: "companion"}
+_PERIOD_S = 0.02  # of a slowed program
+
+
+class LinkInjector(Injector):
+    """Strikes one kind of message that passes between autopilot and companion.
+
+    Args:
+        shortest_flight_s, listener: As for `Injector`.
+        signing: Key with which a struck frame is signed again.
+
+    Attributes:
+        units: Unit of each struck field by name; the message itself has none.
+        side: Sender of the struck messages; None before the first strike.
+    """
+
+    def __init__(
+        self,
+        request: FaultConfig,
+        *,
+        shortest_flight_s: float,
+        listener: Listener,
+        signing: Signing | None = None,
+    ) -> None:
+        assert request.wire_target is not None
+        fields, fault = request.draw_wire()
+        corruption, rng = request.corruption(), Stream.FAULT.generator(request.seed, "strike")
+        super().__init__(rng, request.trigger(), corruption, shortest_flight_s, listener)
+        self._awaits = fields.name
+        self._number, self._signing = fields.number, signing
+        self._only = _SIDES[request.wire_target[0]]
+        self._states = () if fault is None else fault.states
+        bits = None if request.exact_bits is None else tuple(sorted(request.exact_bits))
+        self._patterns = [Pattern(corruption, rng, bits) for _ in self._states]
+        self.units = {state.name: state.unit for state in self._states} or {fields.name: ""}
+        self.side: Side | None = None
+        self._count = 0
+        self._swapped: list[Message] = []
+        self._late: list[tuple[float, Message, Side]] = []
+        self._locked = False  # a struck frame was signed with an unknown key
+
+    @property
+    def missed(self) -> str:
+        """Why the fault never struck."""
+        if self._locked:
+            return "the frames are signed, and key_file names no key to sign them again"
+        return super().missed
+
+    def pass_between(self, message: Message, side: Side, moment: Moment) -> list[Message]:
+        """Return the messages that go on in place of a message."""
+        if message.get_msgId() != self._number or self._only not in (None, side):
+            return [message]
+        self._count += 1
+        if self._swapped:
+            swapped, self._swapped = self._swapped, []
+            return [message, *swapped]
+        if not self._due(moment, self._count):
+            return [message]
+        if self._states:
+            return [self._corrupt(message, side, moment)]
+        self.side = side
+        self._record(moment, self._count, ())
+        effect = self._corruption.effect
+        if effect is Effect.SWAP:
+            self._swapped = [message]
+        elif effect is Effect.LATE:
+            self._late.append((moment.stamp_s + self._corruption.amount, message, side))
+        return [message, message] if effect is Effect.TWICE else []
+
+    def release(self, stamp_s: float) -> Iterator[tuple[Message, Side]]:
+        """Yield the late messages that are due, with their senders."""
+        due = [late for late in self._late if late[0] <= stamp_s]
+        self._late = [late for late in self._late if late[0] > stamp_s]
+        for _, message, side in due:
+            yield message, side
+
+    def _corrupt(self, message: Message, side: Side, moment: Moment) -> Message:
+        changed, changes = message, []
+        for state, pattern in zip(self._states, self._patterns, strict=True):
+            kind = NUMPY_TYPES[state.dtype.value]
+            change = change_of(state.name, 0, state.read(changed, 0), kind, pattern)
+            changed = state.write(changed, 0, change.after)
+            changes.append(change)
+        valid = renewed(changed, self._signing)
+        if valid is None:
+            self._locked = True
+            return message
+        self.side = side
+        struck = valid if any(change.bits for change in changes) else message
+        self.follower.struck(struck, self._record(moment, self._count, changes))
+        return struck
+
+    def deliver(self, message: Message, side: Side, stamp_s: float) -> None:
+        """Record that a message has reached its receiver, which reads all but ignored fields."""
+        read = {state.name for state in self._states if not is_ignored(message, state)}
+        self.follower.read(message, _RECEIVERS[side], stamp_s, read)
+
+
+class Throttle(threading.Thread):
+    """Lets a program run for a share of the time, and stops it for the rest of every 20 ms.
+
+    The signals reach the process group of the program. With a share of 0 the program is stopped
+    until `end`.
+    """
+
+    def __init__(self, program: RunningProgram, share: float) -> None:
+        super().__init__(daemon=True)
+        self._program, self._share = program, share
+        self._over = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        """Stop and continue the program until `end`."""
+        stopped_s = (1.0 - self._share) * _PERIOD_S if self._share else None
+        while not self._over.wait(self._share * _PERIOD_S):
+            self._signal(signal.SIGSTOP)
+            self._over.wait(stopped_s)
+            self._signal(signal.SIGCONT)
+
+    def _signal(self, number: int) -> None:
+        pid = self._program.pid
+        if pid is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(pid, number)
+
+    def end(self) -> None:
+        """Let the program run from now on."""
+        self._over.set()
+        self.join()
+
+
+class CompanionInjection(SourceInjection):
+    """Injection of one fault into the messages or the processes of a user's companion.
+
+    Args:
+        programs: The companion's programs by name.
+        signing: As for `LinkInjector`.
+
+    Raises:
+        FaultSpecError: A user's companion has no such target.
+        UnknownName: It has no such program, message or field.
+    """
+
+    link: LinkInjector | None = None
+
+    def __init__(
+        self, config: FaultConfig, programs: Mapping[str, Any], signing: Signing | None = None
+    ) -> None:
+        super().__init__(config)
+        self._signing = signing
+        self.running: Mapping[str, RunningProgram] = {}
+        self._throttle: Throttle | None = None
+        self._until_s = math.inf
+        check_companion_fault(config, programs)
+
+    def aim_at(self, shortest_flight_s: float) -> None:
+        """Draw the fault over the shortest time of flight, s."""
+        config = self._config
+        if config.killed_node is not None:
+            self.injector = Killer(config, shortest_flight_s, self._on_strike)
+            self._reader = config.killed_node
+            self._stage, self._units = PROCESS, {config.target: ""}
+            return
+        self.link = LinkInjector(
+            config, shortest_flight_s=shortest_flight_s, listener=self._on_strike,
+            signing=self._signing,
+        )  # fmt: skip
+        assert config.wire_target is not None
+        self.injector, self._units = self.link, self.link.units
+        self._stage = config.wire_target[0] or "message"
+
+    def tick(self, moment: Moment) -> None:
+        """Strike a process if it is due, and end what has a duration."""
+        self.injector.strike(moment)
+        if self._throttle is not None and moment.stamp_s >= self._until_s:
+            self._throttle.end()
+            self._throttle = None
+
+    def close(self) -> None:
+        """Let a stopped program go on, so that it can end."""
+        if self._throttle is not None:
+            self._throttle.end()
+
+    def _on_strike(self, strike: Strike) -> None:
+        """Record the first strike before it takes effect, and strike a process."""
+        first = self._state == "planned"
+        super()._on_strike(strike)
+        if first and not strike.changes:
+            self._news[-1:] = [f"fault: {self._config.describe()}"]
+        if self.link is not None:
+            if not strike.changes and self.link.side is not None:
+                self._reader = _RECEIVERS[self.link.side]
+            return
+        program = self.running.get(self._config.killed_node or "")
+        if program is None:
+            return
+        corruption = self._config.corruption()
+        if corruption.effect is Effect.FLIP:
+            program.signal(signal.SIGKILL)
+            return
+        self._throttle = Throttle(program, corruption.amount)
+        self._until_s = strike.stamp_s + corruption.duration_s
+
+
+def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> None:
+    """Refuse a fault that a user's companion cannot have. Raises as `CompanionInjection`."""
+    if config.wire_target is not None:
+        config.draw_wire()
+    elif config.killed_node is not None:
+        config.check_program(programs)
+    else:
+        raise FaultSpecError(
+            f"{config.target}: the target in a user's companion must be a MAVLink message such as "
+            "SET_POSITION_TARGET_LOCAL_NED.vx, or process.PROGRAM"
+        )

@@ -1,0 +1,198 @@
+"""Faults in the messages and processes of a user's companion."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from live_processes import LONG_S
+
+from mavfi_cli import library
+from mavfi_cli.core.errors import FaultSpecError, MavfiError, UnknownName
+from mavfi_cli.fi.injector import Moment
+from mavfi_cli.link.codec import Codec, Signing, dialect, frame_of, key_from_passphrase
+from mavfi_cli.link.router import Side
+from mavfi_cli.mission.companion_faults import (
+    CompanionInjection,
+    LinkInjector,
+    Throttle,
+    check_companion_fault,
+)
+from mavfi_cli.mission.programs import Programs
+from mavfi_cli.report.summary import summary_lines
+from mavfi_cli.spec.fault import FaultConfig
+
+HOP = Path(__file__).with_name("hop.py")
+SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
+CLOCK = 1_700_000_000.0
+KEY = key_from_passphrase("secret")
+
+
+def setpoint(number=0, codec=None, vx=2.0):
+    """A received setpoint, as the router decodes it."""
+    message = dialect.MAVLink_set_position_target_local_ned_message(
+        number, 1, 1, 1, 0b1001_1100_0111, 0, 0, 0, vx, 0, 0, 0, 0, 0, 0.5, 0
+    )
+    frame = (codec or Codec(1, 191)).encode(message)
+    return Codec(0, 0, keeps_unknown=True).decode(frame)[0]
+
+
+def injector(target, *, signing=None, **request):
+    return LinkInjector(
+        FaultConfig(target=target, at="time=0", **request),
+        shortest_flight_s=1.0, listener=lambda strike: None, signing=signing,
+    )  # fmt: skip
+
+
+def at(stamp_s):
+    return Moment(stamp_s=stamp_s, flight_s=stamp_s, tick=0, phase="OFFBOARD")
+
+
+def passed(link, messages, side=Side.COMPANION):
+    return [m for n, own in enumerate(messages) for m in link.pass_between(own, side, at(n * 0.1))]
+
+
+def test_a_struck_frame_is_valid_and_differs_in_the_field_only():
+    before = setpoint()
+    (after,) = passed(injector(f"{SETPOINT}.vx", exact_bits=(30,)), [before])
+    (read,) = Codec(0, 0).decode(frame_of(after))
+    assert (before.vx, read.vx) == (2.0, 0.0)
+    assert read.get_header().pack() == before.get_header().pack()
+    assert {**read.to_dict(), "vx": 2.0} == before.to_dict()
+
+
+def test_a_signed_frame_is_signed_again_and_stays_out_without_a_key():
+    def signing():
+        return Signing(KEY, lambda: CLOCK)
+
+    before = setpoint(codec=Codec(1, 191, signing=signing()))
+    target = f"{SETPOINT}.vx"
+    (after,) = passed(injector(target, exact_bits=(30,), signing=signing()), [before])
+    (read,) = Codec(0, 0, signing=signing()).decode(frame_of(after))
+    assert read.vx == 0.0
+    locked = injector(target, exact_bits=(30,))
+    assert passed(locked, [before]) == [before]
+    assert "key_file" in locked.missed
+
+
+def test_an_old_frame_keeps_its_length():
+    old = dialect.MAVLink(None, srcSystem=1, srcComponent=191)
+    frame = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 0, 0, 0
+    ).pack(old, force_mavlink1=True)
+    (before,) = Codec(0, 0).decode(frame)
+    (after,) = passed(injector(f"{SETPOINT}.vx", exact_bits=(30,)), [before])
+    assert len(frame_of(after)) == len(frame)
+    assert Codec(0, 0).decode(frame_of(after))[0].vx == 0.0
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers"),
+    [("drop", [1, 2, 3]), ("twice", [0, 0, 1, 2, 3]), ("swap", [1, 0, 2, 3]),
+     ("late=0.15", [1, 2, 3])],
+)  # fmt: skip
+def test_a_message_is_dropped_repeated_swapped_or_late(effect, numbers):
+    link = injector(SETPOINT, effect=effect)
+    assert [m.time_boot_ms for m in passed(link, map(setpoint, range(4)))] == numbers
+    assert [m.time_boot_ms for m, side in link.release(0.1)] == []
+    late = [(m.time_boot_ms, side) for m, side in link.release(0.2)]
+    assert late == ([(0, Side.COMPANION)] if "late" in effect else [])
+
+
+def test_a_frozen_field_stays_and_an_ignored_one_is_not_read():
+    link = injector(f"{SETPOINT}.vx", effect="freeze", persistence="stuck-at", duration_s=0.25)
+    values = [m.vx for m in passed(link, [setpoint(vx=vx) for vx in (1.0, 2.0, 3.0, 4.0)])]
+    assert values == [1.0, 1.0, 1.0, 4.0]
+    ignored = injector(f"{SETPOINT}.x")
+    (struck,) = passed(ignored, [setpoint()])
+    ignored.deliver(struck, Side.COMPANION, 0.0)
+    assert ignored.follower.activation.value == "not_read"
+
+
+def test_direction_and_components():
+    link = injector(f"output.{SETPOINT}.vx", together=True, effect="random")
+    assert passed(link, [setpoint()], Side.AUTOPILOT)[0].vx == 2.0
+    passed(link, [setpoint()])
+    (strike,) = link.strikes
+    assert [c.state[-2:] for c in strike.changes] == ["vx", "vy", "vz"]
+
+
+@pytest.mark.parametrize(
+    ("target", "settings", "error", "problem"),
+    [
+        (f"{SETPOINT}.vxx", {}, UnknownName, f"did you mean '{SETPOINT}.vx'"),
+        ("LOCAL_POSITON_NED.z", {}, UnknownName, "did you mean 'LOCAL_POSITION_NED'"),
+        ("planning", {}, FaultSpecError, "MAVLink message"),
+        ("process.hopp", {}, UnknownName, "did you mean 'hop'"),
+        (f"{SETPOINT}.vx", {"effect": "drop"}, FaultSpecError, "whole message"),
+        (f"{SETPOINT}.vx", {"exact_bits": (32,)}, FaultSpecError, "between 0 and 31"),
+        (SETPOINT, {"effect": "late"}, FaultSpecError, "above 0"),
+        (SETPOINT, {"effect": "late=x"}, FaultSpecError, "a number"),
+        (SETPOINT, {"effect": "stop"}, FaultSpecError, "got stop"),
+        (SETPOINT, {"at": "foreseen"}, FaultSpecError, "foreseen"),
+        ("process.hop", {"effect": "zero"}, FaultSpecError, "got zero"),
+        ("process.hop", {"effect": "slow=2"}, FaultSpecError, "at most 1"),
+    ],
+)
+def test_faults_that_a_companion_cannot_have(target, settings, error, problem):
+    with pytest.raises(error, match=problem.replace(".", "\\.")):
+        check_companion_fault(FaultConfig(target=target, **settings), {"hop": None})
+
+
+def test_a_stopped_program_does_not_run_and_goes_on(tmp_path):
+    code = "import os\nwhile True: os.times()"
+    task = {
+        "argv": [sys.executable, "-c", code], "folder": str(tmp_path), "environment": {},
+        "restart": "never", "restart_s": 0.0, "ready_line": None,
+    }  # fmt: skip
+    programs = Programs(tmp_path)
+    try:
+        program = programs.start("busy", task)
+        until_s = time.monotonic() + LONG_S
+        while program.pid is None and time.monotonic() < until_s:
+            program.poll()
+        throttle = Throttle(program, 0.0)
+        stat = Path(f"/proc/{program.pid}/stat")
+        while stat.read_text().split()[2] != "T":
+            assert time.monotonic() < until_s
+        throttle.end()
+        while stat.read_text().split()[2] == "T":
+            assert time.monotonic() < until_s
+        os.kill(program.pid, signal.SIGTERM)
+    finally:
+        programs.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "outcome", "line"),
+    [
+        ({"target": f"{SETPOINT}.vx", "exact_bits": (30,)}, "success", "2 -> 0"),
+        ({"target": "process.hop"}, "crash", "process.hop is killed"),
+        ({"target": "process.hop", "effect": "stop", "duration_s": 2.0}, "success", "is stopped"),
+        ({"target": SETPOINT, "effect": "late=0.2"}, "success", "transient late=0.2"),
+    ],
+)
+def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, line):
+    companion = tmp_path / "hop.toml"
+    companion.write_text(
+        f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} 2 lands'\n"
+        "[success]\nlanded = true\n"
+    )
+    run = library.fly(
+        companion=str(companion), world="farm", speed=2.0, time_limit_s=60.0, out=tmp_path,
+        fault=FaultConfig(**fault, at="time=7"),
+    )  # fmt: skip
+    assert run.record.outcome == outcome
+    assert run.record.fault["state"] == "applied"
+    assert any(line in text for text in summary_lines(run.result))
+    assert any(event["kind"] == "fault" for event in run.record.events)
+
+
+def test_a_message_needs_a_users_companion(tmp_path):
+    with pytest.raises(MavfiError, match="needs --companion"):
+        library.fly(fault=FaultConfig(target="LOCAL_POSITION_NED.z"), out=tmp_path)
+    with pytest.raises(UnknownName, match="no_such"):
+        CompanionInjection(FaultConfig(target="process.no_such"), {})
