@@ -15,7 +15,7 @@ class Progress:
         total: missions of the list.
         before: missions that were finished before this run began.
         over: missions that are finished now, including `before`.
-        running: missions in flight.
+        running: flights that have not ended; missions that share a flight count as one.
         again: attempts that were repeated because something outside the mission ended them.
         elapsed_s: wall time of this run, s.
         inside_s: wall time spent in missions, summed over the workers, s.

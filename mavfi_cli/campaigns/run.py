@@ -43,7 +43,7 @@ from mavfi_cli.campaigns.workers import (
     LocalWorkers,
 )
 from mavfi_cli.core.errors import ConfigError, Interrupted
-from mavfi_cli.core.files import file_digest, own_folder, writing
+from mavfi_cli.core.files import file_digest, own_folder, sync_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.mission.instruction import CACHE, kept_in
@@ -364,6 +364,7 @@ class _Run:
         shares = options.task == TASK and not options.whole
         self._queue = MissionQueue(wanted, stop, cells, over(), shares=shares)
         self._again: list[MissingMission] = []
+        self._alone: dict[int, str] = {}  # reasons why missions do not share a flight
         self._flying: dict[int, MissingMission] = {}
         self._attempts: Counter[int] = Counter()
         self._given_up: dict[int, str] = {}
@@ -396,20 +397,22 @@ class _Run:
         with contextlib.closing(fleet) as workers:
             while len(interrupts) < 2:
                 self._fill(workers, interrupts)
-                if not workers.busy:
+                if not workers.flights:
                     break
                 over = workers.wait(_LOOK_S)
+                if not interrupts:
+                    self._note_unforked(over)
                 self._fill(workers, interrupts)  # at once: the ledger is written while they fly
                 for ended in over:
                     self._take(ended)
-                self._spectator.on_progress(self._progress())
+                self._spectator.on_progress(self._progress(workers.flights))
                 if interrupts and self._flying and not announced:
                     announced = True
                     workers.halt()
                     self._spectator.on_note("finishing what flies; Ctrl-C once more ends it")
         if self._options.profiles is None and not self._sharing:
             shutil.rmtree(self.profiles, ignore_errors=True)  # an interruption may have left some
-        self._spectator.on_end(self._progress())
+        self._spectator.on_end(self._progress(0))
         if interrupts:
             raise Interrupted("interrupted; run again to continue")
         if self._given_up:
@@ -425,13 +428,14 @@ class _Run:
             if not missions:
                 return
             attempts: list[Attempt] = []
+            alone = self._alone.pop(missions[0].number, "")
             for mission in missions:
                 number, _, config = mission
                 config.require_firmware(*self._options.firmware)
                 self._attempts[number] += 1
                 self._flying[number] = mission
                 attempts.append((number, changes_of(config), self._made(number)))
-            workers.start(attempts, self._options.limit_s)
+            workers.start(attempts, self._options.limit_s, alone)
 
     def _next(self) -> list[MissingMission]:
         """Return the missions of the next flight: one, or several that share it."""
@@ -439,7 +443,16 @@ class _Run:
             return [self._again.pop()]
         if (mission := self._queue.next()) is None:
             return []
-        return [mission, *self._queue.mates(mission, SHARING - 1)]
+        left = self._total - self._over - len(self._flying)
+        most = min(SHARING, math.ceil(left / self._jobs))  # the last flights end together
+        return [mission, *self._queue.mates(mission, most - 1)]
+
+    def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
+        """Note which of the ended missions have to be flown alone, and why."""
+        reasons = {ended.number: ended.unforked for ended in over if ended.unforked}
+        self._alone |= reasons
+        for reason, count in Counter(reasons.values()).items():
+            self._spectator.on_note(f"missions to be flown alone: {count}; {reason}")
 
     def _made(self, number: int) -> Path:
         out = self._out(number)
@@ -456,7 +469,7 @@ class _Run:
         mission = self._flying.pop(number)
         self._inside_s += ended.wall_s
         out = self._out(number)
-        if not ended.forked:
+        if ended.unforked:
             shutil.rmtree(out, ignore_errors=True)
             self._attempts[number] -= 1
             self._again.append(mission)
@@ -517,12 +530,12 @@ class _Run:
         if self._errors >= _GIVE_UP and not any(self._outcomes.values()):
             raise CampaignStopped(f"no mission could begin; the last failed with: {verdict.reason}")
 
-    def _progress(self) -> Progress:
+    def _progress(self, flights: int) -> Progress:
         return Progress(
             total=self._total,
             before=self._before,
             over=self._over,
-            running=len(self._flying),
+            running=flights,
             again=self._repeated,
             elapsed_s=time.monotonic() - self._begun,
             inside_s=self._inside_s,
@@ -535,6 +548,7 @@ def _put_away(run: Path, runs: Path, number: int) -> Path:
     """Move a run folder to the kept runs; return its new path."""
     stem = run.name.rpartition("-")[0] if (run / RESULT).is_file() else "cut-off"
     place = own_folder(runs) / f"{number:06d}-{stem}"
+    sync_folder(run)
     with writing(place):
         for old in runs.glob(f"{number:06d}-*"):  # of an attempt whose row was never written
             shutil.rmtree(old)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ from mavfi_cli.core.fork_server import Forks
 
 def prepare() -> None:
     """Import and load everything that a mission needs, before workers are forked."""
-    import pyarrow.parquet  # noqa: F401  # only imported: its threads start at the first use
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
     import mavfi_cli.mission.run
     from mavfi_cli.autonomy import warm
@@ -21,14 +23,16 @@ def prepare() -> None:
     assert mavfi_cli.mission.run
     warm.warm_up()
     VehicleInProcess.warm_up()
+    table = pa.table({"": [0.0]})  # pyarrow imports pandas, if there is one, at its first array
+    pq.write_table(table, io.BytesIO(), compression="zstd")
 
 
 def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> Path:
     """Fly a mission, or several that share a flight; return the run folder in its own folder.
 
     Args:
-        task: a mission's `missions.changes_of`. With `forks`: "limit_s", and "missions" as triples
-            of number, changes and folder.
+        task: "missions" as triples of number, `missions.changes_of` and folder; "limit_s" of each;
+            "alone", the reason why a mission does not share a flight, or "".
         out: folder of the mission, or of the shared flight, which keeps nothing.
 
     Raises:
@@ -36,24 +40,26 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         MavfiError: the mission could not begin, or its record could not be written.
     """
     from mavfi_cli.core.config import structure
+    from mavfi_cli.core.files import leave_unsynced
     from mavfi_cli.mission.instruction import CACHE
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
     from mavfi_cli.mission.shared_flight import SharedFlight
     from mavfi_cli.spec.mission import MissionConfig
 
-    if forks is None:
-        config = structure(task, MissionConfig)
-        profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
-        return fly_mission(config, out, Watcher(), profiles=profiles).path
+    leave_unsynced(out.parent)  # the runner removes the folder, or syncs what it keeps
     branches = {
         number: (structure(changes, MissionConfig), Path(folder))
         for number, changes, folder in task["missions"]
     }
+    config, _ = next(iter(branches.values()))
+    if forks is None:
+        profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
+        host = {"alone": task["alone"]} if task["alone"] else {}
+        return fly_mission(config, out, Watcher(), profiles=profiles, host=host).path
 
     def fork(number: int) -> bool:
         return forks.fork(number, branches[number][1], task["limit_s"])
 
-    first, _ = next(iter(branches.values()))
     shared = SharedFlight(branches, fork)
-    return fly_mission(replace(first, fault=None), out, Watcher(), shared=shared).path
+    return fly_mission(replace(config, fault=None), out, Watcher(), shared=shared).path

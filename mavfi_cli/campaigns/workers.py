@@ -71,7 +71,7 @@ class AttemptEnd:
         timeout: true if the mission exceeded its wall time.
         report: the mission's last message: folder, or error and text, or traceback.
         lost: reason why its end is unknown.
-        forked: false if a shared flight ended before this mission was forked from it.
+        unforked: reason why it was not forked from its shared flight; empty if it was.
         wall_s: wall time of the whole attempt, the guard's work included, s.
     """
 
@@ -81,7 +81,7 @@ class AttemptEnd:
     timeout: bool = False
     report: Mapping[str, str] | None = None
     lost: str = "its guard was killed"
-    forked: bool = True
+    unforked: str = ""
     wall_s: float = 0.0
 
     def judge(self, out: Path, config: MissionConfig, limit_s: float) -> AttemptResult:
@@ -142,26 +142,27 @@ class LocalWorkers:
         return self._jobs - len(self._flying)
 
     @property
-    def busy(self) -> bool:
-        """True if a flight has not ended, even if all its missions have."""
-        return bool(self._flying)
+    def flights(self) -> int:
+        """Number of flights that have not ended, even if all their missions have."""
+        return len(self._flying)
 
-    def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
+    def start(self, attempts: Sequence[Attempt], limit_s: float, alone: str = "") -> None:
         """Start the flight of a mission, or of several that share it.
 
         Args:
             limit_s: limit of the wall time of each mission, s.
+            alone: reason why a mission does not share a flight, for its record.
 
         Raises:
             MavfiError: the processes cannot be started.
         """
-        _, changes, out = attempts[0]
+        missions = [(number, changes, str(out)) for number, changes, out in attempts]
+        task = {"missions": missions, "limit_s": limit_s, "alone": alone}
+        folder = attempts[0][2]
         if len(attempts) == 1:
-            channel = self._server.start(changes, out, limit_s)
+            channel = self._server.start(task, folder, limit_s)
         else:
-            folder = out.with_name(f"{out.name}-shared")
-            missions = [(number, changes, str(own)) for number, changes, own in attempts]
-            task = {"missions": missions, "limit_s": limit_s}
+            folder = folder.with_name(f"{folder.name}-shared")
             all_s = limit_s * (len(attempts) + 1)
             channel = self._server.start(task, folder, all_s, forks=True)
             self._shared[channel] = folder
@@ -187,7 +188,8 @@ class LocalWorkers:
                 ended.append(AttemptEnd(number=number, **message))
             elif "pid" not in message:  # not the begin of the worker
                 if channel in self._shared:
-                    ended += [AttemptEnd(number=number, forked=False) for number in flying]
+                    reason = _end_of_flight(message)
+                    ended += [AttemptEnd(number=number, unforked=reason) for number in flying]
                 else:
                     ended.append(AttemptEnd(number=flying[0], **message))
                 self._release(channel)
@@ -211,6 +213,17 @@ class LocalWorkers:
             self._release(channel)
         self._server.close()
         self._selector.close()
+
+
+def _end_of_flight(message: Mapping[str, Any]) -> str:
+    """Describe how a shared flight ended before it had forked all its missions."""
+    report = message.get("report") or {}
+    if "signal" in message:
+        return f"their flight was killed by {signal.Signals(message['signal']).name}"
+    if "timeout" in message:
+        return "their flight did not end in time"
+    text = report.get("text") or report.get("traceback", "").rstrip().rpartition("\n")[2]
+    return f"their flight failed: {text}" if text else "their flight ended early"
 
 
 def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
@@ -337,16 +350,16 @@ class Cluster:
         return _BACKLOG * self._threads - len(self._futures)
 
     @property
-    def busy(self) -> bool:
-        """True if a flight has not ended."""
-        return bool(self._futures)
+    def flights(self) -> int:
+        """Number of flights that have not ended."""
+        return len(self._futures)
 
-    def start(self, attempts: Sequence[Attempt], limit_s: float) -> None:
+    def start(self, attempts: Sequence[Attempt], limit_s: float, alone: str = "") -> None:
         """Send a flight to the cluster. The arguments are those of `LocalWorkers.start`."""
         self._submitted += 1
         missions = [(number, changes) for number, changes, _ in attempts]
         future = self._client.submit(
-            _fly, missions, limit_s, self._keep.value, self._task, self._versions,
+            _fly, missions, limit_s, alone, self._keep.value, self._task, self._versions,
             key=f"mission-{self._token}-{self._submitted}", pure=False, retries=0,
         )  # fmt: skip
         outs = {number: out for number, _, out in attempts}
@@ -444,6 +457,7 @@ def _worker_versions() -> dict[str, str]:
 def _fly(
     missions: Sequence[tuple[int, Changes]],
     limit_s: float,
+    alone: str,
     keep: str,
     task: str,
     versions: Mapping[str, str],
@@ -471,7 +485,7 @@ def _fly(
         (out / ".profiles").symlink_to(_scratch().path / "profiles")
     try:
         workers = _workers(task)
-        workers.start(attempts, limit_s)
+        workers.start(attempts, limit_s, alone)
         ended: list[AttemptEnd] = []
         while len(ended) < len(attempts):
             ended += workers.wait(60.0)

@@ -21,7 +21,8 @@ FD is a socket to the client. Every packet on it is an order in JSON, {"task", "
 "forks"}, with the descriptor of a channel. The guard sends {"pid"} on this channel at the start,
 and {"exit" | "signal" | "timeout", "report", "wall_s"} at the end. A worker whose order has "forks"
 may fork itself in the middle of its task (`Forks`). The worker waits
-for its fork as a guard does, and sends the same message with the fork's {"key"}.
+for its fork as a guard does, and sends the same message with the fork's {"key"}, or {"key",
+"unforked"} with the reason why it could not fork itself.
 """
 
 from __future__ import annotations
@@ -315,8 +316,8 @@ class Forks:
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
         """Fork the worker. Return True in the fork; in the worker, return False after its end.
 
-        The fork ends by returning from `perform`. There is none after HALT, or if the system has
-        no memory or no process left.
+        The fork ends by returning from `perform`. There is none after HALT, or, as the client is
+        told, if the system has no memory or no process left.
 
         Args:
             key: names the fork in the message about its end, which has the wall time since the
@@ -332,9 +333,10 @@ class Forks:
         reading, writing = os.pipe()
         try:
             child = fork(None)
-        except OSError:
+        except OSError as error:
             for descriptor in (reading, writing):
                 os.close(descriptor)
+            self._send({"key": key, "unforked": f"cannot fork: {error.strerror}"})
             return False
         if not child:
             os.dup2(writing, self._report)
@@ -347,8 +349,11 @@ class Forks:
         now_s = time.monotonic()
         end |= {"key": key, "wall_s": round(now_s - self._since_s, 6)}
         self._since_s = now_s
-        self._channel.send(json.dumps(end).encode())
+        self._send(end)
         return False
+
+    def _send(self, message: Json) -> None:
+        self._channel.send(json.dumps(message).encode())
 
 
 def _begin(folder: Path, parent: int) -> None:

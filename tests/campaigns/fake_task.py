@@ -18,7 +18,8 @@ def prepare():
     pass
 
 
-def perform(changes, out):
+def perform(task, out):
+    [(_, changes, _)] = task["missions"]
     world, _, value = changes.get("world", "fly").partition(":")
     seed = changes.get("seed", 3)
     run = out / f"{world}-{seed}-001"

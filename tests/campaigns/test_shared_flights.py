@@ -79,7 +79,7 @@ def test_a_forked_mission_is_that_flown_alone(missions, tmp_path):
         assert files == files_of(alone.path)[0], row.number
         assert row.injected is alone.injected
         forked += "forked_s" in host
-    assert forked == len(missions) - 1  # all but the one with another restart time
+    assert forked == len(missions) - 2  # one has another restart time; one is left for a job
 
 
 class _KillsWorker(Spectator):
@@ -107,6 +107,66 @@ def test_a_killed_shared_flight_costs_no_mission(missions, tmp_path, monkeypatch
     with run_campaign(missions[:8], tmp_path / "whole", Options(jobs=1, whole=True)) as ledger:
         assert rows == rows_of(ledger)
     none_left(partial(processes, mark))
+
+
+class _Notes(Spectator):
+    def __init__(self):
+        self.notes, self.most_flights = [], 0
+
+    def on_note(self, text):
+        self.notes.append(text)
+
+    def on_progress(self, progress):
+        self.most_flights = max(self.most_flights, progress.running)
+
+
+def flown_both_ways(configs, tmp_path, **options):
+    """Notes about the missions of one flight, and their results; they equal those flown alone."""
+    listed, watcher = [PlannedMission(config=config) for config in configs], _Notes()
+    with run_campaign(listed, tmp_path / "shared", Options(jobs=1, **options), watcher) as ledger:
+        rows, results = rows_of(ledger), [row.result for row in ledger.results()]
+    with run_campaign(listed, tmp_path / "whole", Options(jobs=1, whole=True)) as ledger:
+        assert rows == rows_of(ledger)
+    assert watcher.most_flights == 1
+    return watcher.notes, results
+
+
+@pytest.mark.slow
+def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(
+    short_config, tmp_path, monkeypatch
+):
+    paths = [os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+    monkeypatch.setattr("mavfi_cli.campaigns.run.TASK", "unforkable_task")
+    configs = [replace(short_config, fault=fault) for fault in (None, *FAULTS[:2])]
+    notes, results = flown_both_ways(configs, tmp_path, task="unforkable_task")
+    reason = "cannot fork: Resource temporarily unavailable"
+    assert notes == [f"missions to be flown alone: 1; {reason}"]
+    said = [result["host"].get("alone") for result in results]
+    forked = ["forked_s" in result["host"] for result in results]
+    assert said == [None, None, reason] or said == [None, reason, None]
+    assert forked == [text is None for text in said]
+
+
+@pytest.mark.slow
+def test_a_golden_flight_that_ends_before_the_fault(short_config, tmp_path):
+    """The missions of a flight that runs out of time, or hits something, before their faults."""
+    fault = FaultConfig(target="command_vx", at="invocation=400")  # at 50 per second
+    late = replace(short_config, time_limit_s=2.0)
+    notes, results = flown_both_ways([late, replace(late, fault=fault)], tmp_path)
+    assert notes == []
+    assert [result["outcome"] for result in results] == ["timeout", "timeout"]
+    assert all("forked_s" in result["host"] for result in results)
+    assert results[1]["fault"]["state"] == "not_injected"
+
+
+@pytest.mark.slow
+def test_a_golden_flight_that_cannot_begin(short_config, tmp_path):
+    """Each of its missions is tried alone and reports why."""
+    blocked = replace(short_config, goal=(1e4, 0.0, 2.5))
+    notes, results = flown_both_ways([blocked, replace(blocked, fault=FAULTS[0])], tmp_path)
+    assert notes[0].startswith("missions to be flown alone: 2; their flight failed: ")
+    assert results == [{}, {}]
 
 
 def test_missions_that_may_begin_now_share_a_flight():
