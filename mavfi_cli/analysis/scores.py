@@ -24,7 +24,10 @@ from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.offline import Columns, FlightSamples, PlanStrike, columns_of, replay
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.fi import bits
+from mavfi_cli.mission.measures import Record
 from mavfi_cli.mission.run_folder import RESULT, Run, load_run
+from mavfi_cli.mission.setpoints import samples_of_tlog
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
@@ -156,6 +159,10 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
         config = run.record.config
         world = config["world"]
         name = run.folder.path.name if (world, config["seed"]) in flights else world
+        if config.get("companion"):
+            seed = config["seed"]
+            flights[name, seed] = samples_of_tlog(run.folder.tlog, name, seed)
+            continue
         assert run.trace is not None
         columns, plans = columns_of(run.trace), run.folder.read_plans()
         flights[name, config["seed"]] = FlightSamples.of_trace(
@@ -173,5 +180,12 @@ def _is_error_free(run: Run, stack: StackMark) -> bool:
         record.outcome == Outcome.SUCCESS.value
         and faults == (None, None)
         and not (record.detection or {}).get("alarm_count")
-        and load_stack(record.config["stack"]).mark.digest == stack.digest
+        and _mark_of(record.config).digest == stack.digest
+    )
+
+
+def _mark_of(config: Record) -> StackMark:
+    companion = config.get("companion")
+    return (
+        load_stack(config["stack"]).mark if not companion else CompanionConfig.load(companion).mark
     )

@@ -38,8 +38,10 @@ from mavfi_cli.core.errors import (
     VehicleProcessError,
 )
 from mavfi_cli.core.files import reading, write_text
+from mavfi_cli.mission.companion_faults import check_companion_fault
 from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
@@ -352,14 +354,19 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
             for another stack; a fault is invalid; or the start is blocked.
     """
     CompanionParts.of(config)
-    if config.fault is not None:
+    users = None if config.companion is None else CompanionConfig.load(config.companion)
+    if config.fault is not None and users is not None:
+        check_companion_fault(config.fault, users.program)
+    elif config.fault is not None:
         config.fault.check()
     if config.instruction is not None:
         from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
 
         mission_strategy(config.instruction)
         config.instruction.node()
-    if config.detector is not None:
+    if config.detector is not None and users is not None:
+        config.detector.build_for_companion(users.mark)
+    elif config.detector is not None:
         config.detector.build(config.stack)
     elif config.fault is not None and config.fault.attacks_detector:
         raise FaultSpecError("a fault in the detector requires a detector")

@@ -270,6 +270,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
 
 
 def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
+    from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.mission import OF_THE_WORLD, OWN_AUTOPILOT
 
     fault, instruction = _faults(base, given)
@@ -293,7 +294,9 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
     if not (instruction or mission.isolate or (fault is not None and fault.killed_node)):
         refuse_given({"node_restart_s"}, _DYING)
     mission.loaded_stack()
-    if mission.detector is not None:
+    if mission.detector is not None and mission.companion is not None:
+        mission.detector.build_for_companion(CompanionConfig.load(mission.companion).mark)
+    elif mission.detector is not None:
         mission.detector.build(mission.stack)
     elif fault is not None and fault.attacks_detector:
         raise click.UsageError(f"--inject {fault.target} needs --detector NAME")

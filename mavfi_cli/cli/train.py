@@ -9,10 +9,11 @@ from typing import Any
 import click
 
 from mavfi_cli.cli import types
-from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, refuse_given
+from mavfi_cli.cli.grouped import GroupedCommand, given_fields, given_options, option, refuse_given
 from mavfi_cli.core.terminal import echo
 
-_FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
+_FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs", "speed"}
+_LOG = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command(cls=GroupedCommand)
@@ -32,6 +33,14 @@ _FLYING = {"worlds", "flights", "first_seed", "autopilot", "firmware", "jobs"}
 @option("--flown", type=click.Path(path_type=Path, exists=True, file_okay=False),
         help="Do not fly; fit to the error-free flights among the run folders in this folder. Any "
              "autopilot may have flown them.")  # fmt: skip
+@option("--companion", metavar="FILE|CMD",
+        help="Fly your own companion, and fit models for the gate before it.")  # fmt: skip
+@option("--speed", type=types.ABOVE_ZERO, default=1.0,
+        help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
+@option("--from", "log", type=_LOG,
+        help="Do not fly; fit to this .tlog of a fault-free flight of your own companion and to "
+             "those that follow it.")  # fmt: skip
+@click.argument("more", nargs=-1, type=_LOG)
 @option("--kind", "kinds", multiple=True, type=types.DETECTOR,
         help="Detector to fit: gad, aad, range, l2. May be repeated  [all].")  # fmt: skip
 @option("--n-sigma", type=types.ABOVE_ZERO, help="Threshold of the Gaussian model  [its default].")
@@ -57,10 +66,21 @@ def train(out: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     flown, stack = options["flown"], options["stack"]
     if options["autopilot"] == OWN_AUTOPILOT:
         refuse_given({"firmware"}, "needs --autopilot px4 or ardupilot")
+    logs = tuple(filter(None, (options["log"], *options["more"])))
     if flown is not None:
         refuse_given(_FLYING, "has no effect with --flown")
+    if logs:
+        refuse_given(_FLYING | {"flown"}, "has no effect with --from")
+        if options["log"] is None:
+            raise click.UsageError(f"got {logs[0]}, which needs --from before it")
+    if options["companion"] and flown is None and "worlds" not in given_options():
+        raise click.UsageError("--companion needs --world")
+    if not options["companion"]:
+        refuse_given({"speed"}, "needs --companion")
+    if logs or options["companion"]:
+        stack = "a companion"
     base = MissionConfig(**given_fields(MissionConfig, seed=MissionConfig().seed))
-    plan = TrainingPlan(**given_fields(TrainingPlan, base=base))
+    plan = TrainingPlan(**given_fields(TrainingPlan, base=base, logs=logs))
     with missions_view(quiet=quiet) as view:
         dataset, models, left = run(plan, out, Options(**given_fields(Options)), view)
     if "aad" in models:

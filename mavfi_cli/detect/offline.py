@@ -16,7 +16,7 @@ does the same if it gets the published plans and the changes that a fault made t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -303,6 +303,30 @@ class FlightSamples:
     new_waypoint: NDArray[np.bool_]  # (n,) True for a control tick with new planning states
     deltas: Codes  # (n, COUNT)
     extended: Codes  # (n, 3) extended states; those of a plan are in the row of its first step
+
+    @classmethod
+    def of_ticks(
+        cls, ticks: Iterable[tuple[float, Trajectory | None, Command]], world: str, seed: int
+    ) -> FlightSamples:
+        """Extract the samples of a flight from its control ticks: stamp, waypoint, command.
+
+        A waypoint is a trajectory of one row, the same object until it changes.
+        """
+        gate, rows = Gate(_Probe(None)), []
+        for stamp_s, trajectory, command in ticks:
+            gate.judge_tick(trajectory, 0, command)
+            rows.append((stamp_s, Stage.PLANNING in gate.fresh, gate.deltas))
+        none = np.zeros(len(rows), np.bool_)
+        return cls(
+            world=world,
+            seed=seed,
+            stamps_s=np.array([stamp_s for stamp_s, _, _ in rows]),
+            reports=none,
+            plan_steps=none,
+            new_waypoint=np.array([new for _, new, _ in rows], np.bool_),
+            deltas=np.array([deltas for _, _, deltas in rows], np.int16).reshape(-1, COUNT),
+            extended=np.zeros((len(rows), len(EXTENDED)), np.int16),
+        )
 
     @classmethod
     def of_trace(

@@ -42,6 +42,7 @@ class _AutopilotProfile:
     modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
     offboard_mode: str  # mode in which it follows our setpoints
     land_mode: str
+    hold_mode: str  # mode in which it holds its position without setpoints
     arming_modes: list[str]  # modes that allow arming; the session requests the first
     takeoff_amsl: bool  # NAV_TAKEOFF altitude is above sea level instead of above home
     unused: float  # value of an unused command parameter

@@ -31,18 +31,28 @@ def unix_time_of_stamp_0(path: Path) -> float:
 
     The time is EPOCH_UNIX_S without a state. Raises RecordError if the file cannot be read.
     """
+    for unix_s, message in tlog_messages(path):
+        if isinstance(message, dialect.MAVLink_local_position_ned_message):
+            return unix_s - int(message.time_boot_ms) / 1e3
+    return EPOCH_UNIX_S
+
+
+def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
+    """Yield the messages of a tlog with their Unix times, s, up to the first damaged record.
+
+    Raises:
+        RecordError: The file cannot be read.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise RecordError(f"{path}: cannot read: {error.strerror or error}") from None
     codec, start = Codec(0, 0), 0
     while (length := frame_length(data, start + 8, len(data))) > 0:
+        unix_s = int.from_bytes(data[start : start + 8], "big") / 1e6
         for message in codec.decode(data[start + 8 : start + 8 + length], datagram=True):
-            if isinstance(message, dialect.MAVLink_local_position_ned_message):
-                time_us, stamp_ms = data[start : start + 8], int(message.time_boot_ms)
-                return int.from_bytes(time_us, "big") / 1e6 - stamp_ms / 1e3
+            yield unix_s, message
         start += 8 + length
-    return EPOCH_UNIX_S
 
 
 class TlogWriter:

@@ -28,11 +28,13 @@ from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
 from mavfi_cli.link.router import Router, Side
 from mavfi_cli.link.telemetry import AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
-from mavfi_cli.link.transport import Transport
+from mavfi_cli.link.transport import Transport, signing_from_file
 from mavfi_cli.mission.companion_faults import CompanionInjection, Throttle
 from mavfi_cli.mission.programs import Programs, RunningProgram
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace
+from mavfi_cli.mission.setpoint_gate import SetpointGate
+from mavfi_cli.mission.setpoints import command_of
 from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig, SuccessConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -45,8 +47,6 @@ _PORT_LOOK_S = 0.1
 _MOST_EVENTS = 1000
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
-_NO_VELOCITY, _NO_YAW = 0x38, 0x400  # of a setpoint's type_mask
-_BODY_FRAMES = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_OFFSET_NED)
 
 
 class CompanionFlight:
@@ -83,6 +83,7 @@ class CompanionFlight:
         self.programs: dict[str, Any] = {}
         self._heard_s = time.monotonic()
         self._command: Command | None = None
+        self._gate = self._planned_gate()
         self._commanders: set[tuple[int, int]] = set()
         self._ticks = 0  # since the first arming
         self._faults = injection if isinstance(injection, CompanionInjection) else None
@@ -92,6 +93,24 @@ class CompanionFlight:
         self._verdict = _Verdict(companion.success, self._crew)
         self._time_limit_s = min(config.time_limit_s, companion.time_limit_s or math.inf)
         self._goal_enu_m: FloatArray | None = None
+
+    def _planned_gate(self) -> SetpointGate | None:
+        detector = self._config.detector
+        if detector is None:
+            return None
+
+        def note(text: str) -> None:
+            self.logger.note(self.stamp_s, "alarm", text, self.telemetry.state)
+
+        return SetpointGate(
+            detector, self._companion.gate, self._companion.mark, note=note,
+            signing=signing_from_file(self._companion.key_file), gone=lambda: self._crew.ended(),
+        )  # fmt: skip
+
+    @property
+    def detection(self) -> dict[str, Any] | None:
+        """Checks and alarms of the gate; None without one."""
+        return None if self._gate is None else self._gate.summary()
 
     def close(self) -> None:
         """Close the companion's link."""
@@ -165,14 +184,29 @@ class CompanionFlight:
         passed = [message] if link is None else link.pass_between(message, side, self._moment)
         return [frame for own in passed for frame in self._deliver(own, side)]
 
+    def _gated(self, message: Message, side: Side) -> Iterable[Message]:
+        """Return what the gate passes on."""
+        if self._gate is None:
+            return (message,)
+        passed = self._gate.pass_between(message, side, self.stamp_s)
+        if message not in passed and self._faults is not None and self._faults.link is not None:
+            self._faults.link.follower.withheld(message)
+        for frame in self._gate.outbox:
+            self._tlog.write(self.stamp_s, frame)
+            self._router.send(frame, Side.COMPANION)
+        self._gate.outbox.clear()
+        return passed
+
     def _deliver(self, message: Message, side: Side) -> Iterable[bytes]:
-        """Record a message that reaches its receiver, and return its frames."""
-        if side is Side.COMPANION:
-            self._watch(message)
-        frames = (frame_of(message),)
+        """Record what reaches the receiver in place of a message, and return its frames."""
+        passed = self._gated(message, side)
+        for own in passed:
+            if side is Side.COMPANION:
+                self._watch(own)
+            if self._faults is not None and self._faults.link is not None:
+                self._faults.link.deliver(own, side, self.stamp_s)
+        frames = [frame_of(own) for own in passed]
         self._tlog.write(self.stamp_s, *frames)
-        if self._faults is not None and self._faults.link is not None:
-            self._faults.link.deliver(message, side, self.stamp_s)
         return frames
 
     @property
@@ -252,7 +286,7 @@ class CompanionFlight:
                 text = f"another commander, {sender[0]}/{sender[1]}, sends setpoints"
                 self.logger.note(self.stamp_s, "program", text, self.telemetry.state)
         if self.telemetry.state is not None:
-            self._command = _command_of(message, self.telemetry.state) or self._command
+            self._command = command_of(message, self.telemetry.state)
 
     # The end --------------------------------------------------------------------------------------
 
@@ -294,25 +328,6 @@ class CompanionFlight:
         self.outcome, self.reason, self.end_s = outcome, reason, self.stamp_s
         text = outcome.value.replace("_", " ") + (f": {reason}" if reason else "")
         self.logger.note(self.stamp_s, "outcome", text, self.telemetry.state)
-
-
-def _command_of(setpoint: Message, state: VehicleState) -> Command | None:
-    """Return the velocity command of a setpoint, ENU; None for one without a velocity."""
-    if setpoint.type_mask & _NO_VELOCITY:
-        return None
-    forward, right, down = setpoint.vx, setpoint.vy, setpoint.vz
-    if setpoint.coordinate_frame in _BODY_FRAMES:
-        heading_rad = 0.5 * math.pi - state.yaw_rad
-        cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
-        forward, right = cosine * forward - sine * right, sine * forward + cosine * right
-    yaw_rad = state.yaw_rad
-    if not setpoint.type_mask & _NO_YAW and setpoint.coordinate_frame not in _BODY_FRAMES:
-        yaw_rad = math.remainder(0.5 * math.pi - setpoint.yaw, math.tau) if math.isfinite(
-            setpoint.yaw
-        ) else setpoint.yaw  # fmt: skip
-    return Command(
-        stamp_s=state.stamp_s, velocity_enu_mps=np.array([right, forward, -down]), yaw_rad=yaw_rad
-    )
 
 
 class _Crew:
@@ -426,6 +441,13 @@ class _Crew:
         for name, program in self.running.items():
             if program.codes and program.codes[-1] and self._is_over(name):
                 return f"{name} {_how(program.codes[-1])}"
+        return ""
+
+    def ended(self) -> str:
+        """Return which program has ended, or does not run at present; empty if all run."""
+        for name, program in self.running.items():
+            if program.codes and program.pid is None:
+                return f"the program {name} is gone"
         return ""
 
     def succeeded(self, name: str) -> bool:

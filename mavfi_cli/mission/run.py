@@ -158,6 +158,8 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     config = replace(config, goal_tolerance_m=near_m)
     result = _flown(config, flight, host, vehicle.truth, goal)
     result |= {"pilot": {}, "plans": [], "programs": flight.programs}
+    if flight.detection is not None:
+        result["detection"] = flight.detection
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))
     write_json(folder.result, result)

@@ -169,6 +169,9 @@ def _detection_lines(detection: Record, cost: DetectionCost | None) -> list[str]
             f"            at {alarm['stamp_s']:.2f} s: {alarm['stage']}, {where}: "
             f"{alarm['response']}"
         )
+    if "setpoint" in detection["checks"]:  # the gate before a user's companion
+        counts = (f"{count} {name}" for name, count in responses.items() if count)
+        return [*lines, *(f"            setpoints withheld: {text}" for text in counts)]
     if detection["alarm_count"]:
         recovered = [
             f"{stage} {entry['count']}x, {entry['total_s'] * 1e3:.1f} ms"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import shlex
@@ -13,8 +15,11 @@ from pathlib import Path
 
 from mavfi_cli.core.config import load_toml
 from mavfi_cli.core.errors import ConfigError, UnknownName
+from mavfi_cli.core.types import StackMark
+from mavfi_cli.spec.detector import COMPANION
 
 RESTARTS = ("never", "on-failure", "always")
+ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
 ANY_PORT = "udpin:127.0.0.1:0"
 _PLACEHOLDER = re.compile(r"\{([a-z]+)\}")
 _LONGEST_S = 3600.0
@@ -116,6 +121,36 @@ class SuccessConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GateConfig:
+    """What the gate between a companion and its autopilot does.
+
+    Attributes:
+        action: What takes the place of a setpoint with an alarm: `hold`, the last accepted
+            setpoint; `brake`, a standstill; `autopilot`, nothing, and the autopilot is switched to
+            its own hold.
+        patience: Number of consecutive alarms after which `hold` becomes `brake`.
+        stale_s: Time without a change after which the setpoints of a companion that is gone are
+            withheld, s.
+        on_error: Whether setpoints pass (`open`) or not (`closed`) after an error of the gate.
+        watch_only: Report alarms, and withhold nothing.
+    """
+
+    action: str = ACTIONS[0]
+    patience: int = 5
+    stale_s: float = 1.0
+    on_error: str = ON_ERROR[0]
+    watch_only: bool = False
+
+    def __post_init__(self) -> None:
+        if self.action not in ACTIONS:
+            raise UnknownName("action", self.action, ACTIONS)
+        if self.on_error not in ON_ERROR:
+            raise UnknownName("on_error", self.on_error, ON_ERROR)
+        _require_range("patience", self.patience, 0, 1000)
+        _require_range("stale_s", self.stale_s, 0.1, _LONGEST_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionConfig:
     """A companion: its programs by name, its link, and its success.
 
@@ -131,6 +166,8 @@ class CompanionConfig:
             straight way to the goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. A message
             that a fault changes is signed again with it.
+        gate: What the gate does with `--detector`.
+        name: Name in the models of its detectors.
     """
 
     program: dict[str, ProgramConfig]
@@ -139,6 +176,8 @@ class CompanionConfig:
     time_limit_s: float | None = None
     flight_s: float | None = None
     key_file: str | None = None
+    gate: GateConfig = field(default_factory=GateConfig)
+    name: str = "companion"
 
     def __post_init__(self) -> None:
         if not self.program:
@@ -154,6 +193,13 @@ class CompanionConfig:
             last = SuccessConfig(exit=list(self.program)[-1])
             object.__setattr__(self, "success", last)
 
+    @property
+    def mark(self) -> StackMark:
+        """Identity of the companion for the models of its detectors: its name and commands."""
+        commands = {name: program.command for name, program in self.program.items()}
+        digest = hashlib.sha256(json.dumps(commands).encode()).hexdigest()
+        return StackMark(name=f"{COMPANION}{self.name}", digest=digest)
+
     @classmethod
     def load(cls, given: str) -> CompanionConfig:
         """Load a companion from a TOML file, or make one of a command line.
@@ -165,6 +211,7 @@ class CompanionConfig:
         path = Path(given)
         if path.suffix == ".toml":
             loaded = load_toml(path, cls)
+            loaded = replace(loaded, name=path.stem)
             base = path.resolve().parent
         else:
             loaded, base = cls(program={"companion": ProgramConfig(command=given)}), Path.cwd()

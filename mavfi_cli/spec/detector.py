@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mavfi_cli.core.errors import ConfigError, ModelError, UnknownName
 from mavfi_cli.core.files import file_digest
-from mavfi_cli.core.types import Stage
+from mavfi_cli.core.types import StackMark, Stage
 from mavfi_cli.spec.stack import load_stack
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
 WATCHES = (PAPER, EXTENDED)
+COMPANION = "companion:"
+"""Prefix of the name under which a model records the user's companion that it was fitted to."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,6 +131,37 @@ class DetectorConfig:
                     path=path,
                 )
         self.extended_ranges(detector)
+        return detector
+
+    def build_for_companion(self, mark: StackMark | None) -> Detector:
+        """Create a new detector for the gate before a user's companion.
+
+        Args:
+            mark: The companion; None accepts a model of any companion.
+
+        Raises:
+            UnknownName: No detector has this name.
+            ModelError: The model cannot be used, is missing, or is for another companion without
+                `any_stack`.
+        """
+        from mavfi_cli.detect.base import FittedDetector, find_detector
+
+        path = None if self.model is None else Path(self.model)
+        detector = find_detector(self.name, model=path, threshold=self.threshold)
+        made_for = detector.stack if isinstance(detector, FittedDetector) else None
+        if made_for is None or self.any_stack:
+            return detector
+        fit = "fit one with mavfi train --companion"
+        if path is None:
+            raise ModelError(f"{self.name} needs --model, a model of the companion; {fit}")
+        if not made_for.name.startswith(COMPANION):
+            raise ModelError(f"made for the stack {made_for.name!r}; {fit}", path=path)
+        if mark is not None and mark.digest != made_for.digest:
+            raise ModelError(
+                f"made for {made_for.name!r}, not for {mark.name!r} as it is now; {fit}, or allow "
+                "it with --any-stack-model",
+                path=path,
+            )
         return detector
 
     def extended_ranges(self, detector: Detector) -> Ranges | None:

@@ -199,7 +199,7 @@ class MissionConfig:
             if self.fault is not None and self.fault.wire_target is not None:
                 raise ConfigError("a MAVLink message needs --companion", key="inject")
             return
-        for name in ("link", "realtime", "instruction", "detector", "isolate", "land"):
+        for name in ("link", "realtime", "instruction", "isolate", "land"):
             if getattr(self, name):
                 raise ConfigError("cannot be combined with --companion", key=name)
 

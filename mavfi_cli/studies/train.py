@@ -17,10 +17,15 @@ from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.types import StackMark
 from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.fit import KINDS, check, fit
 from mavfi_cli.detect.offline import Dataset
 from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.mission.setpoints import samples_of_tlog
+from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.detector import COMPANION
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 from mavfi_cli.spec.stack import load_stack
 
@@ -38,6 +43,7 @@ class TrainingPlan:
         seed: seed of the split and of the initial weights.
         n_sigma: threshold of the Gaussian model; None takes the default.
         flown: folder of run folders to fit to; None flies the missions.
+        logs: .tlog files of fault-free flights of a user's companion to fit to instead.
     """
 
     worlds: tuple[str, ...] = TRAINING_WORLDS
@@ -48,6 +54,7 @@ class TrainingPlan:
     kinds: tuple[str, ...] = KINDS
     base: MissionConfig = field(default_factory=MissionConfig)
     flown: Path | None = None
+    logs: tuple[Path, ...] = ()
 
     def missions(self) -> list[PlannedMission]:
         """The flights, world by world."""
@@ -80,8 +87,14 @@ def train(
         MavfiError: no mission can be flown in a world.
         RecordError: a file cannot be written.
     """
-    stack = load_stack(plan.base.stack).mark
-    if plan.flown is None:
+    stack = _mark_of(plan)
+    if plan.logs:
+        flights = [samples_of_tlog(path, path.name, place) for place, path in enumerate(plan.logs)]
+        if empty := [flight.world for flight in flights if not len(flight.deltas)]:
+            raise ModelError(f"{empty[0]}: contains no setpoint of a companion")
+        failed, autopilots = 0, {OWN_AUTOPILOT}
+        check(plan.kinds, len(flights), plan.n_sigma)
+    elif plan.flown is None:
         missions = plan.missions()
         check(plan.kinds, len(missions), plan.n_sigma)
         plan = replace(plan, base=plan.base.with_firmware())
@@ -107,3 +120,12 @@ def train(
     for model, path in models.values():  # all of them, or none
         model.save(path)
     return dataset, models, failed
+
+
+def _mark_of(plan: TrainingPlan) -> StackMark:
+    """Return the identity of the flown software: a stack, a user's companion, or unknown logs."""
+    if plan.base.companion is not None:
+        return CompanionConfig.load(plan.base.companion).mark
+    if plan.logs:
+        return StackMark(name=f"{COMPANION}logs", digest="")
+    return load_stack(plan.base.stack).mark

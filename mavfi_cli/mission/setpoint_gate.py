@@ -1,0 +1,238 @@
+"""The gate between any companion and its autopilot: withholds anomalous setpoints.
+
+It judges every setpoint together with the vehicle's state. A setpoint that raises an alarm does not
+reach the autopilot, and the one that does in its place becomes the reference of the next. Every
+other frame passes unchanged.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.core.errors import described
+from mavfi_cli.core.types import Command, StackMark, Stage
+from mavfi_cli.detect.gate import Alarm, Gate
+from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_of, renewed, text_messages
+from mavfi_cli.link.router import Side
+from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView
+from mavfi_cli.spec.companion import GateConfig
+from mavfi_cli.spec.detector import DetectorConfig
+
+_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # of the gate's own messages
+_SILENT_S = 3.0  # time without a heartbeat after which a companion that had one is gone
+_TEXT_EVERY_S = 1.0
+_MOST_ALARMS = 100
+_BRAKE = 0b1101_1100_0111  # type_mask of a setpoint with a velocity only
+
+
+@dataclass(slots=True)
+class _Counts:
+    """Withheld setpoints by what took their place."""
+
+    hold: int = 0  # the last accepted setpoint
+    brake: int = 0  # a standstill
+    autopilot: int = 0  # nothing: the autopilot was told to hold, or to notice the silence
+    stale: int = 0  # nothing: the companion is gone
+    alarms: list[dict[str, Any]] = field(default_factory=list)
+
+
+class SetpointGate:
+    """The gate of one link.
+
+    Args:
+        mark: Companion for which the model must be made; None for any.
+        note: Receives one line per event.
+        signing: Key of the link, to sign replaced setpoints and own messages.
+        gone: Returns why the companion's process is gone; empty while it runs.
+
+    Attributes:
+        outbox: Frames of the gate itself, for the autopilot and the companion. The owner sends and
+            removes them.
+
+    Raises:
+        ModelError: The model cannot be used.
+        UnknownName: No detector has this name.
+    """
+
+    def __init__(
+        self,
+        detector: DetectorConfig,
+        settings: GateConfig,
+        mark: StackMark | None,
+        *,
+        note: Callable[[str], None],
+        signing: Signing | None = None,
+        gone: Callable[[], str] = str,
+    ) -> None:
+        self._config, self._settings = detector, settings
+        stages = frozenset(Stage(name) for name in detector.protect)
+        self._gate = Gate(detector.build_for_companion(mark), stages)
+        self._view, self._note, self._signing, self._gone = SetpointView(), note, signing, gone
+        self._codec = Codec(1, _COMPONENT, signing=signing)
+        self._accepted: Message | None = None
+        self._in_a_row = self._checks = 0
+        self._counts = _Counts()
+        self._said_s = self._handed_s = self._heartbeat_s = -math.inf
+        self._same: tuple[Any, ...] = ()
+        self._same_since_s = -math.inf
+        self._failed = False
+        self.outbox: list[bytes] = []
+
+    def pass_between(self, message: Message, side: Side, now_s: float) -> list[Message]:
+        """Return the messages that go on in place of a message: usually itself."""
+        number = message.get_msgId()
+        if side is Side.COMPANION and number not in SETPOINTS:
+            if number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+                self._heartbeat_s = now_s
+            return [message]
+        try:
+            if side is Side.AUTOPILOT:
+                self._view.hear(message)
+                return [message]
+            return self._judge(message, now_s)
+        except Exception as error:  # the gate's boundary: it fails as configured
+            if not self._failed:
+                self._say(f"gate fails {self._settings.on_error}: {described(error)}", math.inf)
+            self._failed = True
+            passes = side is Side.AUTOPILOT or self._settings.on_error == "open"
+            return [message] if passes else []
+
+    def _judge(self, message: Message, now_s: float) -> list[Message]:
+        if why := self._staleness(message, now_s):
+            self._counts.stale += 1
+            self._say(f"{why}: its setpoints are withheld", now_s)
+            return [message] if self._settings.watch_only else []
+        self._checks += 1
+        alarm = self._gate.judge_tick(*self._view.sample(message))
+        if alarm is None:
+            if self._in_a_row:
+                self._say("setpoints pass again", now_s)
+            self._in_a_row, self._accepted = 0, message
+            return [message]
+        self._in_a_row += 1
+        if self._settings.watch_only:
+            self._gate.accept_tick()
+            self._record(alarm, now_s, "none")
+            return [message]
+        action = self._settings.action
+        late = self._in_a_row > self._settings.patience
+        if action == "hold" and (late or self._accepted is None):
+            action = "brake"
+        self._record(alarm, now_s, action)
+        if action == "hold":
+            self._counts.hold += 1
+            return self._again(message)
+        if action == "autopilot":
+            self._counts.autopilot += 1
+            self._hand_over(now_s)
+            return []
+        self._counts.brake += 1
+        return self._standstill(message)
+
+    def _staleness(self, message: Message, now_s: float) -> str:
+        """Return who is gone if a setpoint no longer changes; empty otherwise."""
+        content = tuple(
+            getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
+        )
+        content = (message.get_msgId(), *map(repr, content))  # NaN equals itself
+        if content != self._same:
+            self._same, self._same_since_s = content, now_s
+        if now_s - self._same_since_s < self._settings.stale_s:
+            return ""
+        if why := self._gone():
+            return why
+        silent = math.isfinite(self._heartbeat_s) and now_s - self._heartbeat_s > _SILENT_S
+        return "the companion's heartbeat is gone" if silent else ""
+
+    def _again(self, message: Message) -> list[Message]:
+        """Return the last accepted setpoint with the header and time of a message."""
+        assert self._accepted is not None
+        if self._accepted.get_msgId() != message.get_msgId():
+            return []
+        held = copy.copy(self._accepted)
+        held.time_boot_ms, held._msgbuf = message.time_boot_ms, frame_of(message)
+        valid = renewed(held, self._signing)
+        return [] if valid is None else [valid]
+
+    def _standstill(self, message: Message) -> list[Message]:
+        """Return a setpoint of no velocity. It becomes the reference of the next."""
+        state = self._view.telemetry.state
+        yaw_rad = 0.0 if state is None else state.yaw_rad
+        still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=yaw_rad)
+        trajectory, index, _ = self._view.sample(message)
+        if self._gate.judge_tick(trajectory, index, still) is not None:
+            self._gate.accept_tick()
+        setpoint = dialect.MAVLink_set_position_target_local_ned_message(
+            message.time_boot_ms, message.target_system, message.target_component,
+            dialect.MAV_FRAME_LOCAL_NED, _BRAKE, *[0.0] * 11,
+        )  # fmt: skip
+        codec = Codec(message.get_srcSystem(), message.get_srcComponent(), signing=self._signing)
+        return Codec(0, 0).decode(codec.encode(setpoint))
+
+    def _hand_over(self, now_s: float) -> None:
+        """Switch the autopilot to its own hold, at most once a second."""
+        telemetry = self._view.telemetry
+        if now_s - self._handed_s < _TEXT_EVERY_S or not telemetry.heard:
+            return
+        self._handed_s = now_s
+        enabled = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (telemetry.armed << 7)
+        mode = telemetry.autopilot.mode_parameters(telemetry.autopilot.hold_mode)
+        command = dialect.MAVLink_command_long_message(
+            telemetry.system, dialect.MAV_COMP_ID_AUTOPILOT1, dialect.MAV_CMD_DO_SET_MODE, 0,
+            enabled, *mode, 0, 0, 0, 0,
+        )  # fmt: skip
+        self.outbox.append(self._codec.encode(command))
+
+    def _record(self, alarm: Alarm, now_s: float, action: str) -> None:
+        states = [foreign_name(name) for name in alarm.states]
+        if len(self._counts.alarms) < _MOST_ALARMS:
+            self._counts.alarms.append(
+                {
+                    "stamp_s": round(now_s, 3),
+                    "stage": alarm.stage.value,
+                    "states": states,
+                    "score": alarm.score if math.isfinite(alarm.score) else None,
+                    "threshold": alarm.threshold,
+                    "response": action,
+                }
+            )
+        blamed = ", ".join(states[:2]) or "all inputs together"
+        doing = "reported" if action == "none" else "withheld"
+        self._say(f"setpoint {doing}: {blamed}: {alarm.detector} {alarm.score:.3g}", now_s)
+
+    def _say(self, text: str, now_s: float) -> None:
+        """Note an event, and send it as STATUSTEXT; both at most once a second."""
+        if now_s - self._said_s < _TEXT_EVERY_S:
+            return
+        self._said_s = now_s if math.isfinite(now_s) else self._said_s
+        self._note(text)
+        self._codec.system = self._view.telemetry.system or 1
+        data = f"mavfi gate: {text}".encode("ascii", "replace")
+        for message in text_messages(dialect.MAV_SEVERITY_WARNING, data, self._checks % 65535 + 1):
+            self.outbox.append(self._codec.encode(message))
+
+    def summary(self) -> dict[str, Any]:
+        """Return checks, alarms and withheld setpoints as plain values."""
+        counts = self._counts
+        withheld = {name: getattr(counts, name) for name in ("hold", "brake", "autopilot", "stale")}
+        return {
+            "detector": self._config.name,
+            "protect": list(self._config.protect),
+            "threshold": self._gate.detector.threshold,
+            "checks": {"setpoint": self._checks},
+            "alarm_count": sum(withheld.values()),
+            "responses": withheld,
+            "alarms": counts.alarms,
+            "recoveries": {},
+        }
+
+
+def foreign_name(name: str) -> str:
+    """Return the name of a detector's input in a foreign companion; see `setpoints`."""
+    return name.replace("waypoint_", "state_").replace("command_", "setpoint_")

@@ -1,0 +1,162 @@
+"""A companion's setpoints and the states they came from, as samples of a detector.
+
+A detector has 13 inputs (`detect.preprocess`). The 7 of the waypoint take the vehicle's state: its
+position, yaw and velocity. The 4 of the command take the setpoint: its yaw, and the displacement
+that it asks for within 1 s,
+
+    d = (p_target - p) + v_target * 1 s + a_target / 2 * (1 s)^2,
+
+each part only if the setpoint has it, ENU. A velocity setpoint is thus its own velocity. For
+SET_ATTITUDE_TARGET d is (roll, pitch, thrust). The 2 inputs of the collision check are not used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mavfi_cli.core.types import Command, Trajectory, VehicleState
+from mavfi_cli.detect.offline import FlightSamples
+from mavfi_cli.link.codec import Message, dialect
+from mavfi_cli.link.telemetry import Telemetry
+from mavfi_cli.link.tlog import EPOCH_UNIX_S, tlog_messages
+
+_LOCAL = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
+_GLOBAL = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT
+_ATTITUDE = dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET
+SETPOINTS = (_LOCAL, _GLOBAL, _ATTITUDE)
+"""Ids of the messages that a gate judges."""
+
+_BODY = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_OFFSET_NED)
+_OFFSET = (*_BODY, dialect.MAV_FRAME_LOCAL_OFFSET_NED)
+_RELATIVE = (
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT, dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+)  # fmt: skip
+_NO_YAW, _NO_YAW_RATE = 0x400, 0x800  # of a setpoint's type_mask
+_DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
+
+
+class SetpointView:
+    """The newest state of the autopilot, with which setpoints are read."""
+
+    def __init__(self) -> None:
+        self.telemetry = Telemetry()
+        self._global: Message | None = None
+        self._state: VehicleState | None = None
+        self._trajectory: Trajectory | None = None
+
+    def hear(self, message: Message) -> None:
+        """Handle a message of the autopilot."""
+        if not isinstance(message, dialect.MAVLink_unknown):
+            self.telemetry.handle(message)
+        if message.get_msgId() == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
+            self._global = message
+
+    def sample(self, setpoint: Message) -> tuple[Trajectory | None, int, Command]:
+        """Return the arguments of `Gate.judge_tick` for a setpoint."""
+        state = self.telemetry.state
+        if state is not None and state is not self._state:
+            x, y, z = state.position_enu_m.tolist()
+            row = [x, y, z, state.yaw_rad, *state.velocity_enu_mps.tolist(), 0.0, 0.0, 0.0]
+            self._trajectory = Trajectory(
+                stamp_s=state.stamp_s, waypoints=np.array([row]), durations_s=np.ones(1),
+                trajectory_seq=0, future_collision_seq=0,
+            )  # fmt: skip
+        self._state = state
+        return self._trajectory, 0, command_of(setpoint, state, self._global)
+
+
+def command_of(
+    setpoint: Message, state: VehicleState | None, global_position: Message | None = None
+) -> Command:
+    """Return what a setpoint asks for within 1 s, ENU; see the module.
+
+    Args:
+        state: Newest state of the vehicle.
+        global_position: Its newest GLOBAL_POSITION_INT, for setpoints with latitude and longitude.
+    """
+    yaw_rad = 0.0 if state is None else state.yaw_rad
+    stamp_s = 0.0 if state is None else state.stamp_s
+    if setpoint.get_msgId() == _ATTITUDE:
+        roll, pitch, yaw = _euler(setpoint.q)
+        asked = np.array([roll, pitch, setpoint.thrust])
+        return Command(stamp_s=stamp_s, velocity_enu_mps=asked, yaw_rad=yaw)
+    mask, body = setpoint.type_mask, setpoint.coordinate_frame in _BODY
+    move = [0.0, 0.0, 0.0]  # north, east, down; of a body frame: forward, right, down
+    targets = _position_errors(setpoint, state, global_position)
+    velocity, pull = (
+        (setpoint.vx, setpoint.vy, setpoint.vz),
+        (setpoint.afx, setpoint.afy, setpoint.afz),
+    )
+    for axis in range(3):
+        for first, part in ((1, targets[axis]), (8, velocity[axis]), (64, 0.5 * pull[axis])):
+            if not mask & first << axis:
+                move[axis] += part
+    forward, right, down = move
+    if body:
+        heading_rad = 0.5 * math.pi - yaw_rad
+        cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+        forward, right = cosine * forward - sine * right, sine * forward + cosine * right
+    if not mask & _NO_YAW:
+        asked_rad = yaw_rad - setpoint.yaw if body else 0.5 * math.pi - setpoint.yaw
+        yaw_rad = math.remainder(asked_rad, math.tau) if math.isfinite(asked_rad) else asked_rad
+    elif not mask & _NO_YAW_RATE:
+        yaw_rad -= setpoint.yaw_rate
+    return Command(
+        stamp_s=stamp_s, velocity_enu_mps=np.array([right, forward, -down]), yaw_rad=yaw_rad
+    )
+
+
+def _position_errors(
+    setpoint: Message, state: VehicleState | None, here: Message | None
+) -> tuple[float, float, float]:
+    """Return the way from the vehicle to the target in the setpoint's frame, m."""
+    if setpoint.get_msgId() == _GLOBAL:
+        if here is None:
+            return 0.0, 0.0, 0.0
+        frame = setpoint.coordinate_frame
+        up_m = (here.relative_alt if frame in _RELATIVE else here.alt) / 1e3
+        north_m = (setpoint.lat_int - here.lat) * _DEGREE_M
+        east_m = (setpoint.lon_int - here.lon) * _DEGREE_M * math.cos(math.radians(1e-7 * here.lat))
+        return north_m, east_m, up_m - setpoint.alt
+    if setpoint.coordinate_frame in _OFFSET or state is None:
+        return setpoint.x, setpoint.y, setpoint.z
+    east_m, north_m, up_m = state.position_enu_m.tolist()
+    return setpoint.x - north_m, setpoint.y - east_m, setpoint.z + up_m
+
+
+def _euler(q: list[float]) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a quaternion (w, x, y, z), rad; NaN unless it is finite."""
+    if not all(map(math.isfinite, q)):
+        return math.nan, math.nan, math.nan
+    w, x, y, z = (value / (math.hypot(*q) or 1.0) for value in q)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+def samples_of_tlog(path: Path, world: str, seed: int) -> FlightSamples:
+    """Return the samples of the setpoints in the .tlog of a fault-free flight.
+
+    Args:
+        world, seed: Identity of the flight in its data set.
+
+    Raises:
+        RecordError: The file cannot be read.
+    """
+    return FlightSamples.of_ticks(_ticks(path), world, seed)
+
+
+def _ticks(path: Path) -> Iterator[tuple[float, Trajectory | None, Command]]:
+    view = SetpointView()
+    for unix_s, message in tlog_messages(path):
+        if message.get_msgId() in SETPOINTS:
+            trajectory, _, command = view.sample(message)
+            yield unix_s - EPOCH_UNIX_S, trajectory, command
+        else:
+            view.hear(message)
