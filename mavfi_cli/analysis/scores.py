@@ -185,7 +185,6 @@ def _is_error_free(run: Run, stack: StackMark) -> bool:
 
 
 def _mark_of(config: Record) -> StackMark:
-    companion = config.get("companion")
-    return (
-        load_stack(config["stack"]).mark if not companion else CompanionConfig.load(companion).mark
-    )
+    if companion := config.get("companion"):
+        return CompanionConfig.load(companion).mark
+    return load_stack(config["stack"]).mark

@@ -27,6 +27,7 @@ _COMMANDS = {
     "replay": ("mavfi_cli.cli.runs", "Repeat a run and compare the records."),
     "kernels": ("mavfi_cli.cli.kernels", "Flip bits in isolated kernels, one fault per run."),
     "train": ("mavfi_cli.cli.train", "Fly error-free missions and fit the detectors."),
+    "gate": ("mavfi_cli.cli.gate", "Guard the link between a companion and an autopilot."),
     "detect": ("mavfi_cli.cli.detect", "List the detectors and evaluate them."),
     "campaign": ("mavfi_cli.cli.campaign", "Plan, run and summarise thousands of missions."),
     "reproduce": ("mavfi_cli.cli.paper", "Fly every experiment of the paper."),

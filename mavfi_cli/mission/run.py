@@ -44,6 +44,7 @@ from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.progress import Recorder, Watcher
 from mavfi_cli.mission.run_folder import Run, RunFolder, load_run
+from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.shared_flight import SharedFlight
 from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.companion import CompanionConfig
@@ -131,6 +132,8 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     """Fly a user's companion. Raises as `fly_mission`."""
     assert config.companion is not None
     programs = CompanionConfig.load(config.companion)
+    if config.detector is not None:
+        SetpointGate.warm_up(config.detector, programs.mark)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     injection: NoInjection = NoInjection()
     if config.fault is not None:
@@ -157,9 +160,8 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     near_m = programs.success.goal_m or config.loaded_stack().goal_tolerance_m
     config = replace(config, goal_tolerance_m=near_m)
     result = _flown(config, flight, host, vehicle.truth, goal)
-    result |= {"pilot": {}, "plans": [], "programs": flight.programs}
-    if flight.detection is not None:
-        result["detection"] = flight.detection
+    guarded = {} if flight.detection is None else {"detection": flight.detection}
+    result |= {"pilot": {}, "plans": [], "programs": flight.programs, **guarded}
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))
     write_json(folder.result, result)

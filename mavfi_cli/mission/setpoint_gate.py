@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.core.errors import described
-from mavfi_cli.core.types import Command, StackMark, Stage
+from mavfi_cli.core.types import Command, StackMark, Stage, Trajectory
 from mavfi_cli.detect.gate import Alarm, Gate
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_of, renewed, text_messages
 from mavfi_cli.link.router import Side
@@ -83,6 +83,18 @@ class SetpointGate:
         self._same_since_s = -math.inf
         self._failed = False
         self.outbox: list[bytes] = []
+
+    @staticmethod
+    def warm_up(detector: DetectorConfig, mark: StackMark | None) -> None:
+        """Load and compile what a gate runs, before it must be fast. Raises as the constructor."""
+        gate = Gate(detector.build_for_companion(mark))
+        still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
+        plan = Trajectory(
+            stamp_s=0.0, waypoints=np.zeros((1, 10)), durations_s=np.ones(1), trajectory_seq=0,
+            future_collision_seq=0,
+        )  # fmt: skip
+        for trajectory in (None, plan):
+            gate.judge_tick(trajectory, 0, still)
 
     def pass_between(self, message: Message, side: Side, now_s: float) -> list[Message]:
         """Return the messages that go on in place of a message: usually itself."""

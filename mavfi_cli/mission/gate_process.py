@@ -1,0 +1,199 @@
+"""`mavfi gate`: the gate as a process between a companion and an autopilot.
+
+A supervisor opens both links and forks a worker, which routes and judges. When the worker dies, or
+shows no sign of life for 1 s, the supervisor forks another one on the same links, which judges
+nothing: it passes everything (fails open), or everything but setpoints (fails closed).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.files import open_own
+from mavfi_cli.core.processes import fork, interruptible
+from mavfi_cli.core.terminal import exit_code, note
+from mavfi_cli.core.types import StackMark
+from mavfi_cli.link.codec import Codec, Message, dialect, frame_of, text_messages
+from mavfi_cli.link.router import Router, Side
+from mavfi_cli.link.transport import signing_from_file
+from mavfi_cli.mission.setpoint_gate import SetpointGate
+from mavfi_cli.mission.setpoints import SETPOINTS
+from mavfi_cli.spec.companion import GateConfig
+from mavfi_cli.spec.detector import DetectorConfig
+
+_TURN_S = 0.1
+_HANG_S = 1.0  # silence of the worker after which it is killed
+_LOOK_S = 0.5  # between two looks at the companion's process
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateProcess:
+    """The settings of `mavfi gate`.
+
+    Attributes:
+        autopilot, companion: URLs of the two links.
+        mark: Companion for which the model must be made; None for any.
+        process: Process id of the companion, or a file with it; None watches no process.
+        log: File to which one line of JSON per event is appended; None for none.
+        key_file: File with the signing passphrase of both links.
+        allow_unsigned: Allow an unsigned link to reach beyond this machine.
+    """
+
+    autopilot: str
+    companion: str
+    detector: DetectorConfig
+    settings: GateConfig = field(default_factory=GateConfig)
+    mark: StackMark | None = None
+    process: str | None = None
+    log: Path | None = None
+    key_file: Path | None = None
+    allow_unsigned: bool = False
+
+    def run(self) -> int:
+        """Run until interrupted. Return the exit code.
+
+        Raises:
+            MavfiError: A link cannot be opened, or the model cannot be used.
+        """
+        SetpointGate.warm_up(self.detector, self.mark)
+        log = None
+        if self.log is not None:
+            log = open_own(self.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        passing = _Passing()
+        router = Router(
+            self.autopilot, self.companion, passes=passing, allow_unsigned=self.allow_unsigned,
+            signing=signing_from_file(self.key_file),
+        )  # fmt: skip
+        worker = _Worker(self, router, passing, log)
+        note(f"the gate is ready: {self.detector.name}, companion on port {router.port}")
+        judges = True
+        with interruptible() as interrupts:
+            while True:
+                code = _supervise(worker, interrupts, judges=judges)
+                if code is not None:
+                    return code
+                if judges:
+                    worker.tell(f"the gate has failed {self.settings.on_error}")
+                judges = False
+
+
+class _Passing:
+    """The rule by which the router passes frames on. It may be replaced while the router runs."""
+
+    def __init__(self) -> None:
+        self.rule: Callable[[Message, Side], Iterable[Message]] = lambda message, _: (message,)
+
+    def __call__(self, message: Message, side: Side) -> list[bytes]:
+        return [frame_of(own) for own in self.rule(message, side)]
+
+
+class _Worker:
+    """The work of the forked process."""
+
+    def __init__(
+        self, process: GateProcess, router: Router, passing: _Passing, log: int | None
+    ) -> None:
+        self._process, self._router, self._passing, self._log = process, router, passing, log
+
+    def tell(self, text: str) -> None:
+        """Print an event, and append it to the log."""
+        note(text)
+        if self._log is not None:
+            line = {"unix_s": round(time.time(), 3), "event": text}
+            os.write(self._log, json.dumps(line).encode() + b"\n")
+
+    def work(self, alive: int, *, judges: bool) -> int:
+        """Route until the supervisor ends this process; write to `alive` in every turn."""
+        return exit_code(lambda: self._route(alive, judges=judges))
+
+    def _route(self, alive: int, *, judges: bool) -> None:
+        process, gate = self._process, None
+        if judges:
+            gate = SetpointGate(
+                process.detector, process.settings, process.mark, note=self.tell,
+                signing=signing_from_file(process.key_file), gone=_Watch(process.process).gone,
+            )  # fmt: skip
+            judge = gate
+            self._passing.rule = lambda message, side: judge.pass_between(
+                message, side, time.monotonic()
+            )
+        elif process.settings.on_error == "closed":
+            self._passing.rule = _closed
+        if not judges:
+            self._announce()
+        while True:
+            self._router.turn(_TURN_S, time.monotonic() + _TURN_S)
+            os.write(alive, b".")
+            if gate is not None and gate.outbox:
+                for frame in gate.outbox:
+                    self._router.send(frame, Side.COMPANION)
+                gate.outbox.clear()
+
+    def _announce(self) -> None:
+        text = f"mavfi gate: failed {self._process.settings.on_error}".encode()
+        codec = Codec(1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER4, signing=self._router.signing)
+        for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text, 1):
+            self._router.send(codec.encode(message), Side.COMPANION)
+
+
+def _closed(message: Message, side: Side) -> Sequence[Message]:
+    return () if side is Side.COMPANION and message.get_msgId() in SETPOINTS else (message,)
+
+
+def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
+    """Run a worker. Return its exit code, 0 after an interrupt; None if it died or hung."""
+    reading, writing = os.pipe()
+    child = fork(lambda: worker.work(writing, judges=judges))
+    os.close(writing)
+    try:
+        while True:
+            ready, _, _ = select.select([reading], [], [], _HANG_S)
+            if interrupts:
+                return 0
+            if not ready:
+                worker.tell("the gate hangs")
+                return None
+            if not os.read(reading, 1 << 16):
+                break
+    finally:
+        os.close(reading)
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    return os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
+
+
+class _Watch:
+    """Looks for the companion's process."""
+
+    def __init__(self, process: str | None) -> None:
+        self._process = process
+        self._next_s, self._gone = 0.0, ""
+
+    def gone(self) -> str:
+        """Return why the process is gone; empty while it runs, or without a process."""
+        if self._process is None or time.monotonic() < self._next_s:
+            return self._gone
+        self._next_s = time.monotonic() + _LOOK_S
+        try:
+            number = self._process if self._process.isdigit() else Path(self._process).read_text()
+            os.kill(int(number), 0)
+            self._gone = ""
+        except PermissionError:
+            self._gone = ""  # it runs as another user
+        except (OSError, ValueError, OverflowError):
+            self._gone = f"the companion's process ({self._process}) is gone"
+        return self._gone
+
+
+def require_process(process: str | None) -> None:
+    """Refuse a process that cannot be watched. Raises MavfiError."""
+    if why := _Watch(process).gone():
+        raise MavfiError(why)

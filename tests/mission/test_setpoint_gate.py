@@ -1,0 +1,279 @@
+"""The gate before a user's companion: what it reads, withholds and passes on."""
+
+import contextlib
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from live_processes import LONG_S
+
+from mavfi_cli.core.errors import ModelError
+from mavfi_cli.core.types import Command, StackMark, Trajectory
+from mavfi_cli.detect.fit import fit
+from mavfi_cli.detect.offline import Dataset, FlightSamples
+from mavfi_cli.detect.preprocess import PreprocessParams
+from mavfi_cli.link.codec import Codec, dialect, frame_of
+from mavfi_cli.link.router import Side
+from mavfi_cli.link.tlog import TlogWriter
+from mavfi_cli.mission.setpoint_gate import SetpointGate
+from mavfi_cli.mission.setpoints import SetpointView, command_of, samples_of_tlog
+from mavfi_cli.spec.companion import CompanionConfig, GateConfig
+from mavfi_cli.spec.detector import DetectorConfig
+
+MARK = StackMark(name="companion:hop", digest="1")
+VELOCITY = 0b1101_1100_0111
+
+
+def received(message, system=1, component=191):
+    frame = Codec(system, component).encode(message)
+    return Codec(0, 0, keeps_unknown=True).decode(frame)[0]
+
+
+def setpoint(vx=2.0, *, mask=VELOCITY, frame=1, stamp_ms=0, **fields):
+    values = dict.fromkeys(("x", "y", "z", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0.0)
+    values |= {"vx": vx, **fields}
+    order = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
+    return received(
+        dialect.MAVLink_set_position_target_local_ned_message(
+            stamp_ms, 1, 1, frame, mask, *(values[name] for name in order)
+        )
+    )
+
+
+def states(stamp_ms, north_m=0.0):
+    """A heartbeat, an attitude (facing north) and a position of the autopilot."""
+    heartbeat = dialect.MAVLink_heartbeat_message(2, 12, 129, 6 << 16, 4, 3)
+    attitude = dialect.MAVLink_attitude_message(stamp_ms, 0, 0, 0, 0, 0, 0)
+    place = dialect.MAVLink_local_position_ned_message(stamp_ms, north_m, 0, -5, 2, 0, 0)
+    return [received(message, component=1) for message in (heartbeat, attitude, place)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A range model of flights at 0 to 2 m/s."""
+
+    def flight(seed):
+        def ticks():
+            for number in range(40):
+                velocity = np.array([0.0, 0.0 if number < 5 else 2.0, 0.0])
+                row = [0.0, 0.1 * number, 5.0, 0.5 * math.pi, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0]
+                plan = Trajectory(
+                    stamp_s=number * 0.1, waypoints=np.array([row]), durations_s=np.ones(1),
+                    trajectory_seq=0, future_collision_seq=0,
+                )  # fmt: skip
+                yield (
+                    number * 0.1,
+                    plan,
+                    Command(stamp_s=0.0, velocity_enu_mps=velocity, yaw_rad=0.5 * math.pi),
+                )
+
+        return FlightSamples.of_ticks(ticks(), "farm", seed)
+
+    dataset = Dataset(
+        flights=tuple(map(flight, range(10))), preprocess=PreprocessParams(), stack=MARK
+    )
+    path = tmp_path_factory.mktemp("model") / "range.json"
+    fit("range", dataset).save(path)
+    return path
+
+
+@pytest.fixture
+def gate(model):
+    """A function that makes a gate; `said` are its notes."""
+
+    def made(gone=str, mark=MARK, **settings):
+        notes = []
+        detector = DetectorConfig(name="range", model=str(model))
+        made = SetpointGate(detector, GateConfig(**settings), mark, note=notes.append, gone=gone)
+        made.said = notes
+        for message in states(1000):
+            assert made.pass_between(message, Side.AUTOPILOT, 1.0) == [message]
+        assert made.pass_between(setpoint(), Side.COMPANION, 1.0)[0].vx == 2.0
+        return made
+
+    return made
+
+
+def velocities(gate, values):
+    """What passes in place of setpoints 0.1 s apart."""
+    return [
+        [own.vx for own in gate.pass_between(setpoint(vx), Side.COMPANION, 1.0 + 0.1 * n)]
+        for n, vx in enumerate(values, 1)
+    ]
+
+
+def test_a_wild_setpoint_is_held_back_then_braked_and_a_good_one_passes(gate):
+    own = gate(patience=2)
+    passed = velocities(own, [-1000.0, -1000.0, -1000.0, -1000.0, 2.0])
+    assert passed == [[2.0], [2.0], [0.0], [0.0], [2.0]]
+    summary = own.summary()
+    assert summary["responses"] == {"hold": 2, "brake": 2, "autopilot": 0, "stale": 0}
+    assert summary["alarms"][0]["states"] == ["setpoint_vy"]
+    texts = [m.text for frame in own.outbox for m in Codec(0, 0).decode(frame)]
+    assert texts[0].startswith("mavfi gate: setpoint withheld")
+
+
+@pytest.mark.parametrize("wild", [math.nan, math.inf, -3e38])
+def test_no_wild_number_passes(gate, wild):
+    assert velocities(gate(action="brake"), [wild]) == [[0.0]]
+
+
+def test_the_held_setpoint_has_the_header_and_time_of_the_withheld(gate):
+    own = gate()
+    wild = setpoint(-1000.0, stamp_ms=7)
+    (held,) = own.pass_between(wild, Side.COMPANION, 1.1)
+    (read,) = Codec(0, 0).decode(frame_of(held))
+    assert (read.vx, read.time_boot_ms) == (2.0, 7)
+    assert read.get_header().seq == wild.get_header().seq
+
+
+def test_the_autopilot_is_told_to_hold_once_a_second(gate):
+    own = gate(action="autopilot")
+    assert velocities(own, [-1000.0] * 5) == [[]] * 5
+    sent = [m for frame in own.outbox for m in Codec(0, 0).decode(frame)]
+    (command,) = [m for m in sent if m.get_type() == "COMMAND_LONG"]
+    assert (command.command, command.param2, command.param3) == (176, 4.0, 3.0)  # AUTO.LOITER
+
+
+def test_watching_only_reports(gate):
+    own = gate(watch_only=True)
+    assert velocities(own, [-1000.0, 2.0]) == [[-1000.0], [2.0]]
+    assert len(own.summary()["alarms"]) == 2
+    assert "reported" in own.said[0]
+
+
+def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(gate):
+    own = gate(gone=lambda: "the program script is gone")
+    assert velocities(own, [2.0] * 12) == [[2.0]] * 9 + [[]] * 3
+    assert velocities(gate(), [2.0] * 12) == [[2.0]] * 12
+    silent = gate()
+    heartbeat = received(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3))
+    assert silent.pass_between(heartbeat, Side.COMPANION, 1.0) == [heartbeat]
+    assert velocities(silent, [2.0] * 35) == [[2.0]] * 30 + [[]] * 5
+
+
+@pytest.mark.parametrize(("on_error", "passed"), [("open", [[2.0]]), ("closed", [[]])])
+def test_an_error_in_the_gate_fails_as_configured(gate, on_error, passed):
+    own = gate(on_error=on_error)
+    own._gate.judge_tick = None
+    assert velocities(own, [2.0]) == passed
+    assert f"fails {on_error}" in own.said[0]
+
+
+def test_a_model_of_another_companion_is_refused(gate, tmp_path):
+    with pytest.raises(ModelError, match="not for 'companion:other'"):
+        gate(mark=StackMark(name="companion:other", digest="2"))
+    with pytest.raises(ModelError, match="needs --model"):
+        DetectorConfig(name="gad").build_for_companion(MARK)
+    marks = [CompanionConfig.load(command).mark.digest for command in ("true", "true 1")]
+    assert marks[0] != marks[1]
+
+
+def test_setpoints_of_every_kind_are_read_in_the_world_frame():
+    view = SetpointView()
+    for message in states(1000, north_m=3.0):
+        view.hear(message)
+    view.hear(received(dialect.MAVLink_global_position_int_message(
+        1000, 470000000, 80000000, 500000, 5000, 0, 0, 0, 0), component=1))  # fmt: skip
+
+    def read(message):
+        command = view.sample(message)[2]
+        return [*np.round(command.velocity_enu_mps, 3).tolist(), round(command.yaw_rad, 3)]
+
+    north = round(0.5 * math.pi, 3)
+    assert read(setpoint(1.0, vy=2.0, vz=3.0)) == [2.0, 1.0, -3.0, north]
+    assert read(setpoint(1.0, vy=2.0, frame=8)) == [2.0, 1.0, 0.0, north]
+    position = 0b1101_1111_1000
+    assert read(setpoint(mask=position, x=13.0, y=4.0, z=-6.0)) == [4.0, 10.0, 1.0, north]
+    assert read(setpoint(mask=0b1001_1100_0111, yaw=0.5)) == [0.0, 2.0, 0.0, round(north - 0.5, 3)]
+    place = dialect.MAVLink_set_position_target_global_int_message(
+        0, 1, 1, 6, position, 470000900, 80000000, 7.0, *[0.0] * 8
+    )
+    assert read(received(place)) == [0.0, 10.019, 2.0, north]
+    attitude = dialect.MAVLink_set_attitude_target_message(
+        0, 1, 1, 0, [math.cos(0.1), math.sin(0.1), 0, 0], 0, 0, 0, 0.5
+    )
+    assert read(received(attitude)) == [0.2, 0.0, 0.5, 0.0]
+    assert math.isnan(command_of(setpoint(math.nan), None).velocity_enu_mps[1])
+
+
+def test_a_tlog_gives_the_samples_of_its_setpoints(tmp_path):
+    log = TlogWriter(0)
+    log.open(tmp_path / "flight.tlog")
+    for number in range(3):
+        for message in (*states(1000 + 20 * number), setpoint(1.0 * number)):
+            log.write(number, frame_of(message))
+    log.close()
+    samples = samples_of_tlog(tmp_path / "flight.tlog", "flight", 1)
+    assert samples.deltas.shape == (3, 13)
+    assert samples.new_waypoint.all()
+    assert samples.deltas[:, 10].tolist() == [0, 3, 1]  # 0, 1 and 2 m/s north
+
+
+@contextlib.contextmanager
+def running(model, *options):
+    """`mavfi gate` between two sockets of this test: the autopilot's and the companion's."""
+    autopilot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    autopilot.bind(("127.0.0.1", 0))
+    autopilot.settimeout(LONG_S)
+    companion = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    companion.settimeout(LONG_S)
+    url = f"udpout:127.0.0.1:{autopilot.getsockname()[1]}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mavfi_cli", "gate", "--autopilot", url, "--to",
+         "udpin:127.0.0.1:0", "--detector", "range", "--model", str(model), *options],
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        line = process.stderr.readline()
+        assert "ready" in line, line
+        companion.connect(("127.0.0.1", int(line.split()[-1])))
+        yield process, autopilot, companion
+    finally:
+        process.terminate()
+        process.wait(LONG_S)
+        process.stderr.close()
+        autopilot.close()
+        companion.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fails", ["open", "closed"])
+def test_the_gate_passes_frames_byte_for_byte_and_fails_as_configured(model, fails, tmp_path):
+    log = tmp_path / "log.jsonl"
+    with running(model, "--fail", fails, "--log", str(log)) as (process, autopilot, companion):
+        heartbeat = frame_of(received(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3)))
+        good, wild = (frame_of(setpoint(vx)) for vx in (2.0, -1000.0))
+
+        def through(frame):
+            companion.send(frame)
+            data, _ = autopilot.recvfrom(1000)
+            while b"mavfi gate" in data:
+                data, _ = autopilot.recvfrom(1000)
+            return data
+
+        assert through(heartbeat) == heartbeat
+        assert through(good) == good
+        assert Codec(0, 0).decode(through(wild))[0].vx == 2.0
+        children = f"/proc/{process.pid}/task/{process.pid}/children"
+        with open(children) as file:
+            worker = int(file.read().split()[0])
+        os.kill(worker, signal.SIGKILL)
+        time.sleep(1.0)
+        companion.send(heartbeat)
+        assert through(heartbeat) == heartbeat
+        companion.send(wild)
+        companion.send(heartbeat)
+        data = b""
+        while not data or b"mavfi gate" in data:
+            data, _ = autopilot.recvfrom(1000)
+        while data == heartbeat and fails == "open":
+            data, _ = autopilot.recvfrom(1000)
+        assert data == (wild if fails == "open" else heartbeat)
+    assert f"has failed {fails}" in log.read_text()
