@@ -169,6 +169,7 @@ class CompanionFlight:
             "link": f"{scheme}:{end.host}:{port}",
             "mavsdk": f"{mavsdk}://{end.host}:{port}",
             "port": str(port),
+            "free": str(_free_port()),
             "world": self._config.world,
             "start": ",".join(f"{value:g}" for value in briefing.start_enu_m),
             "goal": ",".join(f"{value:g}" for value in briefing.goal_enu_m),
@@ -453,6 +454,13 @@ class _Crew:
     def succeeded(self, name: str) -> bool:
         """Return True if a program has ended for good with code 0."""
         return name in self.running and self._is_over(name) and self.running[name].codes[-1] == 0
+
+
+def _free_port() -> int:
+    """Return a TCP port of this machine that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def _how(code: int) -> str:
