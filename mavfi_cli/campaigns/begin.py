@@ -57,7 +57,7 @@ def chosen(
     out: Path | None,
     scale: float | None,
     changes: Sequence[str] = (),
-    firmware: str | None = None,
+    programs: Sequence[str | None] = (),
 ) -> tuple[Spec, Path]:
     """Find the named campaign and its folder.
 
@@ -67,15 +67,15 @@ def chosen(
         scale: fraction of the repetitions; an existing folder accepts only its own.
         changes: factors to replace, as in `replaced`; they become part of the default folder's
             name.
-        firmware: the program that a folder's missions may name; see
-            `MissionConfig.require_firmware`.
+        programs: programs that a folder's missions may name; see
+            `MissionConfig.require_programs`.
 
     Raises:
         ConfigError: the specification or the scale is invalid, or a preset without `out` has the
             same name as a campaign here.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, out, firmware)
+    spec = chosen_spec(what, scale, changes, out, programs)
     if (folder := _folder(what)) is not None:
         return spec, folder
     if out is None:
@@ -88,7 +88,7 @@ def chosen_spec(
     scale: float | None,
     changes: Sequence[str] = (),
     out: Path | None = None,
-    firmware: str | None = None,
+    programs: Sequence[str | None] = (),
 ) -> Spec:
     """Find the named specification as `chosen` does, but without its folder."""
     folder = _folder(what)
@@ -103,7 +103,7 @@ def chosen_spec(
             )
         stored = stored_spec(ledger) or _Unflown.of(ledger)
     for kind in stored.kinds():
-        kind.config.require_firmware(firmware)
+        kind.config.require_programs(*programs)
     return stored
 
 

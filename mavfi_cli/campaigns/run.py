@@ -81,8 +81,8 @@ class Options:
         profiles: folder of instruction-level profiles that several campaigns share. None selects
             the campaign's own, where profiles are removed after their last mission.
         planned: numbers of the missions among which the last one is determined; None for all.
-        firmware: programs that missions of the folder may name; see
-            `MissionConfig.require_firmware`.
+        programs: programs that missions of the folder may name; see
+            `MissionConfig.require_programs`.
     """
 
     jobs: int = 0  # 0 selects the number of cores
@@ -97,7 +97,7 @@ class Options:
     kept: frozenset[int] = frozenset()
     profiles: Path | None = None
     planned: frozenset[int] | None = None
-    firmware: frozenset[str] = frozenset()
+    programs: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit_s < math.inf:
@@ -152,8 +152,8 @@ def run_campaign(
     with Ledger(folder, writing=True) as ledger:
         store_plan(ledger, missions, append=append)
         options = options or Options()
-        named = {mission.config.firmware for mission in missions if mission.config.firmware}
-        options = replace(options, firmware=options.firmware | named)
+        named = {name for mission in missions for name in mission.config.programs}
+        options = replace(options, programs=options.programs | named)
         fly_missing(ledger, options, spectator or Spectator(), stop)
     return Ledger(folder)
 
@@ -431,7 +431,7 @@ class _Run:
             alone = self._alone.pop(missions[0].number, "")
             for mission in missions:
                 number, _, config = mission
-                config.require_firmware(*self._options.firmware)
+                config.require_programs(*self._options.programs)
                 self._attempts[number] += 1
                 self._flying[number] = mission
                 attempts.append((number, changes_of(config), self._made(number)))

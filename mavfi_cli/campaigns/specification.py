@@ -285,9 +285,9 @@ class Spec:
         """
         return [self._mission(values, labels, 0) for values, labels, _ in self._points()]
 
-    def firmware(self) -> frozenset[str]:
-        """Return the programs that missions name as their firmware. Raises as `kinds`."""
-        return frozenset(kind.config.firmware for kind in self.kinds() if kind.config.firmware)
+    def programs(self) -> frozenset[str]:
+        """Return the programs that missions name and execute. Raises as `kinds`."""
+        return frozenset(name for kind in self.kinds() for name in kind.config.programs)
 
     def _points(self) -> list[tuple[Factors, Labels, int]]:
         """Combine the factors; return each combination with its labels and repetitions."""

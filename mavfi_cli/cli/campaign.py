@@ -64,6 +64,9 @@ def campaign() -> None:
 @_execution("--firmware", metavar="PATH",
             help="SITL binary to trust. A binary that the missions of a folder name is executed "
                  "only if it is this one or that of PX4_SITL or ARDUCOPTER_SITL.")  # fmt: skip
+@_execution("--companion", metavar="FILE|CMD",
+            help="User's companion to trust: the missions of a folder execute no other "
+                 "one.")  # fmt: skip
 @_execution("--limit", "limit_s", type=types.ABOVE_ZERO, default=900.0,
             help="Wall time limit of a mission, s; missions that exceed it are recorded as "
                  "`hang`.")  # fmt: skip
@@ -85,13 +88,15 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.progress import missions_view
 
-    named = (options[name] for name in ("out", "scale", "changes", "firmware"))
-    spec, folder = chosen(what, *named)
+    trusted = (options["firmware"], options["companion"])
+    spec, folder = chosen(
+        what, options["out"], options["scale"], options["changes"], programs=trusted
+    )
     flying = Options(
         **grouped.given_fields(
             Options,
             keep=spec.keep if options["keep"] is None else Keep(options["keep"]),
-            firmware=spec.firmware(),
+            programs=spec.programs(),
         )
     )
     if flying.cluster is not None and flying.cluster_key is None:

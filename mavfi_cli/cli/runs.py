@@ -155,15 +155,19 @@ def _repeat_mission(
 ) -> _Comparison:
     from mavfi_cli.analysis.flights import differing, mission_of, provenance
     from mavfi_cli.campaigns.begin import opened
+    from mavfi_cli.core.errors import RecordError
     from mavfi_cli.core.files import reading
     from mavfi_cli.mission.run import fly_to_end
+    from mavfi_cli.mission.run_folder import COMPANION_VARIES
     from mavfi_cli.report.summary import outcome_line
 
     with opened(campaign) as ledger:
         config, row = mission_of(ledger, number)
         with reading(campaign):
             _warn_of_builds(provenance(ledger).get("versions", {}))
-    config.require_firmware(firmware)
+    if config.companion is not None:
+        raise RecordError(f"mission {number}: {COMPANION_VARIES}")
+    config.require_programs(firmware)
     config = config if with_fault else config.golden
     note(f"flying mission {number}: {config.world}, seed {config.seed}")
     again = fly_to_end(config, out)

@@ -47,6 +47,7 @@ _NEEDED = (
     "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
 )  # fmt: skip
 _PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_seq": np.int32}
+COMPANION_VARIES = "a flight of a user's companion does not repeat"
 _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
 
 
@@ -329,7 +330,7 @@ class Run:
         The golden run has no detector either, because it is the reference for fault and detection.
 
         Args:
-            firmware: The program that the run may name; see `MissionConfig.require_firmware`.
+            firmware: The program that the run may name; see `MissionConfig.require_programs`.
 
         Raises:
             ConfigError: The run names another program.
@@ -342,7 +343,7 @@ class Run:
         elif record.config.get("link") is not None:
             why = "a flight of a foreign autopilot does not repeat"
         elif record.config.get("companion") is not None:
-            why = "a flight of a user's companion does not repeat"
+            why = COMPANION_VARIES
         elif PlatformProfile.factor_of(record.config.get("platform", "")) is not None:
             why = "a flight on measured kernel times does not repeat"
         config = structure(dict(record.config), MissionConfig, path=self.folder.result)
@@ -354,7 +355,7 @@ class Run:
                     why = f"{name} {how}, so the flight does not repeat"
         if why:
             raise RecordError(f"{path}: {why}")
-        config.require_firmware(firmware)
+        config.require_programs(firmware)
         return config if with_fault else config.golden
 
     def differing_sections(self, other: Run) -> list[str]:

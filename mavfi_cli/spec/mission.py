@@ -307,26 +307,33 @@ class MissionConfig:
             )
         return replace(self, firmware=path)
 
-    def require_firmware(self, *known: str | None) -> None:
-        """Refuse a recorded mission whose firmware is not a known program.
+    @property
+    def programs(self) -> tuple[str, ...]:
+        """Programs that the mission names and executes: its firmware and its user's companion."""
+        return tuple(name for name in (self.firmware, self.companion) if name is not None)
 
-        Flying a record executes the program that it names, and a record is untrusted. The program
+    def require_programs(self, *known: str | None) -> None:
+        """Refuse a recorded mission that names an unknown program.
+
+        Flying a record executes the programs that it names, and a record is untrusted. The firmware
         of the environment variable counts as known.
 
         Raises:
             ConfigError: The mission names another program.
         """
-        if self.firmware is None:
-            return
         variable = FIRMWARE.get(self.autopilot, "")
-        for path in (*known, os.environ.get(variable)):
-            if path and os.path.realpath(path) == os.path.realpath(self.firmware):
-                return
-        raise ConfigError(
-            f"the record would execute the program {self.firmware}; to allow it, name it with "
-            f"--firmware or in {variable or 'the environment'}",
-            key="firmware",
-        )
+        trusted = {os.path.realpath(name) for name in known if name}
+        installed = {os.path.realpath(path) for path in [os.environ.get(variable)] if path}
+        for key, name, also, where in (
+            ("firmware", self.firmware, installed, f" or in {variable or 'the environment'}"),
+            ("companion", self.companion, set[str](), ""),
+        ):
+            if name is not None and os.path.realpath(name) not in trusted | also:
+                raise ConfigError(
+                    f"the record would execute the program {name}; to allow it, name it with "
+                    f"--{key}{where}",
+                    key=key,
+                )
 
     def briefing(self, start_enu_m: FloatArray) -> Briefing:
         """Build the briefing for a foreign autopilot at a position (3,) without a known world."""

@@ -152,6 +152,23 @@ def test_the_firmware_of_a_record_flies_only_if_the_user_names_it(hostile, comma
     assert "the firmware" in err
 
 
+def test_the_companion_of_a_campaign_flies_only_if_the_user_names_it(
+    faulty_flight, precious, tmp_path, command_line
+):
+    folder, struck = tmp_path / "theirs", tmp_path / "struck"
+    shutil.copytree(faulty_flight.path, folder)
+    companion = folder / "companion.toml"
+    companion.write_text(f'[program.theirs]\ncommand = "touch {struck}"\n')
+    _make_campaign(folder, {"companion": str(companion)})
+    for line in ("replay FOLDER --mission 0", "campaign run FOLDER --quiet"):
+        code, _, err = command_line(*line.replace("FOLDER", str(folder)).split())
+        assert code in (1, 2)
+        assert "companion" in err
+        assert not struck.exists()
+    command_line("campaign", "run", folder, "--quiet", "--companion", companion)
+    assert struck.exists()
+
+
 def test_a_record_that_inflates_beyond_bounds_is_refused(hostile, command_line, monkeypatch):
     monkeypatch.setattr(ledgers, "_LARGEST_RECORD", 1 << 20)
     with sqlite3.connect(hostile / LEDGER) as database:
