@@ -1,7 +1,8 @@
 """The companion's kernels: perception, planning and control as pure step functions.
 
 point_cloud -> occupancy -> collision        perception
-planners -> shortcut -> smoothing            planning
+planners -> shortcut -> smoothing,           planning
+                        minimum_snap
 tracking                                     control
 
 Importing this package is cheap. Each kernel module imports numba or a native library.
@@ -10,6 +11,7 @@ Importing this package is cheap. Each kernel module imports numba or a native li
 from __future__ import annotations
 
 OUR_PLANNERS = ("rrtstar", "rrt", "rrtconnect")
+SMOOTHERS = ("ours", "release")  # `smoothing` and `minimum_snap`
 
 
 def canonical_planner(name: str) -> str:

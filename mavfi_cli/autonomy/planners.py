@@ -22,8 +22,9 @@ from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
-from mavfi_cli.autonomy import OUR_PLANNERS, canonical_planner
+from mavfi_cli.autonomy import OUR_PLANNERS, SMOOTHERS, canonical_planner
 from mavfi_cli.autonomy.grid import GridTooLarge, ObstacleGrid, segment_free
+from mavfi_cli.autonomy.minimum_snap import smooth_minimum_snap
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
 from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
@@ -32,6 +33,7 @@ from mavfi_cli.core.installed import PlugIns
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 MAX_SEED = 0x7FFF_FFFF
+_SMOOTHERS = dict(zip(SMOOTHERS, (smooth, smooth_minimum_snap), strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +47,7 @@ class PlanningParams:
     radius_m: float = 1.1  # clearance from obstacles
     escape_radius_m: float = 2.2  # within this distance of a blocked start, the radius may shrink
     shortcut_spacing_m: float = 1.0  # vertex spacing of the path before the second shortcut
+    smoother: str = SMOOTHERS[0]
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
 
 
@@ -157,7 +160,8 @@ def plan(
         return PlanFailure(stamp_s=request.stamp_s, reason=result.reason)
     path = _shortcut(result.path_enu_m, problem.grid)
     path = _shortcut(_subdivided(path, params.shortcut_spacing_m), problem.grid)
-    trajectory, free = smooth(path, problem.grid, request, params.smoothing)
+    smoother = _SMOOTHERS[params.smoother]
+    trajectory, free = smoother(path, problem.grid, request, params.smoothing)
     return trajectory if free else PlanFailure(stamp_s=request.stamp_s, reason="no free way on")
 
 

@@ -79,7 +79,7 @@ def smooth(
     Returns:
         The trajectory, and True if all of it lies in free space.
     """
-    velocity = _cut(request.velocity_enu_mps, params.v_max_mps)
+    velocity = limited(request.velocity_enu_mps, params.v_max_mps)
     path = np.asarray(path_enu_m, np.float64)
     vertices, free = _with_run_out(path, velocity, grid, params)
     line, period, a = _Polyline(vertices, params), params.sample_period_s, params.acceleration_mps2
@@ -101,7 +101,7 @@ def smooth(
     return _trajectory(spline, request, params), free
 
 
-def _cut(velocity: FloatArray, limit: float) -> FloatArray:
+def limited(velocity: FloatArray, limit: float) -> FloatArray:
     """Limit a velocity (3,). Return zero if it is negligible or not finite."""
     velocity = np.asarray(velocity, np.float64)
     largest = float(np.abs(velocity).max())
@@ -326,11 +326,24 @@ def _trajectory(spline: FloatArray, request: PlanRequest, params: SmoothingParam
     accelerations = np.zeros_like(velocities)
     accelerations[:-1] = np.diff(velocities, axis=0) / period
     positions = 0.5 * (spline[:-1] + spline[1:])
-    yaws = _headings(positions, request.yaw_rad, params.yaw_rate_max_radps * period)
+    return sampled_trajectory(positions, velocities, accelerations, request, params)
+
+
+def sampled_trajectory(
+    positions_enu_m: FloatArray,
+    velocities_enu_mps: FloatArray,
+    accelerations_enu_mps2: FloatArray,
+    request: PlanRequest,
+    params: SmoothingParams,
+) -> Trajectory:
+    """Return the trajectory of samples (n, 3) that are one sample period apart, for a request."""
+    period = params.sample_period_s
+    yaws = _headings(positions_enu_m, request.yaw_rad, params.yaw_rate_max_radps * period)
+    states = [positions_enu_m, yaws, velocities_enu_mps, accelerations_enu_mps2]
     return Trajectory(
         stamp_s=request.stamp_s,
-        waypoints=np.column_stack([positions, yaws, velocities, accelerations]),
-        durations_s=np.full(len(positions), period),
+        waypoints=np.column_stack(states),
+        durations_s=np.full(len(positions_enu_m), period),
         trajectory_seq=request.trajectory_seq,
         future_collision_seq=request.future_collision_seq,
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
-from mavfi_cli.autonomy import OUR_PLANNERS, collision, planners, point_cloud, tracking
+from mavfi_cli.autonomy import OUR_PLANNERS, SMOOTHERS, collision, planners, point_cloud, tracking
 from mavfi_cli.autonomy.occupancy import OccupancyMap, OccupancyParams
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.core.compiled import in_cache
@@ -37,10 +38,10 @@ def warm_up() -> None:
         goal_enu_m=np.array([9.0, 0.0, 5.0]), attempt=1,
     )  # fmt: skip
     trajectory: Trajectory | None = None
-    for name in OUR_PLANNERS:
+    for name, smoother in itertools.product(OUR_PLANNERS, SMOOTHERS[::-1]):
         result = planners.plan(
             planners.find(name), request, snapshot,
-            bounds_enu_m=_BOUNDS, seed=1, params=planners.PlanningParams(),
+            bounds_enu_m=_BOUNDS, seed=1, params=planners.PlanningParams(smoother=smoother),
         )  # fmt: skip
         trajectory = result if isinstance(result, Trajectory) else None
     checked = collision.CollisionInputs(

@@ -61,6 +61,7 @@ class Kernels:
         self._planning_params = planners.PlanningParams(
             radius_m=stack.planner_radius_m,
             smoothing=smoothing.SmoothingParams(v_max_mps=v_max, a_max_mps2=a_max),
+            **stack.settings_of(planners.PlanningParams),
         )
         self._bounds_enu_m = briefing.bounds_enu_m
         self._tracking_params = tracking.TrackingParams(

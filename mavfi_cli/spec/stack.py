@@ -11,12 +11,13 @@ import json
 import math
 import re
 import tomllib
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from mavfi_cli.autonomy import SMOOTHERS
 from mavfi_cli.core.config import Shipped, read_toml, structure
-from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.core.errors import ConfigError, UnknownName
 from mavfi_cli.core.types import KERNELS, StackMark
 
 DEFAULT = "mavbench"
@@ -76,6 +77,8 @@ class Stack:
         turns_before_departure: The vehicle makes one full turn before the first plan.
         rejected_plan_pause_s: Pause between a rejected plan and the next request.
         slows_where_blind: The vehicle flies at half speed outside its field of view.
+        smoother: Smoothing of planned paths: `ours` (straight flight at 0.9 v_max with blended
+            corners) or `release` (minimum snap with the release's segment times).
         sources: Sources of the values, by key.
     """
 
@@ -106,6 +109,8 @@ class Stack:
     turns_before_departure: bool
     rejected_plan_pause_s: float
     slows_where_blind: bool
+    # Files and models of older versions do not have the keys with a default.
+    smoother: str = SMOOTHERS[0]
     description: str = ""  # which `mavfi stacks` prints
     base: str = ""  # name of a shipped stack that has the other values
     sources: dict[str, str] = field(default_factory=dict)
@@ -116,6 +121,8 @@ class Stack:
             if not (math.isfinite(value) and low <= value <= high):
                 raise ValueError(f"{key}: must be between {low:g} and {high:g}, got {value:g}")
         self._check_processes()
+        if self.smoother not in SMOOTHERS:
+            raise UnknownName("smoother", self.smoother, SMOOTHERS)
         if self.planner_radius_m < self.check_radius_m:
             raise ValueError(
                 f"planner_radius_m: must be at least check_radius_m, {self.check_radius_m:g}, or "
@@ -154,12 +161,24 @@ class Stack:
 
     @property
     def mark(self) -> StackMark:
-        """Return the identity of the stack, which a detector's model stores."""
-        text = json.dumps(self.settings_of(Stack), sort_keys=True)
+        """Return the identity of the stack, which a detector's model stores.
+
+        It excludes keys with their default, so a key that is added later changes no identity.
+        """
+        settings = self.settings_of(Stack)
+        same = [key for key, value in _DEFAULTS.items() if settings[key] == value]
+        for key in same:
+            del settings[key]
+        text = json.dumps(settings, sort_keys=True)
         return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
 
 
 KEYS: tuple[str, ...] = tuple(key.name for key in fields(Stack) if key.name not in _ABOUT)
+_DEFAULTS = {
+    key.name: key.default
+    for key in fields(Stack)
+    if key.name in KEYS and key.default is not MISSING
+}
 
 
 def load_stack(text: str) -> Stack:
@@ -198,7 +217,9 @@ def _values(path: Path) -> tuple[dict[str, Any], str]:
     if values.get("base", ""):
         base = STACKS.base(values["base"], path)
         inherited, _ = _values(STACKS.folder / f"{base}.toml")
-    elif values.keys() <= {*KEYS, *_ABOUT} and (missing := [k for k in KEYS if k not in values]):
+    elif values.keys() <= {*KEYS, *_ABOUT} and (
+        missing := [k for k in KEYS if k not in values and k not in _DEFAULTS]
+    ):
         raise ConfigError(
             f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}: missing; "
             f"base = NAME takes missing values from a stack: {', '.join(STACKS.names)}",

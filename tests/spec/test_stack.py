@@ -70,3 +70,15 @@ def test_a_file_that_lacks_a_key_is_refused(tmp_path):
     file.write_text('name = "half"\nguards_tracking = true\n')
     with pytest.raises(ConfigError, match="missing; base = NAME takes"):
         load_stack(str(file))
+
+
+def test_a_key_with_a_default_may_lack_in_an_older_file_and_changes_no_identity(tmp_path):
+    plain = load_stack("hardened")
+    older = tmp_path / "older.toml"
+    text = (STACKS.folder / "hardened.toml").read_text()
+    older.write_text(text.replace('smoother = "ours"\n', "").replace("[sources]", "\n[sources]"))
+    assert "smoother" not in older.read_text()
+    assert load_stack(str(older)).mark == plain.mark
+    assert load_stack('hardened:smoother="release"').mark.digest != plain.mark.digest
+    with pytest.raises(ConfigError, match="did you mean 'release'"):
+        load_stack('hardened:smoother="releas"')
