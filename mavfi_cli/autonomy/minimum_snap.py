@@ -21,6 +21,7 @@ waypoints (see `tracking`).
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -78,33 +79,36 @@ def _distinct(path: FloatArray) -> FloatArray:
 def _segment_durations(vertices: FloatArray, v_max_mps: float, a_max_mps2: float) -> FloatArray:
     """Return the duration of each segment (n - 1,) between the vertices (n, 3), s."""
     durations_s = []
-    for start, end in zip(vertices[:-1], vertices[1:], strict=True):
+    for start, end in itertools.pairwise(vertices):
         direct_s = 2.0 * max(norm(end - start), 1e-3) / v_max_mps
         slower = _TIME_FACTOR * v_max_mps / a_max_mps2 * math.exp(-direct_s)
         durations_s.append(direct_s * (1.0 + slower))
     return np.array(durations_s)
 
 
-@compiled
 def _solve(vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return the coefficients (n - 1, 8, 3) of the spline's segments in u = t / duration, 0..1.
+    """Return the coefficients (n - 1, 8, 3) of the spline's segments in u = t / duration, 0..1."""
+    matrix, right = _equations(vertices, durations_s, velocity)
+    _eliminate(matrix, right)
+    return right.reshape(len(durations_s), _TERMS, 3)
 
-    The equations are banded. They are solved by Gaussian elimination with partial pivoting, because
-    the last digit of a solver of BLAS depends on the processor.
-    """
+
+@compiled
+def _equations(
+    vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return matrix (m, m) and right side (m, 3) of the equations for the coefficients."""
     segments = len(durations_s)
     size = _TERMS * segments
-    matrix = np.zeros((size, size))
-    right = np.zeros((size, 3))
+    matrix, right = np.zeros((size, size)), np.zeros((size, 3))
     # factors[k, m]: factor of u^(m - k) in the k-th derivative of u^m
     factors = np.ones((_TERMS - 1, _TERMS))
     for k in range(1, _TERMS - 1):
         for m in range(_TERMS):
             factors[k, m] = factors[k - 1, m] * (m - k + 1)
-    last = size - _TERMS
     for row, k in enumerate((1, 4, 5)):
         matrix[row, k] = 1.0
-        matrix[size - 3 + row, last:] = factors[k]
+        matrix[size - 3 + row, size - _TERMS :] = factors[k]
     right[0] = velocity * durations_s[0]
     for i in range(segments):
         row, column = 3 + _TERMS * i, _TERMS * i
@@ -120,13 +124,20 @@ def _solve(vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray) 
             scale *= ratio
             matrix[row + 1 + k, column : column + _TERMS] = factors[k]
             matrix[row + 1 + k, column + _TERMS + k] = -factors[k, k] * scale
+    return matrix, right
+
+
+@compiled
+def _eliminate(matrix: FloatArray, right: FloatArray) -> None:
+    """Replace the right side (m, 3) by the solution of the banded equations.
+
+    This is Gaussian elimination with partial pivoting. The last digit of a solver of BLAS depends
+    on the processor.
+    """
+    size = len(matrix)
     for column in range(size):
-        end = min(column + _REACH + 1, size)
-        pivot = column
-        for row in range(column + 1, end):
-            if abs(matrix[row, column]) > abs(matrix[pivot, column]):
-                pivot = row
-        wide = min(column + 2 * _REACH + 1, size)
+        end, wide = min(column + _REACH + 1, size), min(column + 2 * _REACH + 1, size)
+        pivot = column + np.argmax(np.abs(matrix[column:end, column]))
         for m in range(column, wide):
             matrix[column, m], matrix[pivot, m] = matrix[pivot, m], matrix[column, m]
         for axis in range(3):
@@ -143,7 +154,6 @@ def _solve(vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray) 
             for m in range(row + 1, min(row + 2 * _REACH + 1, size)):
                 right[row, axis] -= matrix[row, m] * right[m, axis]
             right[row, axis] /= matrix[row, row]
-    return right.reshape(segments, _TERMS, 3)
 
 
 def _evaluate(
@@ -162,9 +172,7 @@ def _evaluate(
     return value
 
 
-def _first_blocked(
-    spline: FloatArray, durations_s: FloatArray, grid: ObstacleGrid
-) -> int | None:
+def _first_blocked(spline: FloatArray, durations_s: FloatArray, grid: ObstacleGrid) -> int | None:
     """Return the first segment that is not free; None if all are free."""
     for segment, duration_s in enumerate(durations_s.tolist()):
         within_s = np.append(np.arange(0.0, duration_s, _CHECK_STEP_S), duration_s)

@@ -88,6 +88,7 @@ class PilotParams:
     uses_time_to_collision: bool = True
     acts_on_report_once: bool = False
     owns_sequence_numbers: bool = False
+    restores_counters: bool = False
     plans_in_motion: bool = True
     arrives_at_rest: bool = False
     turns_before_departure: bool = False
@@ -496,8 +497,8 @@ class Pilot:
             self.abandon(state)
 
     def control_lost(self, state: VehicleState) -> None:
-        """Handle a restart of control: its queue is empty and its own counters are 0."""
-        if self.params.owns_sequence_numbers:
+        """Handle a restart of control: its queue is empty, and its counters are 0 or restored."""
+        if self.params.owns_sequence_numbers and not self.params.restores_counters:
             self._trajectory_seq = self._collision_seq = 0
         if self.active.trajectory is not None:
             self.abandon(state)

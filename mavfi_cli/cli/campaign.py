@@ -42,9 +42,9 @@ def campaign() -> None:
     """Plan, fly and evaluate thousands of paired missions.
 
     WHAT is a preset (fig7 fig8 fig9 fig11 fig13 fig14 fig16 table3 table4 speeds hardening
-    ablation), a campaign.toml, or the folder of an existing campaign. Presets and files fly into
-    campaigns/NAME, where the other commands look for them. Write ./NAME for a folder with
-    the name of a preset.
+    ablation protections), a campaign.toml, or the folder of an existing campaign. Presets and
+    files fly into campaigns/NAME, where the other commands look for them. Write ./NAME for a
+    folder with the name of a preset.
     """
 
 

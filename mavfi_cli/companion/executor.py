@@ -96,6 +96,7 @@ class Node(Generic[In, Out]):
     name: str
     kernel: Callable[[In, float], Out]
     on_start: Callable[[In, float], None] = lambda _input, _start_s: None
+    before_restart: Callable[[], None] = lambda: None  # prepares the state of the new process
     on_restart: Callable[[], None] = lambda: None
     pending: tuple[In, Turn] | None = None  # waiting input and the turn that it belongs to
     busy: bool = False
@@ -106,6 +107,7 @@ class Node(Generic[In, Out]):
     restarts: int = 0
     free_s: float = 0.0  # end of the newest invocation outside the queue
     mates: list[AnyNode] = field(default_factory=list)  # others in its process, in cyclic order
+    standby: bool = False  # this process's kernel works on every input, too, and takes over
 
     @types.coroutine
     def run(self, value: In) -> Generator[tuple[AnyNode, In], Out, Out]:
@@ -137,7 +139,8 @@ class _Job:
             self.done = True
         else:
             self.order = process.order(self.node.name, self.input, self.start_s)
-        self.input = None
+        if not self.node.standby:
+            self.input = None
 
     def settle(self, wall: WallClock) -> NodeLost | None:
         """Wait for the output. If the node's process is lost, return the loss."""
@@ -151,6 +154,8 @@ class _Job:
                 return loss
             wall.add(self.node.name, host_s)
             self.done = True
+            if self.node.standby:
+                self.node.kernel(self.input, self.start_s)
         return None
 
 
@@ -195,6 +200,16 @@ class Executor:
         nodes = [self.nodes[name] for name in names]
         for place, node in enumerate(nodes):
             node.mates = nodes[place + 1 :] + nodes[:place]
+
+    def stand_by(self, names: Sequence[str]) -> None:
+        """Give the processes of these nodes a hot standby.
+
+        The standby works on every input as the process does, so it has the same state. When the
+        process dies or hangs, the standby's output takes effect at the same time instead.
+        """
+        for name in names:
+            for node in (self.nodes[name], *self.nodes[name].mates):
+                node.standby = True
 
     def process_of(self, name: str) -> dict[str, Callable[[Any, float], Any]]:
         """Return the kernels in the process of a node, by node name."""
@@ -324,8 +339,11 @@ class Executor:
             return
         self._jobs.pop(job.node.name, None)
         if (loss := job.settle(self.wall)) is not None:
-            self._lose(job, loss)
-            return
+            if not job.node.standby:
+                self._lose(job, loss)
+                return
+            self._take_over(job.node, loss)
+            job.output = job.node.kernel(job.input, job.start_s)
         job.node.busy = False
         assert job.turn is not None
         self._go_on(job.turn, job.output)  # its core is still busy, so new invocations queue last
@@ -365,17 +383,33 @@ class Executor:
         """
         node = self.nodes[name]
         members = (node, *node.mates)
-        jobs = [self._jobs.pop(member.name) for member in members if member.name in self._jobs]
+        jobs = [self._jobs[member.name] for member in members if member.name in self._jobs]
         if not jobs and any(member.busy for member in members):
             return
+        loss = NodeLost(hung=False, how="killed by SIGKILL")
+        if node.standby:
+            for job in jobs:
+                job.settle(self.wall)
+            self._take_over(node, loss)
+            return
         for job in jobs:
+            del self._jobs[job.node.name]
             if job.order is not None:  # the result must not depend on the host's progress
                 job.settle(self.wall)
             job.cancelled = True
         node.busy = True
-        self._note_loss(node, self.now_s, NodeLost(hung=False, how="killed by SIGKILL"))
+        self._note_loss(node, self.now_s, loss)
         self._at(self.now_s + self.restart_s, self._restart, node)
         self._free_cores(len(jobs))
+
+    def _take_over(self, node: AnyNode, loss: NodeLost) -> None:
+        """Let the standby of a lost process answer. It has worked on every earlier input."""
+        loss.node, loss.stamp_s = node.name, self.now_s
+        self.losses.append(loss)
+        if node.process is not None:
+            node.process.close(kill=True)
+        for member in (node, *node.mates):
+            member.process, member.standby = None, False
 
     def _lose(self, job: _Job, loss: NodeLost) -> None:
         """Handle a lost output: the node stays busy until its death, then until its restart."""
@@ -399,8 +433,10 @@ class Executor:
         """Start a new process with fresh state, as the nodes' copies in this process never ran."""
         if node.process is not None:
             node.process.close(kill=True)
-        process = NodeProcess.fork(self.process_of(node.name))
         members = (node, *node.mates)
+        for member in members:
+            member.before_restart()
+        process = NodeProcess.fork(self.process_of(node.name))
         for member in members:
             member.process = process
             member.restarts += 1

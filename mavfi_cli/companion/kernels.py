@@ -5,6 +5,7 @@ If a node runs in its own process, its state is there, too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mavfi_cli.autonomy import collision, occupancy, planners, point_cloud, smoothing, tracking
@@ -124,6 +125,18 @@ class Kernels:
         self._queue = inputs.trajectory
         self._tracking_state, command = tracking.step(state, inputs, self._tracking_params)
         return command
+
+    def restore_check(self, report: CollisionReport | None) -> None:
+        """Give a collision check that is about to restart the number of its last report."""
+        if report is not None:
+            self._collision_state = collision.CollisionState(
+                future_collision_seq=report.future_collision_seq
+            )
+
+    def restore_planner(self, plans: Sequence[Trajectory]) -> None:
+        """Give a planner that is about to restart the number of its last plan."""
+        if plans:
+            self._plans = plans[-1].trajectory_seq
 
     def _as_read(self, trajectory: Trajectory | None) -> Trajectory | None:
         """Return a plan as its readers use it, without accelerations if feed-forward is off."""

@@ -143,9 +143,13 @@ class Companion:
             Node("collision_check", kernels.collision_check, on_start=self._check_starts)
         )
         self._planner = add(Node("planner", kernels.planner, on_restart=self._planner_is_up))
+        if stack.restores_counters:
+            self._collision_check.before_restart = lambda: kernels.restore_check(self.report)
+            self._planner.before_restart = lambda: kernels.restore_planner(self.plans)
         self._control = add(Node("control", kernels.control, on_restart=self._control_is_up))
         for nodes in stack.processes:
             self.executor.share_process(nodes)
+        self.executor.stand_by(stack.standby)
         self._frame: DepthFrame | None = None
         self._map: MapSnapshot | None = None
         self._heard_seq = 0  # newest future_collision_seq that reached the planner
@@ -404,7 +408,8 @@ class Companion:
 
     def _planner_is_up(self) -> None:
         """Repeat the lost request unless a newer one is waiting."""
-        self._heard_seq = 0
+        if not self._stack.restores_counters:
+            self._heard_seq = 0
         if self._planner.pending is None:
             self.pilot.plan_lost()
 

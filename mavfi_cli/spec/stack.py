@@ -79,6 +79,10 @@ class Stack:
         slows_where_blind: The vehicle flies at half speed outside its field of view.
         smoother: Smoothing of planned paths: `ours` (straight flight at 0.9 v_max with blended
             corners) or `release` (minimum snap with the release's segment times).
+        restores_counters: A supervisor gives a restarted node the sequence numbers of the last
+            message that left it. Otherwise the node counts from 0.
+        standby: Nodes whose process has a hot standby, which works on the same inputs and takes
+            over when the process dies or hangs.
         sources: Sources of the values, by key.
     """
 
@@ -111,6 +115,8 @@ class Stack:
     slows_where_blind: bool
     # Files and models of older versions do not have the keys with a default.
     smoother: str = SMOOTHERS[0]
+    restores_counters: bool = False
+    standby: tuple[str, ...] = ()
     description: str = ""  # which `mavfi stacks` prints
     base: str = ""  # name of a shipped stack that has the other values
     sources: dict[str, str] = field(default_factory=dict)
@@ -121,6 +127,12 @@ class Stack:
             if not (math.isfinite(value) and low <= value <= high):
                 raise ValueError(f"{key}: must be between {low:g} and {high:g}, got {value:g}")
         self._check_processes()
+        for node in self.standby:
+            _require_node("standby", node)
+            if node == "control":
+                raise ValueError(
+                    "standby: control keeps its queue in its own process, so it cannot be one"
+                )
         if self.smoother not in SMOOTHERS:
             raise UnknownName("smoother", self.smoother, SMOOTHERS)
         if self.planner_radius_m < self.check_radius_m:
@@ -145,8 +157,7 @@ class Stack:
                     f"processes: a shared process must have at least two nodes, got {list(nodes)}"
                 )
             for node in nodes:
-                if node not in KERNELS:
-                    raise ValueError(f"processes: no node {node!r}; known: {', '.join(KERNELS)}")
+                _require_node("processes", node)
                 if node == "control":
                     raise ValueError(
                         "processes: control works in every tick, so it must be alone in its process"
@@ -173,6 +184,18 @@ class Stack:
         return StackMark(name=self.name, digest=hashlib.sha256(text.encode()).hexdigest())
 
 
+def _quoted(pair: str) -> str:
+    """Return KEY=VALUE with quotes around a value that is a word, such as `smoother=release`."""
+    key, equals, value = pair.partition("=")
+    word = value.strip().isidentifier() and value.strip() not in ("true", "false", "inf", "nan")
+    return f'{key}{equals}"{value.strip()}"' if word else pair
+
+
+def _require_node(key: str, node: str) -> None:
+    if node not in KERNELS:
+        raise ValueError(f"{key}: no node {node!r}; known: {', '.join(KERNELS)}")
+
+
 KEYS: tuple[str, ...] = tuple(key.name for key in fields(Stack) if key.name not in _ABOUT)
 _DEFAULTS = {
     key.name: key.default
@@ -184,7 +207,8 @@ _DEFAULTS = {
 def load_stack(text: str) -> Stack:
     """Load a stack by `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
 
-    The name is that of a shipped stack. Values have TOML syntax and replace those of the stack.
+    The name is that of a shipped stack. Values have TOML syntax and replace those of the stack; a
+    word needs no quotes.
 
     Raises:
         UnknownName: No shipped stack has this name, and it is not a path to a TOML file.
@@ -198,7 +222,7 @@ def load_stack(text: str) -> Stack:
     if not colon:
         return stack
     try:
-        changed = tomllib.loads("\n".join(_PAIR.split(changes)))
+        changed = tomllib.loads("\n".join(_quoted(pair) for pair in _PAIR.split(changes)))
     except tomllib.TOMLDecodeError:
         raise ConfigError(
             f"must have KEY=VALUE,KEY=VALUE after the stack's name, got {changes!r}", key="stack"

@@ -284,6 +284,7 @@ def test_every_preset_expands_to_its_numbers(name):
     sizes = {
         "fig7": 10, "fig8": 9, "fig9": 4, "table3": 4, "table4": 40, "fig11": 4, "fig13": 5,
         "fig14": 136, "fig16": 20, "speeds": 21, "hardening": 84, "ablation": 72,
+        "protections": 110,
     }  # fmt: skip
     assert len(cells) == sizes[name]
     tenth = sum(round(count / 10) for count in cells.values())
@@ -322,7 +323,9 @@ def test_hardening_has_each_protection_alone_and_all_of_them():
     }
 
 
-@pytest.mark.parametrize("name", sorted({*PRESETS.names} - {"hardening", "ablation"}))
+@pytest.mark.parametrize(
+    "name", sorted({*PRESETS.names} - {"hardening", "ablation", "protections"})
+)
 def test_the_presets_of_the_paper_fly_its_stack(name):
     assert {m.config.stack for m in missions_of(name)} == {"mavbench"}
 

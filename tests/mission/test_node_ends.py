@@ -257,3 +257,33 @@ def test_a_kill_loses_the_work_under_way_and_what_waits(executor_of):
     executor.advance(3.0)
     assert executor.published == [("a", "newer", 1.15)]
     assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [(0.05, "killed by SIGKILL")]
+
+
+@pytest.mark.parametrize(
+    ("standby", "sums"),
+    [
+        ((), {0: 1, 1: 11, 3: 1000}),  # the input is lost, and the successor has seen nothing
+        (("b",), {0: 1, 1: 11, 2: 111, 3: 1111}),
+    ],
+)
+def test_a_hot_standby_answers_for_a_process_that_dies(executor_of, standby, sums):
+    """It has worked on every input, so it answers at the same time and with the same state."""
+    executor, here, seen = executor_of("a", "b"), os.getpid(), []
+
+    def add(value, _stamp_s):
+        if value == 100 and os.getpid() != here and len(seen) == 2:
+            crash()
+        seen.append(value)
+        return sum(seen)
+
+    executor.nodes["b"].kernel = add
+    executor.share_process(("a", "b"))
+    executor.stand_by(standby)
+    executor.isolate("a")
+    for number in range(4):
+        executor.submit("b", 10**number)
+        executor.advance(2.0 * (number + 1))
+    expected = [("b", total, pytest.approx(2.0 * number + 0.1)) for number, total in sums.items()]
+    assert executor.published == expected
+    assert [loss.how for loss in executor.losses] == ["killed by SIGSEGV"]
+    assert executor.nodes["b"].restarts == (0 if standby else 1)

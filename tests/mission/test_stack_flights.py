@@ -101,6 +101,22 @@ def test_a_dead_process_takes_its_mates_and_the_map_with_it(golden, tmp_path):
     assert fly(tmp_path, fault=fault).trace.equals(run.trace)
 
 
+@pytest.mark.slow
+def test_a_supervisor_or_a_standby_saves_a_mission_whose_planner_dies(golden, tmp_path):
+    fault = FaultConfig(target="process.planner", at="time=18")  # after the second of three plans
+    lost, restored, covered = (
+        fly(tmp_path, fault=fault, stack=f"mavbench{variant}", time_limit_s=90.0)
+        for variant in ("", ":restores_counters=true", ':standby=["planner"]')
+    )
+    assert lost.result["outcome"] != "success"
+    assert restored.result["outcome"] == "success"
+    assert restored.result["nodes"]["planner"]["restarts"] == 1
+    # The standby has the same map and the same numbers, so the flight is that without a fault.
+    assert covered.trace.equals(golden.trace)
+    assert covered.result["nodes"]["planner"]["restarts"] == 0
+    assert len(covered.result["nodes"]["planner"]["crashes"]) == 1
+
+
 def test_a_record_of_before_there_were_stacks_replays_as_hardened(golden, tmp_path):
     folder = tmp_path / "older"
     folder.mkdir()

@@ -79,6 +79,6 @@ def test_a_key_with_a_default_may_lack_in_an_older_file_and_changes_no_identity(
     older.write_text(text.replace('smoother = "ours"\n', "").replace("[sources]", "\n[sources]"))
     assert "smoother" not in older.read_text()
     assert load_stack(str(older)).mark == plain.mark
-    assert load_stack('hardened:smoother="release"').mark.digest != plain.mark.digest
+    assert load_stack("hardened:smoother=release").mark.digest != plain.mark.digest
     with pytest.raises(ConfigError, match="did you mean 'release'"):
-        load_stack('hardened:smoother="releas"')
+        load_stack("hardened:smoother=releas")
