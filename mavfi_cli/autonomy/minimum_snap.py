@@ -62,9 +62,12 @@ def smooth_minimum_snap(
         vertices = np.insert(vertices, blocked + 1, middle, axis=0)
     period_s = params.sample_period_s
     count = max(1, math.floor(float(durations_s.sum()) / period_s))
-    times_s = np.arange(count) * period_s
-    states = [_evaluate(spline, durations_s, times_s, order) for order in range(3)]
-    return sampled_trajectory(*states, request, params), blocked is None
+    times_s = np.arange(count, dtype=np.float64) * period_s
+    position, velocity, acceleration = (
+        _evaluate(spline, durations_s, times_s, order) for order in range(3)
+    )
+    trajectory = sampled_trajectory(position, velocity, acceleration, request, params)
+    return trajectory, blocked is None
 
 
 def _distinct(path: FloatArray) -> FloatArray:

@@ -20,12 +20,17 @@ from mavfi_cli.core.config import (
     structure,
 )
 from mavfi_cli.core.errors import ConfigError, UnknownName, named_member
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
 _TOP = (*(key.name for key in fields(Spec) if key.name not in ("fixed", "axes", "settings")),
         *_FACTORS)  # fmt: skip
 _SETTING = ("name", "repetitions")
+# Factors that only faults at instruction level have.
+_OF_INSTRUCTIONS = {key.name for key in fields(InstructionConfig)} - {
+    key.name for key in fields(FaultConfig)
+}
 
 
 def load_spec(name: str) -> Spec:
@@ -127,7 +132,8 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
     """Return the specification with factors replaced, under a name that includes the changes.
 
     A factor is replaced in all settings that have it. A mission factor that the specification
-    lacks is added to all missions.
+    lacks is added to all missions, and a factor of instruction-level faults, such as `compat`, to
+    the settings at that level.
 
     Args:
         changes: KEY=VALUE[,VALUE] with distinct keys. A value with a comma is quoted as in TOML,
@@ -170,6 +176,8 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
         raise ConfigError.unknown_key(key, NAMES)
     fixed, crossed = data.setdefault("mission", {}), data.setdefault("factors", {})
     tables = [table for table in (crossed, *data["setting"]) if key in table]
+    if not tables and key in _OF_INSTRUCTIONS:
+        tables = [table for table in data["setting"] if "instruction" in table.get("level", ())]
     for table in tables:
         table[key] = values
     if not tables and key not in fixed and (key not in MISSION or key == "seed"):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together", "direction"}
 _DYING = "needs nodes that can die: --inject process.NODE, or --level instruction"
 _EITHER = {"bits", "field", "fault_seed"}
-_INSTRUCTION = {"sites", "roles"}
+_INSTRUCTION = {"sites", "roles", "compat"}
 _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
 _SMALL = 1.0e-3  # change of a value, of the value itself or of 1 in its unit
 _LARGE = [
@@ -150,6 +150,9 @@ _detector, _output = section("Detector"), section("Output")
                    "opcode, memory. May be repeated  [the first five: registers].")  # fmt: skip
 @_instruction("--role", "roles", multiple=True, type=types.ROLE,
               help="Role of the operand: source or destination  [both].")  # fmt: skip
+@_instruction("--compat", type=types.COMPAT, metavar="INJECTOR",
+              help="Choose operands and bits as another injector: pinfi, pinfi-bugs, rosfi-2021. "
+                   "rosfi-2021 also draws the moment by processor time.")  # fmt: skip
 @_detector("--detector", type=types.DETECTOR, metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip

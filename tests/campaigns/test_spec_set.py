@@ -116,3 +116,15 @@ def test_what_cannot_be_replaced_is_refused(changes, error, problem):
     with pytest.raises(MavfiError, match=problem) as refused:
         changed(*changes).missions()
     assert isinstance(refused.value, error)
+
+
+def test_another_injector_strikes_in_all_settings_at_instruction_level():
+    """Its name is no factor of the presets, but of every fault at that level."""
+    plain, other = load_spec("table4"), replaced(load_spec("table4"), ["compat=rosfi-2021"])
+    missions = [mission.config for mission in other.missions()]
+    assert len(missions) == len(plain.missions())
+    faults = [config.instruction for config in missions if config.instruction is not None]
+    assert len(faults) == 3 * 1200
+    assert {fault.compat for fault in faults} == {"rosfi-2021"}
+    with pytest.raises(MavfiError, match="no such factor to replace"):
+        replaced(load_spec("fig8"), ["compat=rosfi-2021"])
