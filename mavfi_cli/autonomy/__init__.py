@@ -11,7 +11,7 @@ Importing this package is cheap. Each kernel module imports numba or a native li
 from __future__ import annotations
 
 OUR_PLANNERS = ("rrtstar", "rrt", "rrtconnect")
-SMOOTHERS = ("ours", "release")  # `smoothing` and `minimum_snap`
+SMOOTHERS = ("ours", "release")
 
 
 def canonical_planner(name: str) -> str:

@@ -13,25 +13,21 @@ solver of mav_trajectory_generation (Richter, Bry and Roy 2013) with these condi
 - A segment that is not free gets a vertex in the middle of its straight line, and the whole path is
   solved again, up to 40 times. More vertices mean shorter segments, so the vehicle is slow where
   the path is narrow.
-
-The samples differ in one point. The release gives a waypoint the position of the next sample, and
-ours has position, velocity and acceleration of one moment, because our reference moves between
-waypoints (see `tracking`).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from mavfi_cli.autonomy.grid import ObstacleGrid
-from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.smoothing import SmoothingParams, limited, sampled_trajectory
 from mavfi_cli.core.compiled import compiled
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import FloatArray, Trajectory
+from mavfi_cli.core.types import FloatArray
 
 _TIME_FACTOR = 6.5  # `magic_fabian_constant` of the release
 _CHECK_STEP_S = 0.1  # time between two points of the release's collision test
@@ -40,34 +36,50 @@ _TERMS = 8  # coefficients of a polynomial of degree 7
 _REACH = 10  # farthest non-zero entry from the diagonal of the spline's equations
 
 
-def smooth_minimum_snap(
-    path_enu_m: FloatArray, grid: ObstacleGrid, request: PlanRequest, params: SmoothingParams
-) -> tuple[Trajectory, bool]:
-    """Compute the minimum-snap trajectory along a free path (n, 3).
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MinimumSnap:
+    """A minimum-snap curve through the vertices of a path."""
 
-    It begins with the request's velocity, limited to v_max, and ends at rest.
+    durations_s: FloatArray  # (n - 1,) of the segments
+    coefficients: FloatArray  # (n - 1, 8, 3) of u = t / duration, 0..1, in each segment
+    free: bool  # True if all of the curve lies in free space
 
-    Returns:
-        The trajectory, and True if all of it lies in free space.
-    """
-    vertices = _distinct(np.asarray(path_enu_m, np.float64))
-    velocity = limited(request.velocity_enu_mps, params.v_max_mps)
-    for _ in range(params.passes_max):
-        durations_s = _segment_durations(vertices, params.v_max_mps, params.a_max_mps2)
-        spline = _solve(vertices, durations_s, velocity)
-        blocked = _first_blocked(spline, durations_s, grid)
-        if blocked is None:
-            break
-        middle = 0.5 * (vertices[blocked] + vertices[blocked + 1])
-        vertices = np.insert(vertices, blocked + 1, middle, axis=0)
-    period_s = params.sample_period_s
-    count = max(1, math.floor(float(durations_s.sum()) / period_s))
-    times_s = np.arange(count, dtype=np.float64) * period_s
-    position, velocity, acceleration = (
-        _evaluate(spline, durations_s, times_s, order) for order in range(3)
-    )
-    trajectory = sampled_trajectory(position, velocity, acceleration, request, params)
-    return trajectory, blocked is None
+    @classmethod
+    def through(
+        cls,
+        path_enu_m: FloatArray,
+        velocity_enu_mps: FloatArray,
+        is_free: Callable[[FloatArray], bool],
+        *,
+        v_max_mps: float,
+        a_max_mps2: float,
+        passes_max: int,
+    ) -> Self:
+        """Find the curve along a free path (n, 3), from a velocity (3,) at its start to rest.
+
+        Args:
+            is_free: returns True if a polyline (k, 3) lies in free space.
+            passes_max: number of times that it is solved; each pass adds a vertex.
+        """
+        vertices = _distinct(path_enu_m)
+        for _ in range(passes_max):
+            durations_s = _segment_durations(vertices, v_max_mps, a_max_mps2)
+            coefficients = _solve(vertices, durations_s, velocity_enu_mps)
+            blocked = _first_blocked(coefficients, durations_s, is_free)
+            if blocked is None:
+                break
+            middle = 0.5 * (vertices[blocked] + vertices[blocked + 1])
+            vertices = np.insert(vertices, blocked + 1, middle, axis=0)
+        return cls(durations_s=durations_s, coefficients=coefficients, free=blocked is None)
+
+    def sampled(self, period_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return position, velocity and acceleration, (k, 3) each, at equal times from 0 on."""
+        count = max(1, math.floor(float(self.durations_s.sum()) / period_s))
+        times_s = np.arange(count, dtype=np.float64) * period_s
+        position, velocity, acceleration = (
+            _evaluate(self.coefficients, self.durations_s, times_s, order) for order in range(3)
+        )
+        return position, velocity, acceleration
 
 
 def _distinct(path: FloatArray) -> FloatArray:
@@ -175,11 +187,13 @@ def _evaluate(
     return value
 
 
-def _first_blocked(spline: FloatArray, durations_s: FloatArray, grid: ObstacleGrid) -> int | None:
+def _first_blocked(
+    spline: FloatArray, durations_s: FloatArray, is_free: Callable[[FloatArray], bool]
+) -> int | None:
     """Return the first segment that is not free; None if all are free."""
     for segment, duration_s in enumerate(durations_s.tolist()):
         within_s = np.append(np.arange(0.0, duration_s, _CHECK_STEP_S), duration_s)
         alone = spline[segment : segment + 1], durations_s[segment : segment + 1]
-        if not grid.path_free(_evaluate(*alone, within_s, 0)):
+        if not is_free(_evaluate(*alone, within_s, 0)):
             return segment
     return None

@@ -24,16 +24,15 @@ from ompl import util as ou
 
 from mavfi_cli.autonomy import OUR_PLANNERS, SMOOTHERS, canonical_planner
 from mavfi_cli.autonomy.grid import GridTooLarge, ObstacleGrid, segment_free
-from mavfi_cli.autonomy.minimum_snap import smooth_minimum_snap
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanFailure, PlanRequest
-from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth
+from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth, smooth_as_released
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.installed import PlugIns
 from mavfi_cli.core.types import FloatArray, Trajectory
 
 MAX_SEED = 0x7FFF_FFFF
-_SMOOTHERS = dict(zip(SMOOTHERS, (smooth, smooth_minimum_snap), strict=True))
+_SMOOTHERS = dict(zip(SMOOTHERS, (smooth, smooth_as_released), strict=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.autonomy.grid import ObstacleGrid
+from mavfi_cli.autonomy.minimum_snap import MinimumSnap
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.core.frames import norm, wrap_angle
 from mavfi_cli.core.types import FloatArray, Trajectory
@@ -79,7 +80,7 @@ def smooth(
     Returns:
         The trajectory, and True if all of it lies in free space.
     """
-    velocity = limited(request.velocity_enu_mps, params.v_max_mps)
+    velocity = _cut(request.velocity_enu_mps, params.v_max_mps)
     path = np.asarray(path_enu_m, np.float64)
     vertices, free = _with_run_out(path, velocity, grid, params)
     line, period, a = _Polyline(vertices, params), params.sample_period_s, params.acceleration_mps2
@@ -101,7 +102,27 @@ def smooth(
     return _trajectory(spline, request, params), free
 
 
-def limited(velocity: FloatArray, limit: float) -> FloatArray:
+def smooth_as_released(
+    path_enu_m: FloatArray, grid: ObstacleGrid, request: PlanRequest, params: SmoothingParams
+) -> tuple[Trajectory, bool]:
+    """Compute the released planner's trajectory along a free path (n, 3), as `smooth` does.
+
+    One point differs. The release gives a waypoint the position of the next sample, and ours has
+    position, velocity and acceleration of one moment, because our reference moves between waypoints
+    (see `tracking`).
+    """
+    curve = MinimumSnap.through(
+        np.asarray(path_enu_m, np.float64),
+        _cut(request.velocity_enu_mps, params.v_max_mps),
+        grid.path_free,
+        v_max_mps=params.v_max_mps,
+        a_max_mps2=params.a_max_mps2,
+        passes_max=params.passes_max,
+    )
+    return _sampled(*curve.sampled(params.sample_period_s), request, params), curve.free
+
+
+def _cut(velocity: FloatArray, limit: float) -> FloatArray:
     """Limit a velocity (3,). Return zero if it is negligible or not finite."""
     velocity = np.asarray(velocity, np.float64)
     largest = float(np.abs(velocity).max())
@@ -326,10 +347,10 @@ def _trajectory(spline: FloatArray, request: PlanRequest, params: SmoothingParam
     accelerations = np.zeros_like(velocities)
     accelerations[:-1] = np.diff(velocities, axis=0) / period
     positions = 0.5 * (spline[:-1] + spline[1:])
-    return sampled_trajectory(positions, velocities, accelerations, request, params)
+    return _sampled(positions, velocities, accelerations, request, params)
 
 
-def sampled_trajectory(
+def _sampled(
     positions_enu_m: FloatArray,
     velocities_enu_mps: FloatArray,
     accelerations_enu_mps2: FloatArray,

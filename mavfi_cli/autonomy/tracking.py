@@ -24,6 +24,11 @@ waypoint in slices of 10 ms and sleeps through a stretched slice. Its C++ librar
 5) passes a slice of 2^63 s or more to nanosleep as a negative number of seconds. nanosleep rejects
 it, so the slice and the waypoint end at once.
 
+A slice of 10 ms of the trajectory can take longer than 10 ms, because the released follower calls
+the simulator in every slice. `slice_period_s` is the time that it takes. The clock then runs at the
+ratio 0.01 / slice_period_s, but the commanded velocity is that of the waypoint, so the vehicle runs
+ahead of the reference until the position error balances the difference.
+
 A term of a corrupted reference that is not finite is left out: the position error, the velocity or
 the acceleration of that axis counts as zero, and the last yaw is kept. Position and velocity
 between waypoints depend on the acceleration, so a NaN there disables the whole axis. Finite values
@@ -150,6 +155,7 @@ class TrackingParams:
     step_max_s: float = 0.1  # upper limit of the time step
     stretches_clock: bool = False
     skips_endless_slices: bool = False
+    slice_period_s: float = SLICE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,7 +223,7 @@ def step(
         velocity_enu_mps=out[0:3].copy(),
         yaw_rad=yaw_rad,
         acceleration_enu_mps2=out[3:6].copy(),
-        pace=1.0 / stretch,
+        pace=1.0 / max(stretch, params.slice_period_s / SLICE_S),
         skips_waypoint=params.skips_endless_slices and SLICE_S * stretch >= ENDLESS_S,
     )
     return (

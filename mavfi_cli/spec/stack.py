@@ -36,6 +36,7 @@ _LIMITS = {  # minimum and maximum of each number
     "planner_radius_m": (0.1, 10.0),
     "goal_tolerance_m": (0.1, 50.0),
     "rejected_plan_pause_s": (0.0, 60.0),
+    "slice_period_s": (0.01, 1.0),
 }
 
 
@@ -79,6 +80,8 @@ class Stack:
         slows_where_blind: The vehicle flies at half speed outside its field of view.
         smoother: Smoothing of planned paths: `ours` (straight flight at 0.9 v_max with blended
             corners) or `release` (minimum snap with the release's segment times).
+        slice_period_s: Time in which the follower flies a slice of 10 ms of the trajectory. The
+            trajectory's clock slows down by the ratio, the commanded velocity does not.
         restores_counters: A supervisor gives a restarted node the sequence numbers of the last
             message that left it. Otherwise the node counts from 0.
         standby: Nodes whose process has a hot standby, which works on the same inputs and takes
@@ -115,6 +118,7 @@ class Stack:
     slows_where_blind: bool
     # Files and models of older versions do not have the keys with a default.
     smoother: str = SMOOTHERS[0]
+    slice_period_s: float = 0.01
     restores_counters: bool = False
     standby: tuple[str, ...] = ()
     description: str = ""  # which `mavfi stacks` prints

@@ -5,10 +5,9 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from mavfi_cli.autonomy.grid import ObstacleGrid
-from mavfi_cli.autonomy.minimum_snap import smooth_minimum_snap
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
-from mavfi_cli.autonomy.smoothing import SmoothingParams
+from mavfi_cli.autonomy.smoothing import SmoothingParams, smooth_as_released
 
 PARAMS = SmoothingParams()
 BOUNDS = np.array([-60.0, -60.0, 0.0, 60.0, 60.0, 10.0])
@@ -21,7 +20,7 @@ def smoothed(path, grid=OPEN, velocity=(0.0, 0.0, 0.0)):
         stamp_s=7.0, position_enu_m=ZERO, velocity_enu_mps=np.array(velocity, float), yaw_rad=0.0,
         goal_enu_m=ZERO, attempt=1, trajectory_seq=4, future_collision_seq=2,
     )  # fmt: skip
-    return smooth_minimum_snap(np.array(path, np.float64), grid, request, PARAMS)
+    return smooth_as_released(np.array(path, np.float64), grid, request, PARAMS)
 
 
 def duration_s(length_m):

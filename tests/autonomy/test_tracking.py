@@ -128,3 +128,27 @@ def test_a_huge_reference_is_obeyed_at_the_limit():
     _, command = tracking.step(START, following(row), PARAMS)
     np.testing.assert_allclose(command.velocity_enu_mps, [0.0, 3.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(command.acceleration_enu_mps2, [0.0, 5.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("planned_mps", "slice_period_s", "pace"),
+    [
+        (1.0, 0.01, 1.0),
+        (1.0, 0.0265, 0.01 / 0.0265),
+        (6.0, 0.01, 0.5),  # twice the speed limit stretches the slice
+        (6.0, 0.0265, 0.01 / 0.0265),  # a slice that takes longer anyway is not stretched further
+        (12.0, 0.0265, 0.25),
+    ],
+)
+def test_a_slice_that_takes_long_slows_the_clock_but_not_the_command(
+    planned_mps, slice_period_s, pace
+):
+    params = replace(
+        PARAMS, kp_per_s=0.2, kp_climb_per_s=0.2, ki_per_s2=0.0, kd=0.0, stretches_clock=True,
+        slice_period_s=slice_period_s,
+    )  # fmt: skip
+    row = [0.0, 0.0, 5.0, 0.0, planned_mps, 0.0, 0.0, 0.0, 0.0, 0.0]
+    at_reference = replace(following(row), position_enu_m=np.array([0.0, 0.0, 5.0]), time_s=0.0)
+    _, command = tracking.step(START, at_reference, params)
+    assert command.pace == pytest.approx(pace)
+    assert command.velocity_enu_mps[0] == pytest.approx(min(planned_mps, 3.0))

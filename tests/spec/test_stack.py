@@ -7,7 +7,9 @@ from mavfi_cli.spec.stack import KEYS, STACKS, Stack, load_stack
 
 
 def test_the_shipped_stacks_say_every_key_and_where_it_is_from():
-    assert STACKS.names == ["hardened", "mavbench", "mavbench-protected", "mavbench-release"]
+    assert STACKS.names == [
+        "hardened", "mavbench", "mavbench-protected", "mavbench-release", "mavbench-replica",
+    ]  # fmt: skip
     mavbench = load_stack("mavbench")
     unused = {"tracking_guard_m", "farthest_waypoint_m"}
     assert set(mavbench.sources) == set(KEYS) - unused
