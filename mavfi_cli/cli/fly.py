@@ -91,6 +91,9 @@ _detector, _output = section("Detector"), section("Output")
                "which {link}, {goal} and others are filled in.")  # fmt: skip
 @_mission("--speed", type=types.ABOVE_ZERO, default=1.0,
           help="Pace of the vehicle with --companion, in times real time.")  # fmt: skip
+@_mission("--golden", "golden", type=types.MISSIONS, metavar="N",
+          help="Fly the mission N times without fault and detector, and report how far the flights "
+               "of --companion differ.")  # fmt: skip
 @_mission("--link", metavar="URL",
           help="Fly a foreign autopilot: udpin:, udpout:, tcp:, tcpin:, serial:.")  # fmt: skip
 @_mission("--eyes", is_flag=True,
@@ -186,6 +189,7 @@ def fly(
     as_json: bool,
     quiet: bool,
     config: Path | None,
+    golden: int | None,
     **_options: Any,
 ) -> None:
     """Fly one mission from take-off to the goal, through unknown obstacles.
@@ -200,8 +204,17 @@ def fly(
     from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
     from mavfi_cli.report.view.entries import ViewedFlight
+    from mavfi_cli.studies.spread import fly_spread
 
     mission = _mission_of(config)
+    if golden is not None:
+        if mission.companion is None:
+            raise click.UsageError("--golden needs --companion; other flights repeat exactly")
+        with progress_view(mission, quiet=quiet) as view:
+            spread = fly_spread(mission, golden, out, view)
+        text = json.dumps(spread.as_dict(), indent=2)
+        echo_lines(text.split("\n") if as_json else spread.lines())
+        return
     recorder = Recorder() if record else None
     if record:
         viewers.require_viewer(Path(f"flight.{record}"))

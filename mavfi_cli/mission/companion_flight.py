@@ -503,12 +503,14 @@ class _Verdict:
         self._rest_since_s = math.inf
         self._rests = False
         self.deviation_m = 0.0  # largest distance from the golden path
-        self._path = None if success.golden is None else _path_of(Path(success.golden))
+        self._path = None if success.golden is None else path_of(Path(success.golden))
 
     def see(self, state: VehicleState) -> None:
         """Handle a new state."""
         if self._path is not None:
-            self.deviation_m = max(self.deviation_m, _distance(state.position_enu_m, self._path))
+            self.deviation_m = max(
+                self.deviation_m, distance_from(state.position_enu_m, self._path)
+            )
         near_m = self._success.goal_m
         assert self.goal_enu_m is not None
         if (
@@ -544,8 +546,13 @@ class _Verdict:
         return all(ends or (self._crew.over,)) and inside
 
 
-def _path_of(folder: Path) -> FloatArray:
-    """Read the path (n, 3) of a flight, ENU, m."""
+def path_of(folder: Path) -> FloatArray:
+    """Read the path (n, 3) of a flight from its run folder, ENU, m.
+
+    Raises:
+        RecordError: Its trace cannot be read.
+        ConfigError: It has no path.
+    """
     trace = read_parquet(RunFolder(folder).trace, "golden trace")
     try:
         path = np.column_stack([trace[name].to_numpy() for name in ("x_m", "y_m", "z_m")])
@@ -556,7 +563,7 @@ def _path_of(folder: Path) -> FloatArray:
     return path
 
 
-def _distance(place: FloatArray, path: FloatArray) -> float:
+def distance_from(place: FloatArray, path: FloatArray) -> float:
     """Return the distance of a place (3,) from a polyline (n, 3), m."""
     begin, along = path[:-1], np.diff(path, axis=0)
     lengths = np.maximum((along**2).sum(axis=1), 1e-12)

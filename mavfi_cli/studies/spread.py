@@ -1,0 +1,98 @@
+"""How far repeated fault-free flights of a user's companion differ: outcome, time and path.
+
+Such a flight does not repeat, so this spread stands beside every effect of a fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.mission.companion_flight import distance_from, path_of
+from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.run import fly_to_end
+from mavfi_cli.mission.run_folder import Run
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.stats.shares import wilson
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """The spread of some flights.
+
+    Attributes:
+        outcomes: Number of flights by outcome.
+        succeeded: Share of success, and its 95 % interval (Wilson).
+        flight_time_s: Smallest, median and largest time of a successful flight, s.
+        apart_m: Largest distance from the path of the first successful flight, of each later one:
+            the median and the largest, m.
+    """
+
+    outcomes: dict[str, int]
+    succeeded: tuple[float, float, float]
+    flight_time_s: tuple[float, float, float]
+    apart_m: tuple[float, float]
+
+    @classmethod
+    def of(cls, runs: Sequence[Run]) -> Spread:
+        """Compare flights. Numbers without flights are NaN."""
+        good = [run for run in runs if run.record.succeeded]
+        share = wilson(len(good), len(runs))
+        times = sorted(run.record.quality_of_flight["flight_time_s"] for run in good)
+        apart = []
+        for run in good[1:]:
+            first = path_of(good[0].folder.path)
+            apart.append(max(distance_from(p, first) for p in path_of(run.folder.path)))
+        return cls(
+            outcomes=dict(Counter(run.record.outcome for run in runs)),
+            succeeded=(share.share, share.low, share.high),
+            flight_time_s=(_at(times, 0.0), _at(times, 0.5), _at(times, 1.0)),
+            apart_m=(_at(sorted(apart), 0.5), _at(sorted(apart), 1.0)),
+        )
+
+    def lines(self) -> list[str]:
+        """Describe the spread."""
+        total = sum(self.outcomes.values())
+        share, low, high = (100.0 * value for value in self.succeeded)
+        flown = ", ".join(f"{name} {count}" for name, count in sorted(self.outcomes.items()))
+        least, median, most = self.flight_time_s
+        return [
+            f"Outcomes    {flown}, of {total}: success {share:.1f} % ({low:.1f} to {high:.1f})",
+            f"Time        {median:.2f} s median, {least:.2f} to {most:.2f} s",
+            f"Path        {self.apart_m[0]:.2f} m median, {self.apart_m[1]:.2f} m largest distance "
+            "from the first flight",
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values; NaN becomes None."""
+        return {
+            name: [_known(number) for number in value] if isinstance(value, tuple) else value
+            for name, value in asdict(self).items()
+        }
+
+
+def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -> Spread:
+    """Fly the golden mission several times, one after the other, and compare the flights.
+
+    Raises:
+        Interrupted: The user ended it.
+        MavfiError: As for `fly_mission`.
+    """
+    runs = []
+    for number in range(1, count + 1):
+        runs.append(fly_to_end(config.golden, out))
+        watcher.on_note(f"flight {number} of {count}: {runs[-1].record.outcome}")
+    return Spread.of(runs)
+
+
+def _at(values: Sequence[float], share: float) -> float:
+    """Return the value at a share of sorted values; the upper one of two in the middle."""
+    return values[min(int(share * len(values)), len(values) - 1)] if values else math.nan
+
+
+def _known(number: float) -> float | None:
+    return None if math.isnan(number) else number
