@@ -101,7 +101,7 @@ def in_flights(flights: int, fault_seed: int) -> None:
           f" {'recovery':>9} {'alarms':>7}")  # fmt: skip
     for name in base.PLUG_INS.names:
         for kind, options in (("golden", ()), ("faulty", fault)):
-            flown = [fly(*CALM, "--detector", name, *options).result
+            flown = [fly(*CALM, "--detector", name, *options).record
                      for _ in range(flights)]  # fmt: skip
             costs = [cost for cost in map(DetectionCost.of, flown) if cost is not None]
             check_us = 1e6 * statistics.median(cost.check_host_s for cost in costs)

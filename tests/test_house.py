@@ -17,7 +17,7 @@ SOURCES = {
 }
 LONGEST_CHAIN = 14  # modules, each of which imports the next, wherever the import stands
 MOST_FILES = 260
-MOST_NAMES = 920  # public classes and functions at the top level; a row of results is a class
+MOST_NAMES = 940  # public classes and functions at the top level; a row of results is a class
 # Functions that nothing in the product calls by name, with the reason to keep them.
 UNCALLED = {
     "__getattr__": "Python calls it: names of the library are imported when they are first used",
@@ -155,7 +155,8 @@ def test_every_public_function_has_a_caller():
 def test_a_record_is_read_in_one_module():
     """Others take sections and measures from `mission.measures`."""
     reads = r"\bresult(\[|\.get\()[\"']"
-    assert mentions(reads) == {"mavfi_cli.mission.run_folder"}  # upgrades older records
+    here = "mavfi_cli.mission.measures"
+    assert mentions(reads) == {here, "mavfi_cli.mission.run_folder"}  # it upgrades older records
 
 
 def by_processor(module):

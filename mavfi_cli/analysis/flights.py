@@ -35,8 +35,8 @@ from mavfi_cli.mission.measures import (
     RECOMPUTED,
     STRUCK,
     DetectionCost,
+    FlightRecord,
     measures_of,
-    record_of,
 )
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.bootstrap import RESAMPLES, interval
@@ -99,7 +99,8 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
     level = None if fault is None else "instruction" if config.fault is None else "source"
     injected = None if entry.injected is None else entry.injected.value
     shares: list[float | None] = [None] * len(COSTS)
-    cost = DetectionCost.of(entry.result)
+    flight = entry.flight
+    cost = DetectionCost.of(flight)
     if cost is not None:
         recovery = (cost.recovery_s[stage] / cost.flight_s for stage in RECOMPUTED)
         shares = [cost.detection_share, *recovery]
@@ -123,7 +124,7 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
         "wall_s": entry.wall_s,
         "attempts": entry.attempts,
         "path": None if entry.path is None else str(entry.path),
-        **measures_of(entry.result),
+        **measures_of(flight),
         **dict(zip(COSTS, shares, strict=True)),
     }
 
@@ -246,7 +247,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
     if table is not None:
         return stored_provenance(table)
     first = next(source.results(), None)
-    record = record_of({} if first is None else first.result)
+    record = FlightRecord() if first is None else first.flight
     return {
         "name": source.meta("name"),
         "planned": source.planned(),
@@ -287,7 +288,7 @@ def changed(
 
 # One mission --------------------------------------------------------------------------------------
 
-_COMPARED = frozenset(measures_of({})) | {"outcome"}
+_COMPARED = frozenset(measures_of(FlightRecord())) | {"outcome"}
 
 
 def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str, Any]]:
@@ -311,9 +312,9 @@ def number_span(ledger: Ledger) -> str:
     return f"missions {min(numbers)} to {max(numbers)}" if numbers else "no missions"
 
 
-def differing(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
+def differing(row: Mapping[str, Any], flight: FlightRecord) -> list[str]:
     """Return the columns in which a repetition differs. Exports store mixed columns as text."""
-    again = {**measures_of(result), "outcome": record_of(result).outcome}
+    again = {**measures_of(flight), "outcome": flight.outcome}
     return [
         name
         for name, value in row.items()

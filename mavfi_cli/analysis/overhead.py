@@ -20,7 +20,7 @@ from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import Labels
 from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.types import Stage
-from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost, Record
+from mavfi_cli.mission.measures import HOST_CHECKS, DetectionCost, FlightRecord
 from mavfi_cli.mission.run_folder import RESULT, load_run
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
@@ -101,7 +101,7 @@ def flight_overheads(
     for group in groups:
         costs: dict[str, list[DetectionCost]] = {}
         for mission in ledger.results(group.codes("number")[group.counted].tolist()):
-            cost = DetectionCost.of(mission.result)
+            cost = DetectionCost.of(mission.flight)
             if cost is not None:
                 costs.setdefault(cost.detector, []).append(cost)
         rows += [FlightOverhead.of(group.labels, costs[name], confidence) for name in sorted(costs)]
@@ -152,7 +152,7 @@ class ComputeOverhead:
 
     @classmethod
     def of(
-        cls, records: Iterable[Record], platform: str | None = None
+        cls, records: Iterable[FlightRecord], platform: str | None = None
     ) -> dict[str, ComputeOverhead]:
         """The overhead of every detector in these records, summed over its flights.
 
@@ -250,13 +250,13 @@ def recorded_overheads(
     return known
 
 
-def _records(path: Path) -> Iterator[Record]:
+def _records(path: Path) -> Iterator[FlightRecord]:
     """Records of a run folder, of all runs in a folder, or of all missions of a campaign."""
     if path.is_file() or (path / RESULT).is_file():
-        yield load_run(path).result
+        yield load_run(path).record
         return
     for ledger in (file for pattern in _LEDGERS for file in sorted(path.glob(pattern))):
         with Ledger(ledger.parent) as opened:
-            yield from (entry.result for entry in opened.results())
+            yield from (entry.flight for entry in opened.results())
     for run in sorted(path.glob(f"*/{RESULT}")):
-        yield load_run(run).result
+        yield load_run(run).record

@@ -104,13 +104,13 @@ def _seen_of(path: Path) -> _Seen:
         return {}, (), []
     strikes = [
         PlanStrike(
-            stamp_s=strike["stamp_s"], state=change["state"], waypoint=change["index"],
-            before=_value(change["state"], change["before_hex"]),
-            after=_value(change["state"], change["after_hex"]),
+            stamp_s=strike.stamp_s, state=change.state, waypoint=change.index,
+            before=_value(change.state, change.before_hex),
+            after=_value(change.state, change.after_hex),
         )
-        for strike in run.record.fault.get("strikes", ())
-        for change in strike["changes"]
-        if change["state"] in BY_NAME and BY_NAME[change["state"]].stage is Stage.PLANNING
+        for strike in run.record.strikes
+        for change in strike.changes
+        if change.state in BY_NAME and BY_NAME[change.state].stage is Stage.PLANNING
     ]  # fmt: skip
     return columns_of(run.trace), run.folder.read_plans(), strikes
 
@@ -179,12 +179,12 @@ def _is_error_free(run: Run, stack: StackMark) -> bool:
     return (
         record.outcome == Outcome.SUCCESS.value
         and faults == (None, None)
-        and not (record.detection or {}).get("alarm_count")
+        and not (record.detection and record.detection.alarm_count)
         and _mark_of(record.config).digest == stack.digest
     )
 
 
-def _mark_of(config: Record) -> StackMark:
+def _mark_of(config: Json) -> StackMark:
     if companion := config.get("companion"):
         return CompanionConfig.load(companion).mark
     return load_stack(config["stack"]).mark

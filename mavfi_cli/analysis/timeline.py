@@ -76,9 +76,7 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
     timeline ends with the first setpoint of the new plan.
     """
     ran, reactions = run.folder.read_timetable()
-    answers = {
-        event["stamp_s"]: event["text"] for event in run.record.events if event["kind"] in _ANSWERS
-    }
+    answers = {event.stamp_s: event.text for event in run.record.events if event.kind in _ANSWERS}
     stamps = [] if run.trace is None else run.trace["stamp_s"].to_pylist()
     reaction = _typical(reactions, answers)
     if reaction is None:

@@ -100,7 +100,9 @@ class PilotParams:
 
 
 @dataclass(slots=True)
-class _Counters:
+class PilotCounters:
+    """Counters of the mission logic."""
+
     plans_requested: int = 0
     plans_failed: int = 0
     plans_ignored: int = 0  # stale, late, or out of order
@@ -204,7 +206,7 @@ class Pilot:
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
         self.params = params
         self.goal_enu_m = goal_enu_m
-        self.counters = _Counters()
+        self.counters = PilotCounters()
         self.mode = PilotMode.WAITING
         self.active = _ActivePlan(params)
         self._next: Trajectory | None = None

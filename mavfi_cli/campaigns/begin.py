@@ -39,7 +39,6 @@ from mavfi_cli.core.errors import (
 )
 from mavfi_cli.core.files import reading, write_text
 from mavfi_cli.mission.companion_faults import check_companion_fault
-from mavfi_cli.mission.measures import fields_of
 from mavfi_cli.mission.vehicle import VehicleInProcess
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -435,13 +434,12 @@ def _search(
             for flight in range(rule.flights)
         ]
         with run_campaign(planned, folder, options, spectator, append=True) as ledger:
-            replans = {mission.mission.config: fields_of(mission.result)["replans"]
-                       for mission in ledger.results()}  # fmt: skip
+            pilots = {result.mission.config: result.flight.pilot for result in ledger.results()}
         for seed in seeds:
             own = (
-                replans[mission.config] for mission in planned if mission.config.world_seed == seed
+                pilots[mission.config] for mission in planned if mission.config.world_seed == seed
             )
-            flown = (*flown, tuple(count for count in own if count is not None))
+            flown = (*flown, tuple(pilot.replans for pilot in own if pilot is not None))
             if rule.fits(flown[-1]):
                 return flown[:seed]
     often = sorted(itertools.chain.from_iterable(flown))

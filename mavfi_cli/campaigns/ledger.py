@@ -34,8 +34,16 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
-from mavfi_cli.core.files import inflate, open_own, plain, read_parquet, reading, writing
-from mavfi_cli.mission.measures import Record, fields_of, record_of
+from mavfi_cli.core.files import (
+    Json,
+    inflate,
+    open_own,
+    plain,
+    read_parquet,
+    reading,
+    writing,
+)
+from mavfi_cli.mission.measures import FlightRecord, fields_of
 from mavfi_cli.spec.mission import MissionConfig
 
 if TYPE_CHECKING:
@@ -246,7 +254,7 @@ class Ledger:
         name: str,
         cells: Mapping[str, int],
         missions: Iterable[tuple[int, int, str, str]],
-        results: Iterable[Record],
+        results: Iterable[Json],
     ) -> None:
         """Store all rows of a campaign, but no records.
 
@@ -348,7 +356,7 @@ class Ledger:
         number: int,
         *,
         state: ResultState,
-        result: Record,
+        result: Json,
         reason: str,
         injected: Injected | None,
         wall_s: float,
@@ -360,11 +368,12 @@ class Ledger:
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
         """
-        columns = fields_of(result)
+        flight = FlightRecord.of(result)
+        columns = fields_of(flight)
         row = (
             number,
             state.value,
-            record_of(result).outcome or None,
+            flight.outcome or None,
             reason,
             None if injected is None else injected.value,
             *(columns[name] for name in _SHORT),

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mavfi_cli.core.errors import ConfigError, MavfiError
-from mavfi_cli.mission.measures import FlightRecord, Record, record_of
+from mavfi_cli.core.files import Json
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
@@ -171,32 +172,31 @@ class Injected(Enum):
     NULL = "null"  # a null injection, which leaves out the flip
 
     @classmethod
-    def of(cls, result: Record, *, faulty: bool) -> Injected:
+    def of(cls, flight: FlightRecord, *, faulty: bool) -> Injected:
         """Return what happened to the fault of a mission, by its record."""
-        flight = record_of(result)
         fault = flight.fault
         if not faulty:
             return cls.GOLDEN
-        if not fault or fault["state"] in ("planned", "not_injected"):
+        if fault is None or fault.state in ("planned", "not_injected"):
             return cls.NOT_INJECTED
-        if fault["state"] == "null":
+        if fault.state == "null":
             return cls.NULL
-        activation = fault.get("activation") or {"activation": "read"}  # cut off: it may have been
-        fate = cls(_BY_ACTIVATION.get(activation["activation"], "active"))
+        activation = fault.activation
+        read = "read" if activation is None else activation.activation  # cut off: it may have been
+        fate = cls(_BY_ACTIVATION.get(read, "active"))
         return cls.CAUGHT if fate is cls.NOT_ACTIVATED and _caught(flight) else fate
 
 
 def _caught(flight: FlightRecord) -> bool:
     """Return True if an alarm withheld the struck value, matched by stamp or by state."""
-    strikes = flight.fault.get("strikes") or []
-    stamps = {strike["stamp_s"] for strike in strikes}
-    states = {change["state"] for strike in strikes for change in strike["changes"]}
-    alarms = flight.detection.get("alarms", [])
+    stamps = {strike.stamp_s for strike in flight.strikes}
+    states = {change.state for strike in flight.strikes for change in strike.changes}
+    alarms = () if flight.detection is None else flight.detection.alarms
     return any(
-        alarm["response"] != "accept"
+        alarm.response != "accept"
         and (
-            alarm["stamp_s"] in stamps
-            or (alarm["stamp_s"] >= min(stamps) and not states.isdisjoint(alarm["states"]))
+            alarm.stamp_s in stamps
+            or (alarm.stamp_s >= min(stamps) and not states.isdisjoint(alarm.states))
         )
         for alarm in (alarms if stamps else [])
     )
@@ -227,8 +227,13 @@ class MissionResult:
     state: ResultState
     outcome: str | None
     reason: str
-    result: Record
+    result: Json
     injected: Injected | None
     wall_s: float
     attempts: int
     path: Path | None
+
+    @property
+    def flight(self) -> FlightRecord:
+        """The sections of the result."""
+        return FlightRecord.of(self.result)

@@ -47,7 +47,7 @@ from mavfi_cli.core.files import file_digest, own_folder, sync_folder, writing
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.mission.instruction import CACHE, kept_in
-from mavfi_cli.mission.measures import record_of
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.shares import wilson
@@ -501,19 +501,19 @@ class _Run:
     def _settle(self, ended: AttemptEnd, verdict: AttemptResult, config: MissionConfig) -> None:
         """Store a finished mission: first its run folder, then its row."""
         assert verdict.state is not None
-        number, result = ended.number, verdict.result
-        path, outcome = None, record_of(result).outcome or None
+        number, path, flight = ended.number, None, FlightRecord.of(verdict.result)
+        outcome = flight.outcome or None
         keeps = number in self._options.kept or self._options.keep.wants(number, outcome)
         if verdict.run is not None and keeps:
             place = _put_away(verdict.run, self._folder / RUNS, number)
             path = str(place.relative_to(self._folder))
         flown = verdict.state is ResultState.FLOWN
         faulty = config.fault is not None or config.instruction is not None
-        injected = Injected.of(result, faulty=faulty) if flown else None
+        injected = Injected.of(flight, faulty=faulty) if flown else None
         self._ledger.add(
             number,
             state=verdict.state,
-            result=result,
+            result=verdict.result,
             reason=verdict.reason,
             injected=injected,
             wall_s=ended.wall_s,

@@ -27,11 +27,11 @@ from mavfi_cli.campaigns.cluster_keys import security
 from mavfi_cli.campaigns.missions import Changes, ResultState
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import Interrupted, MavfiError, RecordError
-from mavfi_cli.core.files import ScratchFolder, inflate, own_folder, write_atomically
+from mavfi_cli.core.files import Json, ScratchFolder, inflate, own_folder, write_atomically
 from mavfi_cli.core.fork_server import ERRORS, HALT, PACKET, SCRATCH, ForkServer
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.core.types import Outcome
-from mavfi_cli.mission.measures import Record, record_of
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import FAULT, RESULT, RunFolder
 from mavfi_cli.spec.fault import PROCESS
 from mavfi_cli.spec.mission import MissionConfig
@@ -55,7 +55,7 @@ class AttemptResult:
     """
 
     state: ResultState | None
-    result: Record
+    result: Json
     reason: str
     run: Path | None = None
     doubtful: bool = False
@@ -252,18 +252,19 @@ def _recorded(run: Path, config: MissionConfig) -> AttemptResult:
         result = json.loads((run / "result.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise RecordError(f"{run}: {error}") from None
-    flight = record_of(result)
+    flight = FlightRecord.of(result)
     outcome, reason = flight.outcome, flight.reason
     if outcome == Outcome.INTERRUPTED.value:
         return AttemptResult(state=None, result={}, reason="interrupted")
-    crashes = [crash["how"] for node in flight.nodes.values() for crash in node["crashes"]]
+    crashes = [crash.how for node in flight.nodes.values() for crash in node.crashes]
     if config.link is None:  # no fault of the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
             return AttemptResult(state=None, result={}, reason=reason)
         if flight.referee is None:
             reason = "the vehicle died before it had saved the truth"
             return AttemptResult(state=None, result={}, reason=reason)
-    by_fault = flight.fault.get("stage") == PROCESS  # it kills a node itself
+    fault = flight.state_fault
+    by_fault = fault is not None and fault.stage == PROCESS  # it kills a node itself
     doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
     return AttemptResult(
         state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=doubtful

@@ -232,23 +232,25 @@ def fly(
         echo(json.dumps(run.result, indent=2, sort_keys=True))
     else:
         drawn = folder_lines(run, folder.picture if picture else None)
-        echo_lines([*summary_lines(run.result), *drawn, *_hint(run)])
+        echo_lines([*summary_lines(run.record), *drawn, *_hint(run)])
     if run.record.outcome == "interrupted":
         raise click.exceptions.Exit(130)
     if expect is not None and run.record.outcome != expect:
-        note_error(f"expected {expect}, got {outcome_line(run.result)}")
+        note_error(f"expected {expect}, got {outcome_line(run.record)}")
         raise click.exceptions.Exit(1)
 
 
 def _hint(run: Run) -> list[str]:
     """Suggest a fault that moves a waypoint far, if the flown one hardly changed its state."""
-    fault, config = run.record.fault, run.record.config
-    changes = [change for strike in fault.get("strikes", []) for change in strike["changes"]]
+    record = run.record
+    changes = [change for strike in record.strikes for change in strike.changes]
     small = (
-        abs(change["after"] - change["before"]) <= _SMALL * max(1.0, abs(change["before"]))
+        change.before is not None
+        and change.after is not None
+        and abs(change.after - change.before) <= _SMALL * max(1.0, abs(change.before))
         for change in changes
     )
-    if run.record.outcome != "success" or config["detector"] or not (changes and all(small)):
+    if not record.succeeded or record.config["detector"] or not (changes and all(small)):
         return []
     if "config" in given_options():  # its fault settings would alter the suggested one
         return []

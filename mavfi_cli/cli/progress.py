@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from mavfi_cli.campaigns.progress import Progress, Spectator, duration
 from mavfi_cli.core.errors import printable
+from mavfi_cli.core.flight_record import Event
 from mavfi_cli.core.terminal import cleaned, note
-from mavfi_cli.mission.progress import Event, FlightProgress, Watcher
+from mavfi_cli.mission.progress import FlightProgress, Watcher
 
 if TYPE_CHECKING:
     from rich.live import Live

@@ -53,13 +53,13 @@ def show(run: Path, as_json: bool, pair: bool, events: bool, picture: Path | Non
     if recorded.record.fault:
         golden = paired_golden(recorded, note) if pair else recorded.golden
     with reading(recorded.folder.path):
-        lines = summary_lines(recorded.result)
+        lines = summary_lines(recorded.record)
         if golden is not None:
             lines += difference_lines(recorded, golden)
         elif recorded.record.fault:
             lines.append("Effect      unknown; `mavfi show --pair` flies the golden run to find it")
         if events:
-            lines += ["", "Events", *event_lines(recorded.result)]
+            lines += ["", "Events", *event_lines(recorded.record)]
     echo_lines([*lines, *folder_lines(recorded, picture)])
 
 
@@ -140,8 +140,8 @@ def _repeat_run(
     }
     if not with_fault:
         lines = [
-            f"with the fault     {outcome_line(run.result)}",
-            f"without            {outcome_line(again.result)}",
+            f"with the fault     {outcome_line(run.record)}",
+            f"without            {outcome_line(again.record)}",
             *difference_lines(run, again),
             "",
         ]
@@ -171,7 +171,7 @@ def _repeat_mission(
     config = config if with_fault else config.golden
     note(f"flying mission {number}: {config.world}, seed {config.seed}")
     again = fly_to_end(config, out)
-    changed = differing(row, again.result)
+    changed = differing(row, again.record)
     comparison = {
         "campaign": str(campaign),
         "mission": number,
@@ -182,7 +182,7 @@ def _repeat_mission(
     }
     same = "identical in every measure"
     verdict = f"DIFFERENT in {', '.join(changed)}" if changed else same
-    return comparison, [outcome_line(again.result), verdict, f"Run folder  {again.folder.path}"]
+    return comparison, [outcome_line(again.record), verdict, f"Run folder  {again.folder.path}"]
 
 
 def _warn_of_builds(versions: Mapping[str, str]) -> None:

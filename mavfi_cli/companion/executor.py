@@ -31,6 +31,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import numpy as np
 
 from mavfi_cli.companion.node_process import NodeLost, NodeProcess
+from mavfi_cli.core.flight_record import MeasuredKernel, MeasuredPlatform
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import KERNELS, Invocation
 from mavfi_cli.core.wall import WallClock
@@ -68,21 +69,21 @@ class LatencyModel:
         latency, drawn = self._profile.kernels[kernel], self._streams[kernel].standard_normal()
         return latency.latency_s * math.exp(latency.spread * float(drawn))
 
-    def summary(self) -> dict[str, Any] | None:
+    def summary(self) -> MeasuredPlatform | None:
         """Return the factor of a measured platform, and each kernel's medians, s; else None."""
         factor = self._profile.measured_factor
         if factor is None:
             return None
         kernels = {
-            kernel: {
-                "host_median_s": (median_s := float(np.median(times_s))),
-                "latency_median_s": factor * median_s,
-                "invocations": len(times_s),
-            }
+            kernel: MeasuredKernel(
+                host_median_s=(median_s := float(np.median(times_s))),
+                latency_median_s=factor * median_s,
+                invocations=len(times_s),
+            )
             for kernel, times_s in self._host_s.items()
             if times_s
         }
-        return {"platform": self._profile.name, "factor": factor, "kernels": kernels}
+        return MeasuredPlatform(platform=self._profile.name, factor=factor, kernels=kernels)
 
 
 class TurnOver(Exception):

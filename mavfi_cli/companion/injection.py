@@ -9,7 +9,14 @@ from typing import Any, TypeVar
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import FaultSpecError
-from mavfi_cli.core.files import write_json
+from mavfi_cli.core.files import Json, write_json
+from mavfi_cli.core.flight_record import (
+    Reader,
+    RecordedActivation,
+    RecordedTrigger,
+    StateFault,
+    Strike,
+)
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 from mavfi_cli.fi.bits import format_distinct
@@ -19,15 +26,12 @@ from mavfi_cli.fi.injector import (
     MemoryInjector,
     Moment,
     NoInjector,
-    Reader,
     SourceInjector,
-    Strike,
 )
 from mavfi_cli.spec.fault import DETECTOR, PROCESS, FaultConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 M = TypeVar("M")
-SCHEMA = 1
 
 
 class NoInjection:
@@ -56,7 +60,7 @@ class NoInjection:
         """Return one line per strike since the last call."""
         return []
 
-    def finish(self) -> dict[str, Any] | None:
+    def finish(self) -> Json | None:
         """Write and return the record at the end of the mission."""
         return None
 
@@ -161,48 +165,47 @@ class SourceInjection(NoInjection):
         if self._executor is not None:
             self._executor.kill(self._reader)
 
-    def finish(self) -> dict[str, Any] | None:
+    def finish(self) -> Json | None:
         """Write and return the record."""
         if self._state == "planned":
             self._state = "not_injected"
         return self._write()
 
-    def _write(self) -> dict[str, Any]:
-        activation, reader = self._activation()
+    def _write(self) -> Json:
         trigger, injector = self._config.trigger(), self.injector
-        written = {
-            "schema": SCHEMA,
-            "level": "source",
-            "state": self._state,
-            "reason": injector.missed if self._state == "not_injected" else "",
-            "request": asdict(self._config),
-            "stage": self._stage,
-            "states": list(self._units),
-            "units": list(self._units.values()),
-            "trigger": {
-                "when": trigger.when.value,
-                "number": trigger.number,
-                "phase": trigger.phase,
-                "drawn_time_s": injector.drawn_time_s,
-            },
-            "strikes": [asdict(strike) for strike in injector.strikes],
-            "strike_count": injector.count,
-            "activation": {
-                "activation": activation,
-                "first_reader": asdict(reader) if reader else None,
-            },
-        }
+        written = asdict(
+            StateFault(
+                state=self._state,
+                reason=injector.missed if self._state == "not_injected" else "",
+                request=asdict(self._config),
+                stage=self._stage,
+                states=list(self._units),
+                units=list(self._units.values()),
+                trigger=RecordedTrigger(
+                    when=trigger.when.value,
+                    number=trigger.number,
+                    phase=trigger.phase,
+                    drawn_time_s=injector.drawn_time_s,
+                ),
+                strikes=injector.strikes,
+                strike_count=injector.count,
+                activation=self._activation(),
+            )
+        )
         assert self._path is not None
         write_json(self._path, written)
         return written
 
-    def _activation(self) -> tuple[str, Reader | None]:
+    def _activation(self) -> RecordedActivation:
+        follower, strikes = self.injector.follower, self.injector.strikes
         if not self._reader:
-            return self.injector.follower.activation.value, self.injector.follower.reader
-        if not self.injector.strikes:
-            return "not_injected", None
-        stamp_s = self.injector.strikes[0].stamp_s
-        return "read", Reader(name=self._reader, stamp_s=stamp_s, state=next(iter(self._units)))
+            kind = follower.activation.value
+            return RecordedActivation(activation=kind, first_reader=follower.reader)
+        if not strikes:
+            return RecordedActivation(activation="not_injected")
+        state = next(iter(self._units))
+        reader = Reader(name=self._reader, stamp_s=strikes[0].stamp_s, state=state)
+        return RecordedActivation(activation="read", first_reader=reader)
 
 
 def _strike_text(strike: Strike) -> str:

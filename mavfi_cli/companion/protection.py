@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from time import perf_counter
@@ -27,6 +27,7 @@ import numpy as np
 from mavfi_cli.autonomy.pilot import Pilot
 from mavfi_cli.autonomy.tracking import without_waypoint
 from mavfi_cli.core.compiled import in_cache
+from mavfi_cli.core.flight_record import Detection, RecordedAlarm, RecordedRecovery
 from mavfi_cli.core.types import CollisionReport, Command, Message, Stage, Trajectory, VehicleState
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.gate import Alarm, Gate
@@ -56,23 +57,6 @@ class _Outage:
     since_s: float | None = None
     in_a_row: int = 0
     alarm: Alarm | None = None  # of the last message, if it raised one
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _ListedAlarm:
-    """An alarm in the record."""
-
-    stamp_s: float
-    message: str  # report, plan, ahead (active plan) or tick
-    stage: str
-    score: float
-    states: tuple[str, ...]
-    response: str
-    recomputes: str | None  # recomputed stage if it is another; else None, which is not written
-
-
-def _known(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {key: value for key, value in items if value is not None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,8 +109,8 @@ class NoProtection:
         """Return the lines to announce since the last call."""
         return []
 
-    def summary(self) -> dict[str, Any] | None:
-        """Return checks, alarms and recoveries as plain values; None without a detector."""
+    def summary(self) -> Detection | None:
+        """Return checks, alarms and recoveries; None without a detector."""
         return None
 
 
@@ -147,7 +131,7 @@ class Protection(NoProtection):
         self._checks = dict.fromkeys(("report", "plan", "ahead", "tick"), 0)
         self._responses = dict.fromkeys((r.value for r in Response if r is not Response.PASS), 0)
         self._outages = {stage: _Outage() for stage in Stage}
-        self._alarms: list[_ListedAlarm] = []
+        self._alarms: list[RecordedAlarm] = []
         self._news: list[str] = []
         self._announced_s: dict[Stage, float] = {}
 
@@ -240,7 +224,7 @@ class Protection(NoProtection):
             self._end(outage, stamp_s)
         if len(self._alarms) < MAX_LISTED_ALARMS:
             self._alarms.append(
-                _ListedAlarm(
+                RecordedAlarm(
                     stamp_s=round(stamp_s, 9),
                     message=message,
                     stage=stage.value,
@@ -275,21 +259,21 @@ class Protection(NoProtection):
         news, self._news = self._news, []
         return news
 
-    def summary(self) -> dict[str, Any]:
-        """Return checks, alarms and recoveries as plain values."""
-        return {
-            "detector": self._config.name,
-            "protect": list(self._config.protect),
-            "threshold": self._threshold,
-            "checks": self._checks,
-            "alarm_count": sum(self._responses.values()),
-            "responses": self._responses,
-            "alarms": [asdict(alarm, dict_factory=_known) for alarm in self._alarms],
-            "recoveries": {
-                stage.value: {"count": outage.count, "total_s": round(outage.total_s, 9)}
+    def summary(self) -> Detection:
+        """Return checks, alarms and recoveries."""
+        return Detection(
+            detector=self._config.name,
+            protect=self._config.protect,
+            threshold=self._threshold,
+            checks=self._checks,
+            alarm_count=sum(self._responses.values()),
+            responses=self._responses,
+            alarms=self._alarms,
+            recoveries={
+                stage.value: RecordedRecovery(count=outage.count, total_s=round(outage.total_s, 9))
                 for stage, outage in self._outages.items()
             },
-        }
+        )
 
     @staticmethod
     def is_compiled(config: DetectorConfig, stack: str) -> bool:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, get_args, get_origin
 import cattrs
 from cattrs import AttributeValidationNote, ForbiddenExtraKeysError, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, make_mapping_structure_fn
+from cattrs.strategies import configure_union_passthrough
 
 from mavfi_cli.core.errors import ConfigError, UnknownName
 
@@ -129,6 +130,22 @@ def structure(
     raise ConfigError(problem, path=path, line=_line_of(text, key), key=key)
 
 
+def structure_record(data: Mapping[str, Any], cls: type[T]) -> T:
+    """Build the dataclass `cls` from a section of a record.
+
+    Keys of other versions are ignored, and missing ones have their defaults.
+
+    Raises:
+        ValueError: A value has the wrong type, or a field without default is missing.
+    """
+    try:
+        return _RECORDS.structure(data, cls)
+    except cattrs.BaseValidationError as group:
+        key, error = _first_problem(group, "")
+    problem = f"it has no {key}" if isinstance(error, KeyError) else f"{key}: {error}"
+    raise ValueError(problem)
+
+
 def read_text(path: Path) -> str:
     """Read a text file in UTF-8.
 
@@ -175,7 +192,7 @@ def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = No
 _origin: Any = get_origin  # otherwise mypy takes classes for ParamSpec
 
 
-def _converter() -> cattrs.Converter:
+def _converter(*, forbids_others: bool) -> cattrs.Converter:
     converter = cattrs.Converter()
     for kind, *accepted in ((float, int), (int,), (bool,), (str,)):
         converter.register_structure_hook(kind, _strict(kind, *accepted))
@@ -183,7 +200,7 @@ def _converter() -> cattrs.Converter:
 
     @converter.register_structure_hook_factory(dataclasses.is_dataclass)
     def table(cls: Any) -> Any:
-        made = make_dict_structure_fn(cls, converter, _cattrs_forbid_extra_keys=True)
+        made = make_dict_structure_fn(cls, converter, _cattrs_forbid_extra_keys=forbids_others)
         return _shaped(Mapping, "a table", made)
 
     @converter.register_structure_hook_factory(lambda cls: _origin(cls) is dict)
@@ -204,7 +221,8 @@ def _converter() -> cattrs.Converter:
     return converter
 
 
-_CONVERTER = _converter()
+_CONVERTER, _RECORDS = _converter(forbids_others=True), _converter(forbids_others=False)
+configure_union_passthrough(float | int | bool | None, _RECORDS)
 
 
 def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:

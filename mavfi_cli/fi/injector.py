@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName
+from mavfi_cli.core.flight_record import Change, Reader, Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import CollisionReport, Command, Message, Scalar, State, Trajectory
 from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, bits_of
@@ -92,30 +93,6 @@ class Pattern:
         if corruption.effect is Effect.FREEZE:
             self._target = pattern
         return tuple(range(kind.width))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
-    """One value that a strike changed."""
-
-    state: str
-    index: int  # waypoint, 0 for messages without rows
-    bits: tuple[int, ...]
-    before: float | int | bool
-    after: float | int | bool
-    before_hex: str
-    after_hex: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Strike:
-    """One action of the fault on the mission."""
-
-    stamp_s: float
-    tick: int
-    phase: str
-    invocation: int  # number of the kernel's output
-    changes: tuple[Change, ...]
 
 
 Listener = Callable[[Strike], None]
@@ -297,6 +274,7 @@ class SourceInjector(Injector):
         changes = []
         for place, state in enumerate(self.fault.states):
             change = self._change(place, state, changed)
+            assert change.after is not None
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
         # An unchanged message remains the same object: its readers may read an earlier strike.
@@ -401,15 +379,6 @@ class Activation(Enum):
     NOT_READ = "not_read"  # the mission ended before anyone read it
     UNCHANGED = "unchanged"  # the strike did not change the value
     NOT_INJECTED = "not_injected"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reader:
-    """The first receiver that used a corrupted value, and when."""
-
-    name: str
-    stamp_s: float
-    state: str
 
 
 class Follower:

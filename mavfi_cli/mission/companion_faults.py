@@ -12,10 +12,11 @@ from typing import Any
 
 from mavfi_cli.companion.injection import Killer, SourceInjection
 from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.core.flight_record import Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES
 from mavfi_cli.fi.fault import Effect
-from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, Strike, change_of
+from mavfi_cli.fi.injector import Injector, Listener, Moment, Pattern, change_of
 from mavfi_cli.link.codec import Message, Signing, renewed
 from mavfi_cli.link.fields import is_ignored
 from mavfi_cli.link.router import Side
@@ -104,6 +105,7 @@ class LinkInjector(Injector):
         for state, pattern in zip(self._states, self._patterns, strict=True):
             kind = NUMPY_TYPES[state.dtype.value]
             change = change_of(state.name, 0, state.read(changed, 0), kind, pattern)
+            assert change.after is not None
             changed = state.write(changed, 0, change.after)
             changes.append(change)
         valid = renewed(changed, self._signing)

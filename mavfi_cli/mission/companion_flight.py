@@ -19,6 +19,7 @@ import numpy as np
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import ConfigError, LinkLost, MavfiError
 from mavfi_cli.core.files import read_parquet
+from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, Command, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
@@ -80,7 +81,7 @@ class CompanionFlight:
         self.takeover_s = math.inf  # of the first arming
         self.outcome: Outcome | None = None
         self.reason = ""
-        self.programs: dict[str, Any] = {}
+        self.programs: dict[str, ProgramEnds] = {}
         self._heard_s = time.monotonic()
         self._command: Command | None = None
         self._gate = self._planned_gate()
@@ -419,10 +420,10 @@ class _Crew:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, ProgramEnds]:
         """Return how often each program has started, and the exit codes of its processes."""
         return {
-            name: {"starts": program.starts, "codes": [*program.codes]}
+            name: ProgramEnds(starts=program.starts, codes=[*program.codes])
             for name, program in self.running.items()
         }
 

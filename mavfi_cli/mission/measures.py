@@ -11,28 +11,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from math import isfinite
 
 import numpy as np
 
+from mavfi_cli.autonomy.pilot import PilotCounters
+from mavfi_cli.core.config import structure_record
+from mavfi_cli.core.files import Json
+from mavfi_cli.core.flight_record import (
+    Detection,
+    Event,
+    KernelUse,
+    MeasuredPlatform,
+    MissionInstructionFault,
+    NodeEnds,
+    Point,
+    ProgramEnds,
+    QualityOfFlight,
+    ReadingInstruction,
+    RecordedActivation,
+    RecordedCorruption,
+    RecordedPlan,
+    ResponseTime,
+    StateFault,
+    Strike,
+)
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import KERNELS, FloatArray, Outcome, Stage
 from mavfi_cli.fi import bits
 
-Record = Mapping[str, Any]  # a result.json, or a section of it
-QUALITY = (
-    "flight_time_s", "distance_m", "mean_speed_mps", "max_speed_mps", "min_clearance_m",
-    "goal_distance_m",  # at the end of the mission
-    "energy_regression_j",  # MAVBench's regression, see docs/reference/records.md
-    "energy_propeller_j",  # from JSBSim's propeller shaft power, all rotors
-)  # fmt: skip
+QUALITY = tuple(measure.name for measure in fields(QualityOfFlight))
 
 
 def quality_of(
     log: Mapping[str, FloatArray], start_s: float, end_s: float, goal_enu_m: FloatArray
-) -> dict[str, float | None]:
-    """Compute QUALITY, the quality of flight (QoF): time, distance, energy and clearance.
+) -> QualityOfFlight:
+    """Compute the quality of flight: time, distance, energy and clearance.
 
     Flight time runs from the companion's take-over at take-off height to the end of the mission, as
     in the paper (section IV), where take-off precedes the measurement. Unknown values are None.
@@ -47,7 +62,7 @@ def quality_of(
     flown = {name: column[inside] for name, column in log.items()}
     stamps, positions = flown["stamp_s"], flown["position_enu_m"]
     if len(stamps) < 2:
-        return dict.fromkeys(QUALITY)
+        return QualityOfFlight()
     distance_m = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
     flight_time_s = float(stamps[-1] - stamps[0])
     quality = {
@@ -63,9 +78,7 @@ def quality_of(
             energy_j = np.trapezoid(flown[f"power_{kind}_w"], stamps)
             quality[f"energy_{kind}_j"] = float(energy_j)
     # Without obstacles the clearance is infinite; what the referee could not measure is NaN.
-    return {
-        name: quality[name] if np.isfinite(quality.get(name, np.nan)) else None for name in QUALITY
-    }
+    return QualityOfFlight(**{name: value for name, value in quality.items() if isfinite(value)})
 
 
 # Sections -----------------------------------------------------------------------------------------
@@ -73,34 +86,73 @@ def quality_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRecord:
-    """The sections of a result.json. A missing section is empty, and a missing value is None.
+    """The sections of a result.json. A missing section is empty or None.
 
     A mission that crashed or hung before it could write its record lacks most of them.
+
+    Attributes:
+        pilot: None in a flight of a user's companion.
+        plan_failures: Number of failed plans by reason.
+        state_fault, instruction_fault: The section `fault`, by its level.
+        recorded_fault: The whole section as plain values.
+        referee: None if the vehicle left no truth.
+        seeds: Of the mission (`root`) and of its fault.
+        files: SHA-256 of the user's files.
     """
 
     outcome: str = ""
     reason: str = ""
     simulated_s: float | None = None
-    goal_enu_m: Sequence[float] | None = None
-    config: Record = field(default_factory=dict)
-    quality_of_flight: Record = field(default_factory=dict)
-    pilot: Record = field(default_factory=dict)
-    events: Sequence[dict[str, Any]] = ()
-    plans: Sequence[Record] = ()
-    plan_failures: Mapping[str, int] = field(default_factory=dict)  # by reason; if any failed
-    fault: Record = field(default_factory=dict)
-    detection: Record = field(default_factory=dict)
-    nodes: Record = field(default_factory=dict)
-    programs: Record = field(default_factory=dict)  # of a user's companion
-    kernels: Record = field(default_factory=dict)
-    response_time_s: Record = field(default_factory=dict)
-    measured_platform: Record = field(default_factory=dict)
-    world: Record = field(default_factory=dict)
-    referee: Record | None = field(default_factory=dict)  # None: the vehicle left no truth
+    goal_enu_m: Point | None = None
+    config: Json = field(default_factory=dict)
+    quality_of_flight: QualityOfFlight = field(default_factory=QualityOfFlight)
+    pilot: PilotCounters | None = None
+    events: Sequence[Event] = ()
+    plans: Sequence[RecordedPlan] = ()
+    plan_failures: Mapping[str, int] = field(default_factory=dict)
+    state_fault: StateFault | None = None
+    instruction_fault: MissionInstructionFault | None = None
+    recorded_fault: Json | None = None
+    detection: Detection | None = None
+    nodes: Mapping[str, NodeEnds] = field(default_factory=dict)
+    programs: Mapping[str, ProgramEnds] = field(default_factory=dict)
+    kernels: Mapping[str, KernelUse] = field(default_factory=dict)
+    response_time_s: ResponseTime = field(default_factory=ResponseTime)
+    measured_platform: MeasuredPlatform | None = None
+    world: Json = field(default_factory=dict)
+    referee: Json | None = field(default_factory=dict)
     seeds: Mapping[str, int | None] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
-    files: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of the user's files
-    host: Record = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+    host: Json = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, result: Json) -> FlightRecord:
+        """Read the sections of a result.json.
+
+        Raises:
+            RecordError: A section is damaged.
+        """
+        fault = result.get("fault") or None
+        kind = "state_fault"
+        if fault is not None and fault.get("level") == "instruction":
+            kind = "instruction_fault"
+        known = {
+            name: value
+            for name, value in {**result, kind: fault, "recorded_fault": fault}.items()
+            if value not in (None, {}) or name == "referee"
+        }
+        return structure_record(known, cls)
+
+    @property
+    def fault(self) -> StateFault | MissionInstructionFault | None:
+        """The fault at either level; None without a fault."""
+        return self.state_fault or self.instruction_fault
+
+    @property
+    def strikes(self) -> Sequence[Strike]:
+        """The recorded strikes of a fault in a state."""
+        return () if self.state_fault is None else self.state_fault.strikes
 
     @property
     def succeeded(self) -> bool:
@@ -115,79 +167,56 @@ class FlightRecord:
     @property
     def golden(self) -> bool:
         """True if the flight has neither a fault nor a detector."""
-        return not (self.fault or self.detection)
-
-
-_SECTIONS = frozenset(section.name for section in fields(FlightRecord))
-
-
-def record_of(result: Record) -> FlightRecord:
-    """Read the sections of a result.json."""
-    known = {name: result[name] for name in _SECTIONS & result.keys()}
-    return FlightRecord(
-        **{name: value for name, value in known.items() if value is not None or name == "referee"}
-    )
+        return self.fault is None and self.detection is None
 
 
 # Measures -----------------------------------------------------------------------------------------
 
-_PLACES = {
-    **{name: ("quality_of_flight", name) for name in QUALITY},
-    "replans": ("pilot", "replans"),
-    "simulated_s": ("simulated_s",),
-    "response_median_s": ("response_time_s", "median"),
-    "response_p95_s": ("response_time_s", "p95"),
-    "alarm_count": ("detection", "alarm_count"),
-    "hover_shaft_w": ("referee", "physics", "hover_shaft_w"),
-}
 
-
-def measures_of(record: Record) -> dict[str, Any]:
+def measures_of(flight: FlightRecord) -> dict[str, object]:
     """Return all measures of a mission.
 
-    They are the fields of the record; `straight_m`, the distance from the take-off point to the
+    They are those of `fields_of`; `straight_m`, the distance from the take-off point to the
     edge of the goal's tolerance; `crashed`, whether a node died; `struck_s`, `struck_sites` and
     `first_bits`, the time and place of the fault; `alarms`, the listed alarms, oldest first;
     `episodes`, the number of runs of consecutive alarms; and STRUCK.
     """
-    nodes, detection, fault = (record.get(name) or {} for name in ("nodes", "detection", "fault"))
-    hit = _instruction(fault, nodes) if fault.get("level") == "instruction" else _source(fault)
+    detection = flight.detection or Detection()
+    hit = _of_instruction(flight) if flight.instruction_fault else _of_state(flight)
     return {
-        **fields_of(record),
-        "straight_m": _straight_m(record),
-        "crashed": any(node.get("crashes") for node in nodes.values()),
-        "alarms": [
-            {"stamp_s": alarm["stamp_s"], "stage": alarm["stage"]}
-            for alarm in detection.get("alarms", ())
-        ],
-        "episodes": sum(recovery["count"] for recovery in detection.get("recoveries", {}).values()),
+        **fields_of(flight),
+        "straight_m": _straight_m(flight),
+        "crashed": any(node.crashes for node in flight.nodes.values()),
+        "alarms": [{"stamp_s": alarm.stamp_s, "stage": alarm.stage} for alarm in detection.alarms],
+        "episodes": sum(recovery.count for recovery in detection.recoveries.values()),
         "struck_s": hit.get("struck_s"),
-        "struck_sites": hit["struck_sites"],
+        "struck_sites": hit.get("struck_sites", []),
         "first_bits": hit.get("first_bits", []),
         **{name: hit.get(name) for name in STRUCK},
     }
 
 
-def fields_of(record: Record) -> dict[str, Any]:
+def fields_of(flight: FlightRecord) -> dict[str, float | None]:
     """Return the measures that are fields of a record."""
-    return {name: _at(record, *place) for name, place in _PLACES.items()}
+    detection, physics = flight.detection, (flight.referee or {}).get("physics") or {}
+    return {
+        **asdict(flight.quality_of_flight),
+        "replans": None if flight.pilot is None else flight.pilot.replans,
+        "simulated_s": flight.simulated_s,
+        "response_median_s": flight.response_time_s.median,
+        "response_p95_s": flight.response_time_s.p95,
+        "alarm_count": None if detection is None else detection.alarm_count,
+        "hover_shaft_w": physics.get("hover_shaft_w"),
+    }
 
 
-def _at(record: Record, *place: str) -> Any:
-    """Return a field of a field; None if either is missing."""
-    value: Any = record
-    for name in place:
-        value = (value or {}).get(name)
-    return value
-
-
-def _straight_m(record: Record) -> float | None:
-    config, start, goal = record.get("config"), _at(record, "world", "start"), "goal_enu_m"
-    if not config or start is None or record.get(goal) is None:
+def _straight_m(flight: FlightRecord) -> float | None:
+    start, goal = flight.world.get("start"), flight.goal_enu_m
+    if not flight.config or start is None or goal is None:
         return None
     east, north, up = start
-    takeoff = (east, north, up + config["takeoff_height_m"])
-    return math.dist(takeoff, record[goal]) - float(config["goal_tolerance_m"])
+    takeoff = (east, north, up + flight.config["takeoff_height_m"])
+    return math.dist(takeoff, goal) - float(flight.config["goal_tolerance_m"])
 
 
 # What a fault did -----------------------------------------------------------------------------
@@ -205,79 +234,78 @@ STRUCK = (
 _FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
 
 
-def _source(fault: Record) -> dict[str, Any]:
-    drawn = {"strikes": fault.get("strike_count"), "struck_sites": list(fault.get("states", ()))}
-    strikes: Sequence[Record] = fault.get("strikes") or ()
-    if not strikes:
+def _of_state(flight: FlightRecord) -> dict[str, object]:
+    fault = flight.state_fault or StateFault()
+    drawn: dict[str, object] = {"strikes": fault.strike_count, "struck_sites": list(fault.states)}
+    if not fault.strikes:
         return drawn
-    first = strikes[0]
-    changes: Sequence[Record] = first["changes"]  # none where a process was killed
-    reader: Record = _at(fault, "activation", "first_reader") or {}
+    first, activation = fault.strikes[0], fault.activation or RecordedActivation()
+    changes, reader = first.changes, activation.first_reader  # no changes if a process was killed
     return {
         **drawn,
-        "struck_s": first["stamp_s"] if fault.get("state") == "applied" else None,
-        "first_bits": list(changes[0]["bits"]) if changes else [],
-        "strike_s": first["stamp_s"],
-        **{f"strike_{name}": first[name] for name in ("phase", "tick", "invocation")},
-        **{
-            f"struck_{name}": _joined(change[name] for change in changes)
-            for name in ("state", "index", "before_hex", "after_hex")
-        },
-        **{
-            f"struck_{when}": _joined(_value(change, when) for change in changes)
-            for when in ("before", "after")
-        },
-        "struck_bits": [list(change["bits"]) for change in changes],
-        "activation": _at(fault, "activation", "activation"),
-        "first_reader": reader.get("name"),
-        "first_read_state": reader.get("state"),
-        "first_read_s": reader.get("stamp_s"),
+        "struck_s": first.stamp_s if fault.state == "applied" else None,
+        "first_bits": list(changes[0].bits) if changes else [],
+        "strike_s": first.stamp_s,
+        "strike_phase": first.phase,
+        "strike_tick": first.tick,
+        "strike_invocation": first.invocation,
+        "struck_state": _joined(change.state for change in changes),
+        "struck_index": _joined(change.index for change in changes),
+        "struck_before_hex": _joined(change.before_hex for change in changes),
+        "struck_after_hex": _joined(change.after_hex for change in changes),
+        "struck_before": _joined(_value(c.before, c.before_hex) for c in changes),
+        "struck_after": _joined(_value(c.after, c.after_hex) for c in changes),
+        "struck_bits": [list(change.bits) for change in changes],
+        "activation": activation.activation or None,
+        "first_reader": None if reader is None else reader.name,
+        "first_read_state": None if reader is None else reader.state,
+        "first_read_s": None if reader is None else reader.stamp_s,
     }
 
 
-def _instruction(fault: Record, nodes: Record) -> dict[str, Any]:
-    corruption: Record = fault.get("corruption") or {}
-    injection: Record = fault.get("injection") or {}
-    drawn = {
-        "struck_s": fault.get("stamp_s") if fault.get("state") == "applied" else None,
-        "struck_sites": [fault["node"]] if "node" in fault else [],
-        "first_bits": list(corruption.get("bits", ())),
-        "struck_node": fault.get("node"),
-        "struck_kernel": fault.get("kernel"),
-        "struck_function": fault.get("symbol"),
-        "struck_address": f"{fault['object']}+{fault['offset']:#x}" if "object" in fault else None,
-        "struck_instruction": fault.get("instruction"),
-        "struck_execution": fault.get("k"),
-        "struck_role": corruption.get("role"),
-        "struck_register": corruption.get("register") or corruption.get("site"),
-        "struck_bits": [list(corruption["bits"])] if corruption else None,
-        "strike_invocation": fault.get("invocation"),
-        "strikes": int(injection["applied"])
-        if injection
-        else None,  # unknown, because the record was cut off
+def _of_instruction(flight: FlightRecord) -> dict[str, object]:
+    fault = flight.instruction_fault
+    assert fault is not None
+    flip, injection = fault.corruption or RecordedCorruption(), fault.injection
+    address = f"{fault.object}+{fault.offset:#x}" if fault.object else None
+    drawn: dict[str, object] = {
+        "struck_s": fault.stamp_s if fault.state == "applied" else None,
+        "struck_sites": [fault.node] if fault.node else [],
+        "first_bits": list(flip.bits),
+        "struck_node": fault.node or None,
+        "struck_kernel": fault.kernel or None,
+        "struck_function": fault.symbol,
+        "struck_address": address,
+        "struck_instruction": fault.instruction or None,
+        "struck_execution": fault.k,
+        "struck_role": flip.role or None,
+        "struck_register": flip.register or flip.site or None,
+        "struck_bits": None if fault.corruption is None else [list(flip.bits)],
+        "strike_invocation": fault.invocation,
+        "strikes": None if injection is None else int(injection.applied),
     }
-    if not injection.get("applied"):
+    if injection is None or not injection.applied:
         return drawn
-    node: Record = nodes.get(fault.get("node", "")) or {}
-    ends = [crash["how"] for crash in node.get("crashes", ())] + ["hang"] * node.get("hangs", 0)
+    reading = fault.activation or ReadingInstruction()
+    node = flight.nodes.get(fault.node) or NodeEnds()
+    ends = [crash.how for crash in node.crashes] + ["hang"] * node.hangs
     return {
         **drawn,
-        "strike_s": fault.get("stamp_s"),
-        "struck_before_hex": injection["before"],
-        "struck_after_hex": injection["after"],
-        "activation": _at(fault, "activation", "activation"),
-        "reading_instruction": _at(fault, "activation", "instruction") or None,
+        "strike_s": fault.stamp_s,
+        "struck_before_hex": injection.before,
+        "struck_after_hex": injection.after,
+        "activation": reading.activation or None,
+        "reading_instruction": reading.instruction or None,
         "node_ended": ";".join(ends) or None,
     }
 
 
-def _joined(values: Iterable[Any]) -> str:
+def _joined(values: Iterable[object]) -> str:
     return ";".join(map(str, values))
 
 
-def _value(change: Record, when: str) -> Any:
+def _value(value: float | int | bool | None, pattern: str) -> object:
     """Return a value, with infinities and NaN, which JSON lacks, restored from bits."""
-    value, pattern = change[when], change[f"{when}_hex"]
     if value is not None:
         return value
     return bits.NUMPY_TYPES[_FLOATS[len(pattern)]].value(int(pattern, 16))
@@ -345,39 +373,38 @@ class DetectionCost:
         return self.recovered_s / self.flight_s
 
     @classmethod
-    def of(cls, result: Record) -> DetectionCost | None:
+    def of(cls, flight: FlightRecord) -> DetectionCost | None:
         """Compute the cost of detection and recovery in a flight.
 
         Returns:
             Cost; None without a detector or without any check.
         """
-        flight = record_of(result)
         detection, kernels = flight.detection, flight.kernels
         walls = flight.host.get("stage_wall_s") or {}
         checks_host_s = walls.get("gate")
-        if not detection or not checks_host_s:
+        if detection is None or not checks_host_s:
             return None
-        checks = sum(detection["checks"].values())
-        flight_s = flight.quality_of_flight.get("flight_time_s") or flight.simulated_s
+        checks = sum(detection.checks.values())
+        flight_s = flight.quality_of_flight.flight_time_s or flight.simulated_s
         if not checks or not flight_s:
             return None
         # Alarms that are not listed are distributed over the stages like those that are.
         listed = [
-            alarm.get("recomputes", alarm["stage"])
-            for alarm in detection["alarms"]
-            if alarm["response"] in _AGAIN
+            alarm.recomputes or alarm.stage
+            for alarm in detection.alarms
+            if alarm.response in _AGAIN
         ]
-        total = sum(detection["responses"].get(response, 0) for response in _AGAIN)
+        total = sum(detection.responses.get(response, 0) for response in _AGAIN)
         again = {stage: total * listed.count(stage) / max(len(listed), 1) for stage in RECOMPUTED}
 
-        def mean_s(kernel: Record | None) -> float:
+        def mean_s(kernel: KernelUse | None) -> float:
             """Return the mean latency of an invocation, s."""
-            if not kernel or not kernel["invocations"]:
+            if kernel is None or not kernel.invocations:
                 return 0.0
-            return float(kernel["busy_s"] / kernel["invocations"])
+            return kernel.busy_s / kernel.invocations
 
         return cls(
-            detector=detection["detector"],
+            detector=detection.detector,
             checks=checks,
             checks_host_s=checks_host_s,
             flight_s=flight_s,
@@ -386,8 +413,8 @@ class DetectionCost:
                 stage: math.fsum(again[stage] * mean_s(kernels.get(name)) for name in names)
                 for stage, names in RECOMPUTED.items()
             },
-            compute_s=math.fsum(kernels[name]["busy_s"] for name in KERNELS if name in kernels),
+            compute_s=math.fsum(kernels[name].busy_s for name in KERNELS if name in kernels),
             host_compute_s=math.fsum(walls.get(name, 0.0) for name in KERNELS),
             platform=str(flight.config.get("platform", "an unknown platform")),
-            faulty=bool(flight.fault),
+            faulty=flight.fault is not None,
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.autonomy.pilot import PilotMode
+from mavfi_cli.core.flight_record import Event
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
@@ -21,16 +22,6 @@ _MODES = {  # kind and text of the event with which a mode of the pilot begins
     PilotMode.SLOWING: ("slow", "slows down before an obstacle"),
     PilotMode.STOPPING: ("stop", "stops before an obstacle"),
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Event:
-    """One event of a flight."""
-
-    stamp_s: float
-    kind: str  # phase, autopilot, plan, collision, outcome
-    text: str
-    position_enu_m: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

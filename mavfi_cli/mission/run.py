@@ -25,6 +25,7 @@ from mavfi_cli.companion.protection import Protection
 from mavfi_cli.core.compiled import processor_level
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import (
+    Json,
     ScratchFolder,
     file_digest,
     write_json,
@@ -32,6 +33,7 @@ from mavfi_cli.core.files import (
     write_text,
     writing,
 )
+from mavfi_cli.core.flight_record import SCHEMA, KernelUse, NodeCrash, NodeEnds, ResponseTime
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
@@ -161,7 +163,8 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     config = replace(config, goal_tolerance_m=near_m)
     result = _flown(config, flight, host, vehicle.truth, goal)
     guarded = {} if flight.detection is None else {"detection": flight.detection}
-    result |= {"pilot": {}, "plans": [], "programs": flight.programs, **guarded}
+    ends = {name: asdict(program) for name, program in flight.programs.items()}
+    result |= {"pilot": {}, "plans": [], "programs": ends, **guarded}
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))
     write_json(folder.result, result)
@@ -250,7 +253,7 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 
 def _host(
     config: MissionConfig, flight: Flight | CompanionFlight, truth: FlightTruth | None
-) -> dict[str, Any]:
+) -> Json:
     """Return measurements of this machine, which differ between repetitions."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     of_vehicle = {} if truth is None else truth.stage_wall_s
@@ -276,25 +279,27 @@ def _write(
     flight: Flight,
     companion: Companion,
     folder: RunFolder,
-    host: dict[str, Any],
+    host: Json,
     truth: FlightTruth | None,
     crash: str | None,
 ) -> None:
     log, goal = None if truth is None else truth.log, companion.pilot.goal_enu_m
     failures = dict(companion.plan_failures)
+    measured, detection = companion.latency.summary(), companion.protection.summary()
     config = replace(config, goal_tolerance_m=flight.stack.goal_tolerance_m)
     result = {
         **_flown(config, flight, host, truth, goal),
         "pilot": asdict(companion.pilot.counters),
-        **_nodes(companion),
+        "kernels": {name: asdict(use) for name, use in _kernels(companion).items()},
+        "nodes": {name: asdict(ends) for name, ends in _nodes(companion).items()},
         "images": {"received": flight.images.received, "lost": flight.images.lost},
-        "measured_platform": companion.latency.summary(),
-        "response_time_s": response_times(companion.reactions),
+        "measured_platform": measured and asdict(measured),
+        "response_time_s": asdict(response_times(companion.reactions)),
         "plans": [
             {"stamp_s": plan.stamp_s, "points_enu_m": np.round(plan.waypoints[:, 0:3], 3).tolist()}
             for plan in companion.plans
         ],
-        "detection": companion.protection.summary(),
+        "detection": detection and asdict(detection, dict_factory=_known),
         **({"plan_failures": failures} if failures else {}),
     }
     write_parquet(folder.trace, flight.trace.table(log))
@@ -310,23 +315,24 @@ def _write(
 def _flown(
     config: MissionConfig,
     flight: Flight | CompanionFlight,
-    host: dict[str, Any],
+    host: Json,
     truth: FlightTruth | None,
     goal_enu_m: FloatArray,
-) -> dict[str, Any]:
+) -> Json:
     """Return the sections that every flight's record has."""
     assert flight.outcome is not None
     fault, report = config.fault or config.instruction, {} if truth is None else truth.report
     flown = flight.trace.motion() if truth is None else truth.log
     files = {name: file_digest(name) for name in config.files}
+    quality = quality_of(flown, flight.takeover_s, flight.end_s, goal_enu_m)
     return {
-        "schema": 1,
+        "schema": SCHEMA,
         "outcome": flight.outcome.value,
         "reason": flight.reason,
         "config": config.to_dict(),
         "seeds": {"root": config.seed, "fault": fault.seed if fault else None},
         "simulated_s": flight.end_s - flight.begun_s,
-        "quality_of_flight": quality_of(flown, flight.takeover_s, flight.end_s, goal_enu_m),
+        "quality_of_flight": asdict(quality),
         "events": [asdict(event) for event in flight.logger.events],
         "fault": flight.injection.finish(),
         "goal_enu_m": goal_enu_m.tolist(),
@@ -338,43 +344,48 @@ def _flown(
     }
 
 
-def _nodes(companion: Companion) -> dict[str, Any]:
-    nodes, losses = companion.executor.nodes, companion.executor.losses
+def _known(items: list[tuple[str, Any]]) -> Json:
+    return {key: value for key, value in items if value is not None}
+
+
+def _kernels(companion: Companion) -> dict[str, KernelUse]:
     return {
-        "kernels": {
-            name: {
-                "invocations": node.invocations,
-                "dropped_inputs": node.dropped,
-                "busy_s": round(node.busy_s, 9),
-            }
-            for name, node in nodes.items()
-        },
-        "nodes": {
-            name: {
-                "crashes": [
-                    {"stamp_s": round(loss.stamp_s, 9), "how": loss.how}
-                    for loss in losses
-                    if loss.node == name and not loss.hung
-                ],
-                "hangs": sum(loss.node == name and loss.hung for loss in losses),
-                "restarts": node.restarts,
-            }
-            for name, node in nodes.items()
-        },
+        name: KernelUse(
+            invocations=node.invocations,
+            dropped_inputs=node.dropped,
+            busy_s=round(node.busy_s, 9),
+        )
+        for name, node in companion.executor.nodes.items()
     }
 
 
-def response_times(reactions: Sequence[Reaction]) -> dict[str, float | None]:
-    """Return median and 95th percentile of the response time, s."""
+def _nodes(companion: Companion) -> dict[str, NodeEnds]:
+    losses = companion.executor.losses
+    return {
+        name: NodeEnds(
+            crashes=[
+                NodeCrash(stamp_s=round(loss.stamp_s, 9), how=loss.how)
+                for loss in losses
+                if loss.node == name and not loss.hung
+            ],
+            hangs=sum(loss.node == name and loss.hung for loss in losses),
+            restarts=node.restarts,
+        )
+        for name, node in companion.executor.nodes.items()
+    }
+
+
+def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
+    """Return median and 95th percentile of the response time."""
     times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
     times = times[np.isfinite(times)]
     if not len(times):
-        return {"median": None, "p95": None, "count": 0}
-    return {
-        "median": round(float(np.median(times)), 9),
-        "p95": round(float(np.percentile(times, 95.0)), 9),
-        "count": len(times),
-    }
+        return ResponseTime()
+    return ResponseTime(
+        median=round(float(np.median(times)), 9),
+        p95=round(float(np.percentile(times, 95.0)), 9),
+        count=len(times),
+    )
 
 
 # Again --------------------------------------------------------------------------------------------

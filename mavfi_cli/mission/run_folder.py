@@ -12,6 +12,7 @@ import numpy as np
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import (
+    Json,
     file_digest,
     read_json,
     read_parquet,
@@ -33,7 +34,7 @@ from mavfi_cli.core.types import (
     Trajectory,
     VehicleState,
 )
-from mavfi_cli.mission.measures import FlightRecord, record_of
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import PlatformProfile
 from mavfi_cli.spec.stack import FIRST
@@ -302,7 +303,7 @@ class Run:
 
     to_html: ClassVar[Callable[[Run], str] | None] = None
     folder: RunFolder
-    result: dict[str, Any]
+    result: Json
     trace: pa.Table | None
 
     def __repr__(self) -> str:
@@ -315,7 +316,8 @@ class Run:
     @property
     def record(self) -> FlightRecord:
         """The sections of the result."""
-        return record_of(self.result)
+        with reading(self.folder.result):
+            return FlightRecord.of(self.result)
 
     @property
     def golden(self) -> Run | None:

@@ -20,9 +20,10 @@ from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection, SourceInjection
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.flight_record import Strike
 from mavfi_cli.core.types import Trajectory
 from mavfi_cli.core.wall import WallClock
-from mavfi_cli.fi.injector import Moment, NoInjector, Strike
+from mavfi_cli.fi.injector import Moment, NoInjector
 from mavfi_cli.mission.run_folder import RunFolder
 from mavfi_cli.spec.fault import FaultConfig
 from mavfi_cli.spec.mission import MissionConfig

@@ -5,12 +5,24 @@ from __future__ import annotations
 import base64
 import html
 import textwrap
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
+from mavfi_cli.core.flight_record import (
+    Change,
+    Detection,
+    MeasuredPlatform,
+    MissionInstructionFault,
+    NodeEnds,
+    ProgramEnds,
+    QualityOfFlight,
+    RecordedActivation,
+    StateFault,
+)
+from mavfi_cli.core.types import Scalar
 from mavfi_cli.fi.bits import format_distinct
 from mavfi_cli.fi.tracer.image import short_name
-from mavfi_cli.mission.measures import DetectionCost, FlightRecord, Record, record_of
+from mavfi_cli.mission.measures import DetectionCost, FlightRecord
 from mavfi_cli.mission.run_folder import Run
 from mavfi_cli.report.table import WIDTH
 
@@ -28,22 +40,20 @@ _OUTCOMES = {
 }
 
 
-def _number(value: Any, unit: str, digits: int = 1, per: float = 1.0) -> str:
+def _number(value: float | None, unit: str, digits: int = 1, per: float = 1.0) -> str:
     return "not known" if value is None else f"{value / per:.{digits}f} {unit}"
 
 
-def outcome_line(result: Record) -> str:
+def outcome_line(flight: FlightRecord) -> str:
     """Return the outcome and its reason in one line."""
-    flight = record_of(result)
     text = _OUTCOMES.get(flight.outcome, flight.outcome)
     if flight.programs:  # success and failure have the reasons of a user's companion
         text = text.partition(":")[0]
     return f"{text} ({flight.reason})" if flight.reason else text
 
 
-def summary_lines(result: Record) -> list[str]:
+def summary_lines(flight: FlightRecord) -> list[str]:
     """Return outcome, quality of flight, pipeline figures and cost on this machine."""
-    flight = record_of(result)
     config = flight.config
     with_what = f"planner {config['planner']}, platform {config['platform']}"
     with_what += f", stack {config['stack']}"
@@ -53,18 +63,18 @@ def summary_lines(result: Record) -> list[str]:
         flown = f"foreign autopilot at {config['link']}{where}, seed {config['seed']}"
     if config.get("companion"):
         with_what = f"companion {config['companion']}, {config['speed']:g} x real time"
-    lines = [outcome_line(result), "", f"Mission     {flown}; {with_what}", *_flight_lines(flight)]
+    lines = [outcome_line(flight), "", f"Mission     {flown}; {with_what}", *_flight_lines(flight)]
     if pose := (flight.referee or {}).get("pose"):
         lines.append(f"Referee     on {pose}")
-    lines += _fault_lines(flight.fault)
+    lines += _fault_lines(flight)
     lines += _node_lines(flight.nodes)
     lines += _program_lines(flight.programs)
-    lines += _detection_lines(flight.detection, DetectionCost.of(result))
+    lines += _detection_lines(flight.detection, DetectionCost.of(flight))
     response = flight.response_time_s
-    if response.get("median") is not None:
+    if response.median is not None and response.p95 is not None:
         lines.append(
-            f"Response    {response['median'] * 1e3:.0f} ms from depth frame to setpoint "
-            f"(median), {response['p95'] * 1e3:.0f} ms (95th percentile)"
+            f"Response    {response.median * 1e3:.0f} ms from depth frame to setpoint "
+            f"(median), {response.p95 * 1e3:.0f} ms (95th percentile)"
         )
     lines += _measured_lines(flight.measured_platform)
     lines += _host_lines(flight)
@@ -90,93 +100,91 @@ def _host_lines(flight: FlightRecord) -> list[str]:
 
 def _flight_lines(flight: FlightRecord) -> list[str]:
     qof, counters = flight.quality_of_flight, flight.pilot
-    if qof["flight_time_s"] is None:
+    if qof.flight_time_s is None:
         return ["Flight      none: the mission ended before the companion took over"]
     lines = [
-        f"Flight      {_number(qof['flight_time_s'], 's')}, "
-        f"{_number(qof['distance_m'], 'm')} flown, "
-        f"{_number(qof['goal_distance_m'], 'm', 2)} from the goal",
+        f"Flight      {_number(qof.flight_time_s, 's')}, "
+        f"{_number(qof.distance_m, 'm')} flown, "
+        f"{_number(qof.goal_distance_m, 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
     ]
-    if not counters:  # of a user's companion
+    if counters is None:  # of a user's companion
         return lines
-    flown = counters["replans"] + any(e["kind"] in ("plan", "replan") for e in flight.events)
-    wanted, failed, again = (counters[k] for k in ("plans_requested", "plans_failed", "replans"))
+    flown = counters.replans + any(e.kind in ("plan", "replan") for e in flight.events)
+    wanted, failed, again = counters.plans_requested, counters.plans_failed, counters.replans
     why = ", ".join(f"{reason} {n}x" for reason, n in flight.plan_failures.items())
     return [
         *lines,
         f"Plans       {wanted} requested: {flown} flown{f' ({again} replans)' if again else ''}, "
         f"{failed} failed{f' ({why})' if why else ''}, {wanted - flown - failed} not used",
-        f"Obstacles   {counters['collisions_foreseen']} collisions predicted, "
-        f"{counters['slowdowns']} slowdowns, {counters['stops']} stops",
+        f"Obstacles   {counters.collisions_foreseen} collisions predicted, "
+        f"{counters.slowdowns} slowdowns, {counters.stops} stops",
     ]
 
 
-def _clearance_and_energy(qof: Record) -> list[str]:
+def _clearance_and_energy(qof: QualityOfFlight) -> list[str]:
     clearance, energy = "not known", "not known"
-    if qof["min_clearance_m"] is not None:
-        clearance = f"{_number(qof['min_clearance_m'], 'm', 2)} minimum"
-    if qof["energy_regression_j"] is not None or qof["energy_propeller_j"] is not None:
+    if qof.min_clearance_m is not None:
+        clearance = f"{_number(qof.min_clearance_m, 'm', 2)} minimum"
+    if qof.energy_regression_j is not None or qof.energy_propeller_j is not None:
         energy = (
-            f"{_number(qof['energy_regression_j'], 'kJ', per=1e3)} (paper's regression), "
-            f"{_number(qof['energy_propeller_j'], 'kJ', per=1e3)} (propeller shafts)"
+            f"{_number(qof.energy_regression_j, 'kJ', per=1e3)} (paper's regression), "
+            f"{_number(qof.energy_propeller_j, 'kJ', per=1e3)} (propeller shafts)"
         )
     return [f"Clearance   {clearance}", f"Energy      {energy}"]
 
 
-def _measured_lines(measured: Record) -> list[str]:
-    if not measured:
+def _measured_lines(measured: MeasuredPlatform | None) -> list[str]:
+    if measured is None:
         return []
     medians = ", ".join(
-        f"{name} {1e3 * times['host_median_s']:.2f} ms"
-        for name, times in measured["kernels"].items()
+        f"{name} {1e3 * times.host_median_s:.2f} ms" for name, times in measured.kernels.items()
     )
-    return [f"Measured    {medians} (medians on this host), x {measured['factor']:g} in the flight"]
+    return [f"Measured    {medians} (medians on this host), x {measured.factor:g} in the flight"]
 
 
-def _node_lines(nodes: Record) -> list[str]:
+def _node_lines(nodes: Mapping[str, NodeEnds]) -> list[str]:
     lines = []
     for name, node in nodes.items():
-        ends = [f"{c['how']} at {c['stamp_s']:.2f} s" for c in node["crashes"][:3]]
-        if len(node["crashes"]) > 3:
-            ends.append(f"{len(node['crashes']) - 3} more crashes")
-        if node["hangs"]:
-            ends.append(f"hung {node['hangs']} times" if node["hangs"] > 1 else "hung once")
+        ends = [f"{crash.how} at {crash.stamp_s:.2f} s" for crash in node.crashes[:3]]
+        if len(node.crashes) > 3:
+            ends.append(f"{len(node.crashes) - 3} more crashes")
+        if node.hangs:
+            ends.append(f"hung {node.hangs} times" if node.hangs > 1 else "hung once")
         if ends:
-            lines.append(f"Node        {name}: {'; '.join(ends)}; restarted {node['restarts']}x")
+            lines.append(f"Node        {name}: {'; '.join(ends)}; restarted {node.restarts}x")
     return lines
 
 
-def _program_lines(programs: Record) -> list[str]:
+def _program_lines(programs: Mapping[str, ProgramEnds]) -> list[str]:
     lines = []
     for name, program in programs.items():
-        ends = ", ".join(map(str, program["codes"])) or "runs until the end"
-        lines.append(f"Program     {name}: started {program['starts']}x; exit codes: {ends}")
+        ends = ", ".join(map(str, program.codes)) or "runs until the end"
+        lines.append(f"Program     {name}: started {program.starts}x; exit codes: {ends}")
     return lines
 
 
-def _detection_lines(detection: Record, cost: DetectionCost | None) -> list[str]:
-    if not detection:
+def _detection_lines(detection: Detection | None, cost: DetectionCost | None) -> list[str]:
+    if detection is None:
         return []
-    responses, alarms = detection["responses"], detection["alarm_count"]
+    responses, alarms = detection.responses, detection.alarm_count
     lines = [
-        f"Detector    {detection['detector']} on {', '.join(detection['protect'])}: "
-        f"{sum(detection['checks'].values())} checks, {alarms} alarm{'' if alarms == 1 else 's'}"
+        f"Detector    {detection.detector} on {', '.join(detection.protect)}: "
+        f"{sum(detection.checks.values())} checks, {alarms} alarm{'' if alarms == 1 else 's'}"
     ]
-    for alarm in detection["alarms"][:3]:
-        where = ", ".join(alarm["states"][:2]) or "all states together"
+    for alarm in detection.alarms[:3]:
+        where = ", ".join(alarm.states[:2]) or "all states together"
         lines.append(
-            f"            at {alarm['stamp_s']:.2f} s: {alarm['stage']}, {where}: "
-            f"{alarm['response']}"
+            f"            at {alarm.stamp_s:.2f} s: {alarm.stage}, {where}: {alarm.response}"
         )
-    if "setpoint" in detection["checks"]:  # the gate before a user's companion
+    if "setpoint" in detection.checks:  # the gate before a user's companion
         counts = (f"{count} {name}" for name, count in responses.items() if count)
         return [*lines, *(f"            setpoints withheld: {text}" for text in counts)]
-    if detection["alarm_count"]:
+    if alarms:
         recovered = [
-            f"{stage} {entry['count']}x, {entry['total_s'] * 1e3:.1f} ms"
-            for stage, entry in detection["recoveries"].items()
-            if entry["count"]
+            f"{stage} {recovery.count}x, {recovery.total_s * 1e3:.1f} ms"
+            for stage, recovery in detection.recoveries.items()
+            if recovery.count
         ]
         lines.append(
             f"            recovered {'; '.join(recovered)}; {responses['hold']} holds, "
@@ -209,7 +217,7 @@ def run_html(run: Run) -> str:
     from mavfi_cli.report.drawing import svg
     from mavfi_cli.report.top_view import draw_top_view
 
-    text = html.escape("\n".join([*summary_lines(run.result), *folder_lines(run, None)]))
+    text = html.escape("\n".join([*summary_lines(run.record), *folder_lines(run, None)]))
     data = base64.b64encode(svg(draw_top_view(run)).encode()).decode()
     return (
         f'<pre style="white-space: pre-wrap">{text}</pre><img alt="the flight from above" '
@@ -217,105 +225,108 @@ def run_html(run: Run) -> str:
     )
 
 
-def event_lines(result: Record) -> list[str]:
+def event_lines(flight: FlightRecord) -> list[str]:
     """Return one line per event with its simulated time."""
-    return [f"{e['stamp_s']:9.2f} s  {e['kind']:<10} {e['text']}" for e in record_of(result).events]
+    return [f"{e.stamp_s:9.2f} s  {e.kind:<10} {e.text}" for e in flight.events]
 
 
-def _fault_lines(fault: Record) -> list[str]:
-    if not fault:
+def _fault_lines(flight: FlightRecord) -> list[str]:
+    if flight.instruction_fault is not None:
+        return _instruction_lines(flight.instruction_fault)
+    fault = flight.state_fault
+    if fault is None or fault.trigger is None:
         return []
-    if fault["level"] == "instruction":
-        return _instruction_lines(fault)
-    trigger = fault["trigger"]
+    trigger = fault.trigger
     when = {
-        "random": f"at a random moment ({trigger['drawn_time_s']:.2f} s into the flight)",
-        "time": f"{trigger['number']:g} s into the flight",
-        "tick": f"at control tick {trigger['number']:g}",
-        "phase": f"once the pilot is in the phase {trigger['phase']}",
+        "random": f"at a random moment ({_number(trigger.drawn_time_s, 's', 2)} into the flight)",
+        "time": f"{trigger.number:g} s into the flight",
+        "tick": f"at control tick {trigger.number:g}",
+        "phase": f"once the pilot is in the phase {trigger.phase}",
         "foreseen": "once a collision is foreseen",
-        "invocation": f"at invocation {trigger['number']:g} of the kernel",
-    }[trigger["when"]]
-    request, states = fault["request"], ", ".join(fault["states"])
-    what = f"{fault['stage']} stage, {states}: {request['persistence']} {request['effect']}"
-    if fault["stage"] == "process":
+        "invocation": f"at invocation {trigger.number:g} of the kernel",
+    }[trigger.when]
+    request, states = fault.request, ", ".join(fault.states)
+    what = f"{fault.stage} stage, {states}: {request['persistence']} {request['effect']}"
+    is_value = bool(fault.units and fault.units[0])
+    if fault.stage == "process":
         struck = {"flip": "is killed", "stop": "is stopped"}
         what = f"{states} {struck.get(request['effect'], request['effect'])}"
-    elif not fault["units"][0]:  # a whole message
-        what = f"{fault['stage']}, {states}: {request['persistence']} {request['effect']}"
+    elif not is_value:  # a whole message
+        what = f"{fault.stage}, {states}: {request['persistence']} {request['effect']}"
     lines = [f"Fault       {what}, {when}"]
-    if fault["state"] == "not_injected":
-        lines.append(f"            not injected: {fault['reason']}")
-    for strike in fault["strikes"][:3]:
-        lines += [_change_line(strike["stamp_s"], change) for change in strike["changes"]]
-    if fault["strike_count"] > 3:
-        lines.append(f"            and {fault['strike_count'] - 3} more strikes")
-    if fault["state"] == "applied" and fault["units"][0]:  # a value
-        lines.append(f"            {_activation(fault)}")
+    if fault.state == "not_injected":
+        lines.append(f"            not injected: {fault.reason}")
+    for strike in fault.strikes[:3]:
+        lines += [_change_line(strike.stamp_s, change) for change in strike.changes]
+    if fault.strike_count and fault.strike_count > 3:
+        lines.append(f"            and {fault.strike_count - 3} more strikes")
+    if fault.state == "applied" and is_value and fault.activation is not None:
+        lines.append(f"            {_activation(fault.activation)}")
     return lines
 
 
-def _activation(fault: Record) -> str:
+def _activation(activation: RecordedActivation) -> str:
     """Return the activation: whether any node read the corrupted value."""
-    reader = fault["activation"]["first_reader"]
+    reader = activation.first_reader
     if reader is not None:
-        return f"first read by {reader['name']} at {reader['stamp_s']:.2f} s ({reader['state']})"
+        return f"first read by {reader.name} at {reader.stamp_s:.2f} s ({reader.state})"
     return {
         "withheld": "withheld by the detector's gate before any node read it",
         "overwritten": "overwritten before any node read it",
         "not_read": "never read before the mission ended",
         "unchanged": "changed nothing: the state already had that value",
-    }[fault["activation"]["activation"]]
+    }[activation.activation]
 
 
-def _instruction_lines(fault: Record) -> list[str]:
+def _instruction_lines(fault: MissionInstructionFault) -> list[str]:
     lines = [
-        f"Fault       node {fault['node']}, invocation {fault['invocation']} of "
-        f"{fault['invocations']} of {fault['kernel']}, at {fault['stamp_s']:.2f} s; "
-        f"{fault['sampling']}, windows {fault['windows']}",
-        f"            before execution {fault['k']} of {fault['instruction']} ({_place(fault)})",
+        f"Fault       node {fault.node}, invocation {fault.invocation} of "
+        f"{fault.invocations} of {fault.kernel}, at {_number(fault.stamp_s, 's', 2)}; "
+        f"{fault.sampling}, windows {fault.windows}",
+        f"            before execution {fault.k} of {fault.instruction} ({_place(fault)})",
     ]
-    if fault["state"] == "null":
+    if fault.state == "null":
         return [*lines, "            null injection: nothing was flipped"]
-    corruption, injection = fault["corruption"], fault["injection"]
-    if fault["state"] == "not_injected":
-        return [*lines, f"            not injected: {fault['reason']}"]
-    bits = f"bit{'s'[len(corruption['bits']) == 1 :]} {', '.join(map(str, corruption['bits']))}"
-    what = corruption["register"] or corruption["site"]
-    activation = fault["activation"]["activation"].replace("_", " ")
+    if fault.state == "not_injected":
+        return [*lines, f"            not injected: {fault.reason}"]
+    corruption, injection, activation = fault.corruption, fault.injection, fault.activation
+    if corruption is None or injection is None or activation is None:  # cut off
+        return lines
+    bits = f"bit{'s'[len(corruption.bits) == 1 :]} {', '.join(map(str, corruption.bits))}"
+    what = corruption.register or corruption.site
     return [
         *lines,
-        f"            {bits} of {corruption['role']} {what}: "
-        f"{injection['before']} -> {injection['after']}; {activation}",
+        f"            {bits} of {corruption.role} {what}: {injection.before} -> "
+        f"{injection.after}; {activation.activation.replace('_', ' ')}",
     ]
 
 
-def _place(fault: Record) -> str:
+def _place(fault: MissionInstructionFault) -> str:
     """Return the place of an instruction: function and offset, or offset in its object."""
-    if not fault["symbol"]:
-        return f"{fault['object']}+{fault['offset']:#x}"
-    name, _, offset = fault["symbol"].partition("+")
-    return f"{short_name(name)}{offset and '+'}{offset} in {fault['object']}"
+    if not fault.symbol:
+        return f"{fault.object}+{fault.offset:#x}"
+    name, _, offset = fault.symbol.partition("+")
+    return f"{short_name(name)}{offset and '+'}{offset} in {fault.object}"
 
 
-def _change_line(stamp_s: float, change: Record) -> str:
-    place = f"[{change['index']}]" if change["state"].startswith("waypoint") else ""
-    bits = ", ".join(map(str, change["bits"])) or "none: the state already had that value"
-    plural = "s" if len(change["bits"]) > 1 else ""
+def _change_line(stamp_s: float, change: Change) -> str:
+    place = f"[{change.index}]" if change.state.startswith("waypoint") else ""
+    bits = ", ".join(map(str, change.bits)) or "none: the state already had that value"
+    plural = "s" if len(change.bits) > 1 else ""
+    before = _formatted(change.before, change.before_hex, change.after)
+    after = _formatted(change.after, change.after_hex, change.before)
     return (
-        f"            at {stamp_s:.2f} s: {change['state']}{place} "
-        f"{_formatted(change, 'before')} -> {_formatted(change, 'after')} (bit{plural} {bits})"
+        f"            at {stamp_s:.2f} s: {change.state}{place} {before} -> {after} "
+        f"(bit{plural} {bits})"
     )
 
 
-def _formatted(change: Record, when: str) -> str:
+def _formatted(value: Scalar | None, pattern: str, other: Scalar | None) -> str:
     """Format a value. Infinities and NaN, which JSON lacks, are decoded from their bits."""
-    value, pattern = change[when], change[f"{when}_hex"]
     if value is None:
         return {"0x7ff0000000000000": "inf", "0xfff0000000000000": "-inf"}.get(
             pattern, f"nan {pattern}"
         )
-    other = change["after" if when == "before" else "before"]
     return format_distinct(value, *([] if other is None else [other]))[0]
 
 
@@ -324,8 +335,9 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     parting = run.first_difference(golden)
     ours, theirs = run.record, golden.record
     fault = ours.fault
-    if parting is None or run.first_difference(golden, leave_out=fault.get("states", ())) is None:
-        why = _no_effect(fault) if fault else "none"
+    struck = () if ours.state_fault is None else ours.state_fault.states
+    if parting is None or run.first_difference(golden, leave_out=struck) is None:
+        why = "none" if fault is None else _no_effect(fault)
         return [f"Effect      {why}: nothing else ever differs from the golden flight"]
     sides = ["inf or nan" if v is None else v for v in (parting.this, parting.other)]
     lines = [
@@ -333,7 +345,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
         f"{' instead of '.join(format_distinct(*sides))}",
         f"            at most {run.largest_deviation_m(golden):.2f} m from the golden vehicle",
     ]
-    our_s, their_s = (record.quality_of_flight["flight_time_s"] for record in (ours, theirs))
+    our_s, their_s = (record.quality_of_flight.flight_time_s for record in (ours, theirs))
     if our_s and their_s:
         change = 100.0 * (our_s / their_s - 1.0)
         lines.append(
@@ -343,9 +355,9 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
     return lines
 
 
-def _no_effect(fault: Record) -> str:
+def _no_effect(fault: StateFault | MissionInstructionFault) -> str:
     """Return why a fault had no effect: not injected, not activated, or masked."""
-    if fault["state"] == "not_injected":
+    if fault.state == "not_injected":
         return "none, not injected"
-    activation = fault["activation"]["activation"]
+    activation = "" if fault.activation is None else fault.activation.activation
     return "masked" if activation == "read" else f"none, {activation.replace('_', ' ')}"

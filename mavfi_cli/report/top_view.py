@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mavfi_cli.analysis.trajectories import MissionPicture
-from mavfi_cli.mission.measures import FlightRecord, Record
+from mavfi_cli.core.files import Json
+from mavfi_cli.core.flight_record import Event, RecordedPlan
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import Run, load_run
 from mavfi_cli.report.drawing import (
     ALARM,
@@ -102,7 +104,7 @@ def _path_of(run: Run) -> _Path:
     return places[known], speeds[known]
 
 
-def _draw_obstacles(axes: Axes, world: Record, positions: np.ndarray) -> None:
+def _draw_obstacles(axes: Axes, world: Json, positions: np.ndarray) -> None:
     """Draw the boxes of a world, pale if they end below the positions (n, 3) m of the flight."""
     from matplotlib.patches import Rectangle
 
@@ -117,12 +119,12 @@ def _draw_obstacles(axes: Axes, world: Record, positions: np.ndarray) -> None:
         )  # fmt: skip
 
 
-def _draw_plans(axes: Axes, plans: Sequence[Record]) -> None:
-    drawn = [plan for plan in plans if len(plan["points_enu_m"])]
+def _draw_plans(axes: Axes, plans: Sequence[RecordedPlan]) -> None:
+    drawn = [plan for plan in plans if len(plan.points_enu_m)]
     label = "planned" if len(drawn) <= _PLANS else f"planned (newest {_PLANS} of {len(drawn)})"
     newest = drawn[-_PLANS:]
     for number, plan in enumerate(newest, 1):
-        points = np.array(plan["points_enu_m"], dtype=float)
+        points = np.array(plan.points_enu_m, dtype=float)
         axes.plot(
             points[:, 0], points[:, 1], color=PLAN, linewidth=0.9, linestyle=(0, (4, 3)), zorder=2,
             alpha=0.25 + 0.75 * number / len(newest), label=label if plan is newest[-1] else None,
@@ -195,23 +197,23 @@ def _mark(
 
 def _draw_marks(
     axes: Axes,
-    events: Iterable[Record],
+    events: Iterable[Event],
     kind: str,
     columns: list[int] = _FROM_ABOVE,
     **style: Any,
 ) -> np.ndarray:
     """Mark events of a kind and return their places (n, 2). `style` overrides the mark."""
     stamped = [
-        (e["stamp_s"], *e["position_enu_m"])
-        for e in events
-        if e["kind"] == kind and e["position_enu_m"]
+        (event.stamp_s, *event.position_enu_m)
+        for event in events
+        if event.kind == kind and event.position_enu_m
     ]
     places = np.array(stamped, dtype=float).reshape(-1, 4)
     label, marker, look = _MARKS[kind]
     return _mark(axes, places, columns, label, marker, **{**_EVENT, **look, **style})
 
 
-def _frame(axes: Axes, world: Record, positions: np.ndarray) -> None:
+def _frame(axes: Axes, world: Json, positions: np.ndarray) -> None:
     places = [positions[:, :2]] if len(positions) else []
     places += [np.array([world[key][:2]], dtype=float) for key in ("start", "goal") if key in world]
     if places:
@@ -256,8 +258,9 @@ def _place_of(flight: FlightRecord) -> str:
 
 def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
     qof = flight.quality_of_flight
-    time_s, distance_m = qof["flight_time_s"], qof["distance_m"]
-    figures = "" if time_s is None else f", {time_s:.1f} s, {distance_m:.1f} m"
+    figures = ""
+    if qof.flight_time_s is not None and qof.distance_m is not None:
+        figures = f", {qof.flight_time_s:.1f} s, {qof.distance_m:.1f} m"
     title = f"{_place_of(flight)}: {flight.outcome.replace('_', ' ')}{figures}"
     axes.set_title("\n".join([title, *_treatment(flight)]), fontsize=9.5, loc="left")
     figure.legend(
@@ -269,22 +272,22 @@ def _caption(figure: Figure, axes: Axes, flight: FlightRecord) -> None:
 def _treatment(flight: FlightRecord) -> list[str]:
     """Return the fault and the detector of a flight; nothing if it has neither."""
     parts = []
-    if fault := flight.fault:
-        what = _struck(fault)
-        missed = " (not injected)" if fault["state"] == "not_injected" else ""
-        parts.append(f"fault: {what}{missed}")
-    if detection := flight.detection:
-        count = detection["alarm_count"]
-        parts.append(f"detector: {detection['detector']}, {count or 'no'} alarm{'s'[count == 1 :]}")
+    if (fault := flight.fault) is not None:
+        missed = " (not injected)" if fault.state == "not_injected" else ""
+        parts.append(f"fault: {_struck(flight)}{missed}")
+    if (detection := flight.detection) is not None:
+        count = detection.alarm_count
+        parts.append(f"detector: {detection.detector}, {count or 'no'} alarm{'s'[count == 1 :]}")
     return textwrap.wrap("; ".join(parts), _TITLE)
 
 
-def _struck(fault: Record) -> str:
+def _struck(flight: FlightRecord) -> str:
     """Return the fault in words, with the state or the node that was drawn."""
-    if fault["level"] == "instruction":
-        return InstructionConfig(**fault["request"]).describe(fault["node"])
-    states = fault["states"]
-    return FaultConfig(**fault["request"]).describe(states[0] if len(states) == 1 else None)
+    if (instruction := flight.instruction_fault) is not None:
+        return InstructionConfig(**instruction.request).describe(instruction.node)
+    assert flight.state_fault is not None
+    request, states = flight.state_fault.request, flight.state_fault.states
+    return FaultConfig(**request).describe(states[0] if len(states) == 1 else None)
 
 
 # Flights of one mission: golden, with a fault, protected ---------------------------------------
@@ -365,8 +368,8 @@ def _colours(flights: Iterable[tuple[str, Run]]) -> dict[str, str]:
     turn = itertools.cycle(FLIGHTS)
     for name, run in flights:
         if name not in colours:
-            detector = run.record.detection.get("detector")
-            own = DETECTORS.get(detector) if detector else None
+            detection = run.record.detection
+            own = None if detection is None else DETECTORS.get(detection.detector)
             colours[name] = own if own and own not in colours.values() else next(turn)
     return colours
 
@@ -436,13 +439,12 @@ def _explain_marks(figure: Figure) -> None:
 def _golden_s(flights: _Flights) -> float | None:
     for _, run in flights:
         if (flight := run.record).golden:
-            time_s: float | None = flight.quality_of_flight["flight_time_s"]
-            return time_s if flight.succeeded else None
+            return flight.quality_of_flight.flight_time_s if flight.succeeded else None
     return None
 
 
 def _legend_entry(name: str, flight: FlightRecord, golden_s: float | None) -> str:
-    time_s = flight.quality_of_flight["flight_time_s"]
+    time_s = flight.quality_of_flight.flight_time_s
     entry = f"{name}: {flight.outcome.replace('_', ' ')}"
     if time_s is None:
         return entry

@@ -321,7 +321,7 @@ def fly_and_report(
     table = fly(missions, plan.folder / FLIGHTS, Keep.NONE, options, spectator)
     watched = chosen(flown(table), label_arm=DETECTORS)["number"].to_pylist()
     with Ledger(plan.folder / FLIGHTS) as ledger:
-        measured = ComputeOverhead.of(mission.result for mission in ledger.results(watched))
+        measured = ComputeOverhead.of(mission.flight for mission in ledger.results(watched))
     sources = {name: (100.0 * own.share, own.describe("--fly")) for name, own in measured.items()}
     setups = {key: p.setup if isinstance(p, FlightPlan) else p for key, p in plans.items()}
     flights = FlightsReport(

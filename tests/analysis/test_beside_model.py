@@ -14,7 +14,7 @@ from mavfi_cli.analysis.beside_model import (
     side_by_side,
 )
 from mavfi_cli.analysis.overhead import ComputeOverhead
-from mavfi_cli.mission.measures import measures_of
+from mavfi_cli.mission.measures import FlightRecord, measures_of
 from mavfi_cli.report.drawing import write_figure
 from mavfi_cli.report.model import draw_flights, model_csv, model_json, model_lines
 from mavfi_cli.spec.platform import load_platform
@@ -62,7 +62,7 @@ def flights_of(records):
                 "seed": seed,
                 "outcome": record["outcome"],
                 "succeeded": record["outcome"] == "success",
-                **measures_of(record),
+                **measures_of(FlightRecord.of(record)),
             }
             for (vehicle, scheme), those in records.items()
             for seed, record in enumerate(those)

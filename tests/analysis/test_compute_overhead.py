@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from mavfi_cli.analysis.overhead import ComputeOverhead, recorded_overheads
 from mavfi_cli.cli.vpm import vpm
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.mission.measures import FlightRecord
 
 
 def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, platform="x86"):
@@ -15,7 +16,7 @@ def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, 
     counts = {"recompute": 0, "hold": 0, "accept": 0}
     for _, response in alarms:
         counts[response] += 1
-    return {
+    result = {
         "detection": detector
         and {
             "detector": detector,
@@ -35,6 +36,7 @@ def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, 
         },
         "host": {"stage_wall_s": {"gate": gate_s, "octomap": 0.15, "planner": 0.05, "link": 9.0}},
     }
+    return FlightRecord.of(result)
 
 
 def test_checks_alone():
@@ -67,7 +69,7 @@ def test_alarms_beyond_the_listed_ones_are_counted():
 def test_flights_are_taken_together_and_faulty_ones_left_out():
     found = ComputeOverhead.of(
         [flight(), flight(gate_s=0.04), flight("aad"), flight(None), flight(fault={"state": "x"}),
-         {"outcome": "crash"}]
+         FlightRecord(outcome="crash")]
     )  # fmt: skip
     assert set(found) == {"gad", "aad"}
     assert found["gad"].flights == 2
@@ -114,7 +116,7 @@ def guarded(fly_short):
 
 def test_a_real_record_has_what_it_takes(guarded):
     result = json.loads(guarded.result.read_text())
-    found = ComputeOverhead.of([result])["gad"]
+    found = ComputeOverhead.of([FlightRecord.of(result)])["gad"]
     assert found.detection_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert found.compute_s == pytest.approx(sum(k["busy_s"] for k in result["kernels"].values()))
     assert 0.0 < found.share < 0.5

@@ -5,7 +5,7 @@ from evaluation_flights import flown, labelled, pair, paired, struck
 
 from mavfi_cli.analysis.detectors import WANTED
 from mavfi_cli.campaigns.missions import Injected
-from mavfi_cli.mission.measures import measures_of
+from mavfi_cli.mission.measures import FlightRecord, measures_of
 
 GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}
 FAULT = {
@@ -83,7 +83,9 @@ def test_pairs_need_all_of_their_flights():
 
 
 def record(fault, **result):
-    return measures_of({"quality_of_flight": {"flight_time_s": 12.0}, "fault": fault, **result})
+    return measures_of(
+        FlightRecord.of({"quality_of_flight": {"flight_time_s": 12.0}, "fault": fault, **result})
+    )
 
 
 def test_a_record_of_a_source_level_fault():
@@ -118,5 +120,5 @@ def test_a_record_of_an_instruction_level_fault():
 
 
 def test_a_record_of_a_mission_that_was_cut_off_has_empty_columns():
-    read = measures_of({})
+    read = measures_of(FlightRecord.of({}))
     assert not any(value for value in read.values())

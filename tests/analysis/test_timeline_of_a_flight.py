@@ -6,6 +6,7 @@ import pytest
 
 from mavfi_cli.analysis.timeline import timelines
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.flight_record import Event
 from mavfi_cli.core.types import Invocation, Reaction
 from mavfi_cli.mission.run_folder import RunFolder, load_run
 
@@ -40,7 +41,7 @@ def test_a_damaged_time_table_is_one_line(tmp_path, bad):
 def flight(invocations, reactions, events=()):
     """What a timeline reads of a run."""
     folder = SimpleNamespace(read_timetable=lambda: (invocations, reactions))
-    record = SimpleNamespace(events=[{"kind": "slow", "stamp_s": s, "text": "?"} for s in events])
+    record = SimpleNamespace(events=[Event(kind="slow", stamp_s=s, text="?") for s in events])
     return {"x86": SimpleNamespace(folder=folder, record=record, trace=None)}
 
 

@@ -15,6 +15,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import ConfigError, RecordError
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
@@ -174,8 +175,8 @@ def test_a_database_of_somebody_else_is_refused(tmp_path):
     ],
 )
 def test_what_became_of_a_fault(fault, injected):
-    assert Injected.of({"fault": fault}, faulty=True) is injected
-    assert Injected.of({"fault": fault}, faulty=False) is Injected.GOLDEN
+    assert Injected.of(FlightRecord.of({"fault": fault}), faulty=True) is injected
+    assert Injected.of(FlightRecord.of({"fault": fault}), faulty=False) is Injected.GOLDEN
 
 
 @pytest.mark.parametrize(
@@ -197,5 +198,8 @@ def test_a_fault_that_a_detector_withheld_was_no_idle_one(alarm, injected):
         "strikes": [{"stamp_s": 11.0, "changes": [{"state": "command_yaw"}]}],
     }
     result = {"fault": fault, "detection": {"alarms": [told]}}
-    assert Injected.of(result, faulty=True) is injected
-    assert Injected.of({**result, "detection": None}, faulty=True) is Injected.NOT_ACTIVATED
+    assert Injected.of(FlightRecord.of(result), faulty=True) is injected
+    assert (
+        Injected.of(FlightRecord.of({**result, "detection": None}), faulty=True)
+        is Injected.NOT_ACTIVATED
+    )

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from mavfi_cli.core.errors import Interrupted
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.report.summary import event_lines, summary_lines
 from sitl.world.world import CLEAR_RADIUS_M
 
@@ -73,7 +74,7 @@ def test_show_says_what_fly_said(command_line, short_flight):
     result = json.loads(short_flight.result.read_text())
     code, out, err = command_line("show", short_flight.path)
     assert (code, err) == (0, "")
-    assert out.splitlines()[:-2] == summary_lines(result)
+    assert out.splitlines()[:-2] == summary_lines(FlightRecord.of(result))
     assert out.splitlines()[-1] == f"Run folder  {short_flight.path}"
     assert command_line("show", short_flight.result)[1] == out
 
@@ -108,7 +109,7 @@ def test_a_record_that_is_none_says_so(command_line, short_flight, tmp_path):
 def test_show_events_and_json(command_line, troubled_flight):
     result = json.loads(troubled_flight.result.read_text())
     _, out, _ = command_line("show", troubled_flight.path, "--events")
-    for line in event_lines(result):
+    for line in event_lines(FlightRecord.of(result)):
         assert line in out.splitlines()
     _, out, _ = command_line("show", troubled_flight.path, "--json")
     assert json.loads(out) == result
@@ -147,9 +148,12 @@ def _change(folder, section, value):
         (lambda f: (f / "result.json").write_text("[]"), "not a JSON object"),
         (lambda f: (f / "result.json").write_text("[" * 100_000), "nested too deeply"),
         (lambda f: _change(f, "config", 5), "damaged (a value in it has the wrong type)"),
-        (lambda f: _change(f, "detection", 5), "damaged (a value in it has the wrong type)"),
-        (lambda f: _change(f, "events", 5), "damaged (a value in it has the wrong type)"),
-        (lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}), "damaged (it has no"),
+        (lambda f: _change(f, "detection", 5), "detection: must be a table, got 5"),
+        (lambda f: _change(f, "events", 5), "damaged (events"),
+        (
+            lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}),
+            "distance_m: must be a number, got 'x'",
+        ),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
         (lambda f: (f / "trace.parquet").write_bytes(b"PAR1 not"), "the trace cannot be read"),

@@ -5,7 +5,8 @@ import sys
 import pytest
 
 from mavfi_cli.cli.progress import progress_view
-from mavfi_cli.mission.progress import Event, FlightProgress
+from mavfi_cli.core.flight_record import Event
+from mavfi_cli.mission.progress import FlightProgress
 from mavfi_cli.spec.mission import MissionConfig
 
 

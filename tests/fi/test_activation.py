@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mavfi_cli.core.flight_record import Change, Reader, Strike
 from mavfi_cli.core.types import Trajectory
-from mavfi_cli.fi.injector import Activation, Change, Follower, Reader, Strike
+from mavfi_cli.fi.injector import Activation, Follower
 
 STRUCK = Trajectory(
     stamp_s=0.0,

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavfi_cli.core.errors import FaultError, FaultSpecError, UnknownName
+from mavfi_cli.core.flight_record import Strike
 from mavfi_cli.core.types import (
     BY_NAME,
     STATES,
@@ -27,7 +28,7 @@ from mavfi_cli.fi.fault import (
     When,
     draw_fault,
 )
-from mavfi_cli.fi.injector import Activation, MemoryInjector, Moment, SourceInjector, Strike
+from mavfi_cli.fi.injector import Activation, MemoryInjector, Moment, SourceInjector
 
 TRAJECTORY = Trajectory(
     stamp_s=0.0,

@@ -56,7 +56,7 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     data = run.folder.tlog.read_bytes()
     kinds = {m.get_type() for m in Codec(0, 0).decode(data)}
     assert {"HEARTBEAT", "LOCAL_POSITION_NED", "SET_POSITION_TARGET_LOCAL_NED"} <= kinds
-    assert any("Program     hop: started 1x" in line for line in summary_lines(run.result))
+    assert any("Program     hop: started 1x" in line for line in summary_lines(run.record))
     draw_top_view(run)
     assert ViewedFlight(name="flight", run=run, recorder=None).run is run
     with pytest.raises(RecordError, match="a user's companion does not repeat"):

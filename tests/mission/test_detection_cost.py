@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mavfi_cli.mission.measures import DetectionCost
+from mavfi_cli.mission.measures import DetectionCost, FlightRecord
 from mavfi_cli.spec.detector import DetectorConfig
 
 RECORD = {
@@ -35,7 +35,7 @@ RECORD = {
 
 def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels():
     """Four of eight recomputations are listed: one, two and one, so they are two, four and two."""
-    cost = DetectionCost.of(RECORD)
+    cost = DetectionCost.of(FlightRecord.of(RECORD))
     assert (cost.detector, cost.checks) == ("gad", 1000)
     assert cost.check_host_s == pytest.approx(5e-6)
     assert cost.detection_share == pytest.approx(0.005 / 20.0)
@@ -50,13 +50,15 @@ def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels()
 def test_an_alarm_about_a_report_that_recomputes_control_costs_control_only():
     alarm = {"stage": "perception", "recomputes": "control", "response": "recompute"}
     detection = RECORD["detection"] | {"responses": {"recompute": 1}, "alarms": [alarm]}
-    cost = DetectionCost.of(RECORD | {"detection": detection})
+    cost = DetectionCost.of(FlightRecord.of(RECORD | {"detection": detection}))
     assert cost.recomputations == {"perception": 0.0, "planning": 0.0, "control": 1.0}
     assert cost.recovered_s == pytest.approx(0.0005)
 
 
 def test_without_a_flight_time_the_whole_mission_counts():
-    cost = DetectionCost.of(RECORD | {"quality_of_flight": {"flight_time_s": None}})
+    cost = DetectionCost.of(
+        FlightRecord.of(RECORD | {"quality_of_flight": {"flight_time_s": None}})
+    )
     assert cost.detection_share == pytest.approx(0.005 / 32.0)
 
 
@@ -70,13 +72,13 @@ def test_without_a_flight_time_the_whole_mission_counts():
     ],
 )
 def test_a_flight_in_which_nothing_was_checked_has_no_cost(changes):
-    assert DetectionCost.of(RECORD | changes) is None
-    assert DetectionCost.of({"outcome": "hang"}) is None
+    assert DetectionCost.of(FlightRecord.of(RECORD | changes)) is None
+    assert DetectionCost.of(FlightRecord.of({"outcome": "hang"})) is None
 
 
 def test_a_real_record_has_what_it_takes(fly_short):
     result = json.loads(fly_short(detector=DetectorConfig(name="aad")).result.read_text())
-    cost = DetectionCost.of(result)
+    cost = DetectionCost.of(FlightRecord.of(result))
     assert cost.checks_host_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert cost.flight_s == result["quality_of_flight"]["flight_time_s"]
     assert 50.0 < cost.checks / cost.flight_s < 100.0  # a tick is 20 ms

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import asdict
 
 import pytest
 
@@ -9,6 +10,7 @@ from mavfi_cli.companion.executor import Executor, LatencyModel, Node
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.types import KERNELS
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.spec.mission import MissionConfig
@@ -78,8 +80,8 @@ def test_an_invocation_takes_what_it_took_times_the_factor():
     assert [value for value, _ in published] == ["a", "b", "c"]
     assert [stamp_s for _, stamp_s in published] == pytest.approx([0.04, 1.12, 2.08])
     told = model.summary()
-    assert (told["platform"], told["factor"]) == ("measured:4", 4.0)
-    assert told["kernels"]["octomap"] == pytest.approx(
+    assert (told.platform, told.factor) == ("measured:4", 4.0)
+    assert asdict(told.kernels["octomap"]) == pytest.approx(
         {"host_median_s": 0.020, "latency_median_s": 0.080, "invocations": 3}
     )
     assert octomap.busy_s == pytest.approx(0.24)
@@ -89,7 +91,7 @@ def test_other_platforms_measure_nothing(short_flight):
     assert LatencyModel(load_platform("x86"), 1, WallClock()).summary() is None
     result = json.loads(short_flight.result.read_text())
     assert result["measured_platform"] is None
-    assert not any(line.startswith("Measured") for line in summary_lines(result))
+    assert not any(line.startswith("Measured") for line in summary_lines(FlightRecord.of(result)))
 
 
 @pytest.mark.slow
@@ -110,7 +112,7 @@ def test_a_flight_on_this_host_ten_times_as_slow(fly_short):
     assert result["response_time_s"]["p95"] >= waits_s
     busy_s, wall_s = result["kernels"]["octomap"]["busy_s"], result["host"]["stage_wall_s"]
     assert busy_s == pytest.approx(10.0 * wall_s["octomap"], rel=0.02, abs=0.01)
-    text = " ".join(" ".join(summary_lines(result)).split())
+    text = " ".join(" ".join(summary_lines(FlightRecord.of(result))).split())
     assert re.search(r"Measured .*octomap .* ms \(medians on this host\)", text)
     assert "x 10 in the flight" in text
     with pytest.raises(RecordError, match="measured kernel times does not repeat"):

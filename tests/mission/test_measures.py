@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavfi_cli.mission.measures import STRUCK, measures_of
+from mavfi_cli.mission.measures import STRUCK, FlightRecord, measures_of
 
 STRIKE = {
     "changes": [
@@ -32,7 +32,11 @@ INSTRUCTION = {
 
 def told(**result):
     """The columns that are not empty."""
-    found = {name: value for name, value in measures_of(result).items() if name in STRUCK}
+    found = {
+        name: value
+        for name, value in measures_of(FlightRecord.of(result)).items()
+        if name in STRUCK
+    }
     assert tuple(found) == STRUCK
     return {name: value for name, value in found.items() if value is not None}
 
@@ -83,7 +87,7 @@ def test_a_fault_in_an_instruction():
 def test_a_killed_process_changes_no_bit():
     strike = {"changes": [], "invocation": 3, "phase": "flying", "stamp_s": 9.0, "tick": 5}
     killed = {**SOURCE, "states": ["process.planner"], "strikes": [strike]}
-    found = measures_of({"fault": killed})
+    found = measures_of(FlightRecord.of({"fault": killed}))
     assert (found["struck_s"], found["first_bits"]) == (9.0, [])
     assert (found["strikes"], found["struck_bits"]) == (1, [])
 

@@ -18,6 +18,7 @@ from mavfi_cli.core.files import (
     write_parquet,
     write_text,
 )
+from mavfi_cli.core.flight_record import QualityOfFlight, ResponseTime
 from mavfi_cli.core.types import (
     KERNELS,
     STATES,
@@ -27,7 +28,7 @@ from mavfi_cli.core.types import (
     Trajectory,
     VehicleState,
 )
-from mavfi_cli.mission.measures import QUALITY, quality_of
+from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.run import response_times
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
 from mavfi_cli.mission.vehicle import read_briefing
@@ -295,26 +296,26 @@ def circle(count=2001, radius_m=3.0, time_s=10.0):
 
 def test_quality_of_a_circle_against_its_closed_form():
     found = quality_of(circle(), 0.0, 99.0, np.array([3.0, 4.0, 0.0]))
-    assert found["flight_time_s"] == pytest.approx(10.0)
-    assert found["distance_m"] == pytest.approx(math.tau * 3.0, rel=1e-5)
-    assert found["mean_speed_mps"] == pytest.approx(0.6 * math.pi, rel=1e-5)
-    assert found["max_speed_mps"] == pytest.approx(0.6 * math.pi)
-    assert found["min_clearance_m"] == pytest.approx(1.0, abs=1e-5)
-    assert found["goal_distance_m"] == pytest.approx(4.0)
-    assert found["energy_regression_j"] == pytest.approx(100.0)
-    assert found["energy_propeller_j"] == pytest.approx(70.0)
+    assert found.flight_time_s == pytest.approx(10.0)
+    assert found.distance_m == pytest.approx(math.tau * 3.0, rel=1e-5)
+    assert found.mean_speed_mps == pytest.approx(0.6 * math.pi, rel=1e-5)
+    assert found.max_speed_mps == pytest.approx(0.6 * math.pi)
+    assert found.min_clearance_m == pytest.approx(1.0, abs=1e-5)
+    assert found.goal_distance_m == pytest.approx(4.0)
+    assert found.energy_regression_j == pytest.approx(100.0)
+    assert found.energy_propeller_j == pytest.approx(70.0)
 
 
 def test_only_the_flight_itself_counts():
     half = quality_of(circle(), 5.0, 10.0, np.zeros(3))
-    assert half["flight_time_s"] == pytest.approx(5.0)
-    assert half["distance_m"] == pytest.approx(math.pi * 3.0, rel=1e-5)
-    assert half["energy_regression_j"] == pytest.approx(25.0)
+    assert half.flight_time_s == pytest.approx(5.0)
+    assert half.distance_m == pytest.approx(math.pi * 3.0, rel=1e-5)
+    assert half.energy_regression_j == pytest.approx(25.0)
 
 
 @pytest.mark.parametrize("window", [(math.inf, 12.0), (99.0, 100.0), (7.0, 7.0)])
 def test_a_flight_that_never_was_has_no_quality(window):
-    assert quality_of(circle(), *window, np.zeros(3)) == dict.fromkeys(QUALITY)
+    assert quality_of(circle(), *window, np.zeros(3)) == QualityOfFlight()
 
 
 def test_what_the_companion_knows_by_itself():
@@ -323,12 +324,12 @@ def test_what_the_companion_knows_by_itself():
     found = quality_of(received, 0.0, 99.0, np.zeros(3))
     true = quality_of(data, 0.0, 99.0, np.zeros(3))
     unknown = dict.fromkeys(("min_clearance_m", "energy_regression_j", "energy_propeller_j"))
-    assert found == {**true, **unknown}
+    assert found == replace(true, **unknown)
 
 
 def test_a_world_without_boxes_has_no_clearance():
     data = {**circle(), "clearance_m": np.full(2001, math.inf)}
-    assert quality_of(data, 0.0, 99.0, np.zeros(3))["min_clearance_m"] is None
+    assert quality_of(data, 0.0, 99.0, np.zeros(3)).min_clearance_m is None
 
 
 # Response time -------------------------------------------------------------------------------
@@ -338,12 +339,12 @@ def test_response_times_are_those_of_numpy():
     times = [0.3, 0.5, 0.1, 0.4, 0.2]
     reactions = [Reaction(frame_stamp_s=k, setpoint_stamp_s=k + t) for k, t in enumerate(times)]
     found = response_times(reactions)
-    assert found["median"] == pytest.approx(0.3)
-    assert found["p95"] == pytest.approx(np.percentile(times, 95))
-    assert found["count"] == 5
+    assert found.median == pytest.approx(0.3)
+    assert found.p95 == pytest.approx(np.percentile(times, 95))
+    assert found.count == 5
 
 
 def test_no_reaction_no_response_time():
-    empty = {"median": None, "p95": None, "count": 0}
+    empty = ResponseTime()
     assert response_times([]) == empty
     assert response_times([Reaction(frame_stamp_s=math.nan, setpoint_stamp_s=1.0)]) == empty

@@ -10,6 +10,7 @@ import pytest
 from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.companion.protection import PASSED, Protection, Response
 from mavfi_cli.core.errors import ConfigError, FaultSpecError, ModelError, UnknownName
+from mavfi_cli.core.flight_record import RecordedRecovery
 from mavfi_cli.core.types import CollisionReport, Command, Stage, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.detect.base import shipped
@@ -79,9 +80,9 @@ def test_after_so_many_alarms_in_a_row_it_holds_and_then_accepts(limit):
         Response.RECOMPUTE, Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
     ]  # fmt: skip
     summary = gate.summary()
-    assert summary["responses"] == {"recompute": 2, "hold": 1, "accept": 1}
-    assert summary["alarm_count"] == 4
-    assert summary["recoveries"]["control"] == {"count": 1, "total_s": 0.06}
+    assert summary.responses == {"recompute": 2, "hold": 1, "accept": 1}
+    assert summary.alarm_count == 4
+    assert summary.recoveries["control"] == RecordedRecovery(count=1, total_s=0.06)
 
 
 def test_a_message_that_passes_ends_the_row(limit):
@@ -126,16 +127,16 @@ def test_a_wild_report_is_withheld(limit):
     wild = replace(calm, future_collision_seq=1 << 20)
     assert gate.report(wild, 0.3).response is Response.RECOMPUTE
     assert gate.report(calm, 0.6).response is Response.PASS
-    assert gate.summary()["recoveries"]["perception"] == {"count": 1, "total_s": 0.3}
+    assert gate.summary().recoveries["perception"] == RecordedRecovery(count=1, total_s=0.3)
 
 
 def test_the_record_names_the_recomputed_stage_if_it_is_not_the_alarm_s(per_stage, limit):
     gate = protection(limit)
     for number in (0, 1 << 20):
         gate.report(replace(CALM, future_collision_seq=number), 0.0)
-    (alarm,) = gate.summary()["alarms"]
-    assert (alarm["stage"], alarm["message"]) == ("perception", "report")
-    assert alarm.get("recomputes") == (None if per_stage else "control")
+    (alarm,) = gate.summary().alarms
+    assert (alarm.stage, alarm.message) == ("perception", "report")
+    assert alarm.recomputes == (None if per_stage else "control")
 
 
 CALM = CollisionReport(
@@ -191,7 +192,7 @@ def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_
     assert [gate.plan(plan, 0.1).response for plan in wrong] == [
         Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
     ]  # fmt: skip
-    assert {alarm["states"] for alarm in gate.summary()["alarms"]} == {("plan_trajectory_seq",)}
+    assert {alarm.states for alarm in gate.summary().alarms} == {("plan_trajectory_seq",)}
     assert gate.news()[0] == ("extended watch alarm in planning: plan_trajectory_seq; recompute")
 
 

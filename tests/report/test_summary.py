@@ -6,6 +6,7 @@ import re
 import pytest
 
 from mavfi_cli.core.types import Outcome
+from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.report.summary import event_lines, outcome_line, summary_lines
 
 
@@ -17,15 +18,15 @@ def result(short_flight):
 @pytest.mark.parametrize("outcome", Outcome)
 def test_every_outcome_has_its_words(result, outcome):
     result.update(outcome=outcome.value, reason="why it was")
-    first = summary_lines(result)[0]
+    first = summary_lines(FlightRecord.of(result))[0]
     assert first.startswith(outcome.value.upper().replace("_", " "))
     assert first.endswith("(why it was)")
     result["reason"] = ""
-    assert "(" not in outcome_line(result)
+    assert "(" not in outcome_line(FlightRecord.of(result))
 
 
 def test_the_figures_are_those_of_the_record(result):
-    text = "\n".join(summary_lines(result))
+    text = "\n".join(summary_lines(FlightRecord.of(result)))
     quality = result["quality_of_flight"]
     for figure in (
         f"{quality['flight_time_s']:.1f} s, ",
@@ -44,14 +45,14 @@ def test_the_figures_are_those_of_the_record(result):
 
 def test_a_mission_that_ended_before_its_flight_says_so(result):
     result["quality_of_flight"] = dict.fromkeys(result["quality_of_flight"])
-    lines = summary_lines(result | {"outcome": "interrupted"})
+    lines = summary_lines(FlightRecord.of(result | {"outcome": "interrupted"}))
     assert "Flight      none: the mission ended before the companion took over" in lines
     assert "not known" not in "\n".join(lines)
 
 
 def test_the_plans_add_up(result, troubled_flight):
     for run in (result, json.loads(troubled_flight.result.read_text())):
-        text = "\n".join(summary_lines(run))
+        text = "\n".join(summary_lines(FlightRecord.of(run)))
         found = re.search(
             r"(\d+) requested: (\d+) flown(?: \((\d+) replans\))?, (\d+) failed.*, (\d+) not used",
             text,
@@ -68,7 +69,7 @@ def test_what_is_not_known_is_said_so(result):
     result["quality_of_flight"] = quality | {"flight_time_s": 12.0, "distance_m": 30.0}
     result["response_time_s"] = {"median": None, "p95": None, "count": 0}
     result["host"]["flight_wall_s"] = 0.0
-    text = "\n".join(summary_lines(result))
+    text = "\n".join(summary_lines(FlightRecord.of(result)))
     assert "Flight      12.0 s, 30.0 m flown, not known from the goal" in text
     assert "Clearance   not known\n" in text
     assert "Energy      not known\n" in text
@@ -80,7 +81,9 @@ def test_what_is_not_known_is_said_so(result):
 
 def test_a_foreign_autopilot_is_named_by_its_link(result):
     result["config"]["link"] = "udpin:127.0.0.1:14540"
-    assert "foreign autopilot at udpin:127.0.0.1:14540" in "\n".join(summary_lines(result))
+    assert "foreign autopilot at udpin:127.0.0.1:14540" in "\n".join(
+        summary_lines(FlightRecord.of(result))
+    )
 
 
 def test_a_long_line_goes_on_below_its_text(result):
@@ -94,7 +97,7 @@ def test_a_long_line_goes_on_below_its_text(result):
         "strikes": [{"stamp_s": 10.52, "changes": [change]}], "strike_count": 1, "reason": "",
         "activation": {"first_reader": None, "activation": "overwritten"},
     }  # fmt: skip
-    lines = summary_lines(result)
+    lines = summary_lines(FlightRecord.of(result))
     assert max(map(len, lines)) <= 100
     place = next(place for place, line in enumerate(lines) if line.startswith("Fault"))
     assert lines[place].endswith(": transient flip, once the pilot is")
@@ -111,9 +114,11 @@ def test_a_struck_instruction_is_in_a_function_with_a_plain_name(result):
         "object": "liboctomap.so",
     }  # fmt: skip
     told = "before execution 3 of and ebx, 1 ({})"
-    assert told.format("search+0x205 in liboctomap.so") in "\n".join(summary_lines(result))
+    assert told.format("search+0x205 in liboctomap.so") in "\n".join(
+        summary_lines(FlightRecord.of(result))
+    )
     result["fault"]["symbol"] = ""
-    assert told.format("liboctomap.so+0x1234") in "\n".join(summary_lines(result))
+    assert told.format("liboctomap.so+0x1234") in "\n".join(summary_lines(FlightRecord.of(result)))
 
 
 @pytest.mark.parametrize(("bits", "told"), [([3], "bit 3 of"), ([3, 40], "bits 3, 40 of")])
@@ -126,10 +131,10 @@ def test_the_bits_of_a_struck_instruction_are_counted(result, bits, told):
         "injection": {"before": "0x1", "after": "0x9"}, "activation": {"activation": "not_read"},
     }  # fmt: skip
     line = f"            {told} destination rbx: 0x1 -> 0x9; not read"
-    assert line in summary_lines(result)
+    assert line in summary_lines(FlightRecord.of(result))
 
 
 def test_events_come_one_a_line_in_order(result):
-    lines = event_lines(result)
+    lines = event_lines(FlightRecord.of(result))
     assert len(lines) == len(result["events"])
     assert lines[-1].split() == [f"{result['simulated_s']:.2f}", "s", "outcome", "success"]

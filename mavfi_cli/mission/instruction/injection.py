@@ -29,7 +29,7 @@ from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.companion.executor import Executor
-from mavfi_cli.companion.injection import SCHEMA, NoInjection
+from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.archive import pack, unpack
@@ -39,6 +39,7 @@ from mavfi_cli.core.files import (
     read_bounded,
     write_atomically,
 )
+from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, DepthFrame, PointCloud
 from mavfi_cli.fi.tracer import linux, record

@@ -67,7 +67,7 @@ class Entry:
     @property
     def urgent(self) -> bool:
         """Whether a note reports a fault, an alarm or the death of a node."""
-        return self.data["kind"] in ("fault", "alarm", "node")
+        return self.data.kind in ("fault", "alarm", "node")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ class ViewedFlight:
     @property
     def colour(self) -> str:
         """Colour of vehicle, path and setpoints, as in all pictures."""
-        return FLIGHTS[1 if self.run.record.fault else 0]
+        return FLIGHTS[0 if self.run.record.fault is None else 1]
 
     def entry(self, name: str, stamp_s: float, kind: str, data: Any, **look: Any) -> Entry:
         """An entry of this name below the flight's."""
@@ -112,7 +112,7 @@ def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
 
 
 def _world(record: FlightRecord) -> Iterator[Entry]:
-    stamp_s = record.events[0]["stamp_s"] if record.events else 0.0
+    stamp_s = record.events[0].stamp_s if record.events else 0.0
     boxes = np.array(record.world.get("boxes", ()), dtype=np.float64).reshape(-1, 6)
     low, high = np.split(boxes.clip(max=[math.inf] * 5 + [_TALLEST_M]), 2, axis=1)
     yield Entry(
@@ -132,22 +132,22 @@ def _world(record: FlightRecord) -> Iterator[Entry]:
 def _plans(flight: ViewedFlight) -> Iterator[Entry]:
     for plan in flight.run.record.plans:
         yield flight.line(
-            "plan", plan["stamp_s"], np.array(plan["points_enu_m"]), colour=PLAN, size_m=0.08
+            "plan", plan.stamp_s, np.array(plan.points_enu_m, dtype=float), colour=PLAN, size_m=0.08
         )
 
 
 def _notes(flight: ViewedFlight) -> Iterator[Entry]:
     for event in flight.run.record.events:
-        yield flight.entry("events", event["stamp_s"], "note", event)
+        yield flight.entry("events", event.stamp_s, "note", event)
 
 
 def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
     places: list[Sequence[float]] = []
     for event in flight.run.record.events:
-        if event["kind"] == kind and event["position_enu_m"]:
-            places.append(event["position_enu_m"])
+        if event.kind == kind and event.position_enu_m:
+            places.append(event.position_enu_m)
             look = {"colour": _MARKED[kind], "size_m": _MARK_M}
-            yield flight.entry(f"{kind}s", event["stamp_s"], "marks", np.array(places), **look)
+            yield flight.entry(f"{kind}s", event.stamp_s, "marks", np.array(places), **look)
 
 
 def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:

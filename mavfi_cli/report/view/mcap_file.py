@@ -74,7 +74,7 @@ def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
 
 
 def _write(
-    entries: Iterable[Entry], metadata: Mapping[str, Mapping[str, Any]], file: BinaryIO
+    entries: Iterable[Entry], metadata: Mapping[str, Mapping[str, object]], file: BinaryIO
 ) -> None:
     writer = Writer(file)
     writer.start(library="mavfi")
@@ -94,17 +94,17 @@ def _write(
     writer.finish()
 
 
-def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, Any]]:
+def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]]:
     """Metadata records of an MCAP file, by name: what was flown, and on which versions."""
-    records: dict[str, Mapping[str, Any]] = {}
+    records: dict[str, Mapping[str, object]] = {}
     for flight in flights:
         record = flight.run.record
         end = {"outcome": record.outcome, "reason": record.reason}
         records[f"{flight.name}/mission"] = {**record.config, **end}
         records[f"{flight.name}/seeds"] = record.seeds
         records[f"{flight.name}/versions"] = record.versions
-        if record.fault:
-            records[f"{flight.name}/fault"] = record.fault
+        if (fault := record.recorded_fault) is not None:
+            records[f"{flight.name}/fault"] = fault
     return records
 
 
@@ -219,7 +219,7 @@ def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
             yield topic, PoseInFrame(timestamp=stamp, frame_id=_WORLD, pose=pose)
         case "note":
             level = Log.WARNING if entry.urgent else Log.INFO
-            log = Log(timestamp=stamp, level=level, message=data["text"], name=data["kind"])
+            log = Log(timestamp=stamp, level=level, message=data.text, name=data.kind)
             yield topic, log
         case "values":
             yield topic, data

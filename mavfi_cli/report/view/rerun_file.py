@@ -111,7 +111,7 @@ def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
             archetype = rr.Transform3D(translation=data[0], rotation=turn)
         case "note":
             level = "WARN" if entry.urgent else "INFO"
-            archetype = rr.TextLog(f"{data['kind']}: {data['text']}", level=level)
+            archetype = rr.TextLog(f"{data.kind}: {data.text}", level=level)
         case "depth":
             yield from _camera(entry)
             return

@@ -92,7 +92,7 @@ def test_world_and_marks_are_where_the_record_has_them(entries, pair):
     np.testing.assert_allclose(high, [box[3:] for box in record.world["boxes"]])
     (goal,) = at(entries, "world/goal")
     assert goal.data.tolist() == [list(record.goal_enu_m)]
-    faults = [e["position_enu_m"] for e in record.events if e["kind"] == "fault"]
+    faults = [list(e.position_enu_m) for e in record.events if e.kind == "fault"]
     assert at(entries, "faulty/faults")[-1].data.tolist() == faults
 
 

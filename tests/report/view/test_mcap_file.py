@@ -116,7 +116,7 @@ def test_clouds_boxes_lines_and_events_are_those_of_the_entries(messages, entrie
     (line,) = plan.entities[0].lines
     assert [[p.x, p.y, p.z] for p in line.points] == entry.data.tolist()
     texts = [(told.name, told.message) for _, told in messages["/faulty/events"]]
-    assert texts == [(entry.data["kind"], entry.data["text"]) for entry in entries["faulty/events"]]
+    assert texts == [(entry.data.kind, entry.data.text) for entry in entries["faulty/events"]]
 
 
 def test_equal_flights_give_equal_bytes(pair, file, tmp_path):
