@@ -18,13 +18,12 @@ import pyarrow as pa
 from mavfi_cli.analysis.detectors import NONE, Scored, harmful
 from mavfi_cli.analysis.flights import chosen
 from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.files import write_json
+from mavfi_cli.core.files import Json, write_json
 from mavfi_cli.core.types import BY_NAME, Outcome, StackMark, Stage, Trajectory
 from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.offline import Columns, FlightSamples, PlanStrike, columns_of, replay
 from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.fi import bits
-from mavfi_cli.mission.measures import Record
 from mavfi_cli.mission.run_folder import RESULT, Run, load_run
 from mavfi_cli.mission.setpoints import samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig
