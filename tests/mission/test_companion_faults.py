@@ -186,8 +186,8 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
         fault=FaultConfig(**fault, at="time=7"),
     )  # fmt: skip
     assert run.record.outcome == outcome
-    assert run.record.fault["state"] == "applied"
-    assert any(line in text for text in summary_lines(run.result))
+    assert run.record.state_fault.state == "applied"
+    assert any(line in text for text in summary_lines(run.record))
     assert any(event["kind"] == "fault" for event in run.record.events)
 
 
