@@ -247,7 +247,7 @@ def _fault_lines(flight: FlightRecord) -> list[str]:
     }[trigger.when]
     request, states = fault.request, ", ".join(fault.states)
     what = f"{fault.stage} stage, {states}: {request['persistence']} {request['effect']}"
-    is_value = bool(fault.units and fault.units[0])
+    is_value = "" not in fault.units[:1]
     if fault.stage == "process":
         struck = {"flip": "is killed", "stop": "is stopped"}
         what = f"{states} {struck.get(request['effect'], request['effect'])}"
