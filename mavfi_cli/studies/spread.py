@@ -42,7 +42,8 @@ class Spread:
         """Compare flights. Numbers without flights are NaN."""
         good = [run for run in runs if run.record.succeeded]
         share = wilson(len(good), len(runs))
-        times = sorted(run.record.quality_of_flight["flight_time_s"] for run in good)
+        qualities = [run.record.quality_of_flight for run in good]
+        times = sorted(own.flight_time_s for own in qualities if own.flight_time_s is not None)
         apart = []
         for run in good[1:]:
             first = path_of(good[0].folder.path)

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from mavfi_cli.core.flight_record import QualityOfFlight
 from mavfi_cli.studies.spread import Spread
 
 
@@ -19,7 +20,7 @@ def run(folder, outcome, time_s, east_m):
     pq.write_table(pa.table(columns), folder / "trace.parquet")
     record = types.SimpleNamespace(
         outcome=outcome, succeeded=outcome == "success",
-        quality_of_flight={"flight_time_s": time_s},
+        quality_of_flight=QualityOfFlight(flight_time_s=time_s),
     )  # fmt: skip
     return types.SimpleNamespace(record=record, folder=types.SimpleNamespace(path=folder))
 
