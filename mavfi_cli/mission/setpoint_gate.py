@@ -76,6 +76,7 @@ class SetpointGate:
         self._view, self._note, self._signing, self._gone = SetpointView(), note, signing, gone
         self._codec = Codec(1, _COMPONENT, signing=signing)
         self._accepted: Message | None = None
+        self._yaw_rad = 0.0  # of the last accepted setpoint; a standstill keeps it
         self._in_a_row = self._checks = 0
         self._counts = _Counts()
         self._said_s = self._handed_s = self._heartbeat_s = -math.inf
@@ -121,11 +122,12 @@ class SetpointGate:
             self._say(f"{why}: its setpoints are withheld", now_s)
             return [message] if self._settings.watch_only else []
         self._checks += 1
-        alarm = self._gate.judge_tick(*self._view.sample(message))
+        sample = self._view.sample(message)
+        alarm = self._gate.judge_tick(*sample)
         if alarm is None:
             if self._in_a_row:
                 self._say("setpoints pass again", now_s)
-            self._in_a_row, self._accepted = 0, message
+            self._in_a_row, self._accepted, self._yaw_rad = 0, message, sample[2].yaw_rad
             return [message]
         self._in_a_row += 1
         if self._settings.watch_only:
@@ -174,9 +176,7 @@ class SetpointGate:
 
     def _standstill(self, message: Message) -> list[Message]:
         """Return a setpoint of no velocity. It becomes the reference of the next."""
-        state = self._view.telemetry.state
-        yaw_rad = 0.0 if state is None else state.yaw_rad
-        still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=yaw_rad)
+        still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=self._yaw_rad)
         trajectory, index, _ = self._view.sample(message)
         if self._gate.judge_tick(trajectory, index, still) is not None:
             self._gate.accept_tick()

@@ -119,6 +119,21 @@ def test_a_wild_setpoint_is_held_back_then_braked_and_a_good_one_passes(gate):
     assert texts[0].startswith("mavfi gate: setpoint withheld")
 
 
+def test_a_standstill_keeps_the_yaw_of_the_last_accepted_setpoint(model):
+    own = SetpointGate(
+        DetectorConfig(name="range", model=str(model)), GateConfig(action="brake"), MARK,
+        note=lambda text: None,
+    )  # fmt: skip
+    for message in states(1000):  # the vehicle faces north
+        own.pass_between(message, Side.AUTOPILOT, 1.0)
+    turned = {"mask": 0b1001_1100_0111, "yaw": 3.0}
+    passed = [
+        own.pass_between(setpoint(vx, **turned), Side.COMPANION, 1.1)[0].vx
+        for vx in (2.0, -1000.0, 2.0)
+    ]
+    assert passed == [2.0, 0.0, 2.0]
+
+
 @pytest.mark.parametrize("wild", [math.nan, math.inf, -3e38])
 def test_no_wild_number_passes(gate, wild):
     assert velocities(gate(action="brake"), [wild]) == [[0.0]]
