@@ -130,7 +130,8 @@ COMMANDS = {
         ],
     ),
     "platforms": ("74ae6a5804b06c25", ["platforms", "--json"]),
-    "stacks": ("9d210fde04e7d330", ["stacks", "mavbench", "--json"]),
+    # Renewed when stacks got smoother, slice_period_s, restores_counters and standby.
+    "stacks": ("7bd4f9e1afab2d76", ["stacks", "mavbench", "--json"]),
     "states": ("a82ad9744e330395", ["states", "--json"]),
 }
 
