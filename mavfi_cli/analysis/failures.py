@@ -18,7 +18,7 @@ from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer, wilson
+from mavfi_cli.stats.shares import CrossLayer, Share, cross_layer
 
 _STRUCK = (COUNTED | {Injected.NOT_ACTIVATED.value}) - {Injected.GOLDEN.value}
 
@@ -73,13 +73,16 @@ def setting_failures(
         if group.golden or not struck:
             continue
         failed = struck - int(group.succeeded[places].sum())
-        failure = wilson(failed, struck, confidence=confidence)
+        failure = group.share(~group.succeeded, places, confidence)
         numbers = group.codes("number")[places].tolist()
         configs = list(ledger.configs(numbers)) if alone else []
         kernel, layers = _kernel(configs), None
         if alone is not None and kernel in silent:
             _require_same_faults(configs[0], alone)
             sdc = silent[kernel]
+            if group.stratified:
+                problem = "cannot be combined with a stratified sample, whose missions have weights"
+                raise ConfigError(problem, key="kernels")
             layers = cross_layer(sdc.count, sdc.total, failed, struck, confidence)
         rows.append(
             SettingFailures(

@@ -18,7 +18,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from mavfi_cli.campaigns.ledger import METADATA, Ledger, stored_export, stored_provenance
+from mavfi_cli.campaigns.ledger import (
+    METADATA,
+    STRATUM,
+    WEIGHT,
+    Ledger,
+    stored_export,
+    stored_provenance,
+)
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     Labels,
@@ -48,7 +55,7 @@ COSTS = ("check_share", *(f"recovery_share_{stage}" for stage in RECOMPUTED))
 EXPORTED = (
     "number", "pair", *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector",
     "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
-    "wall_s", *COSTS, "attempts", "path", "changes",
+    "wall_s", *COSTS, "attempts", "path", STRATUM, WEIGHT, "changes",
 )  # fmt: skip
 BITS = pa.list_(pa.list_(pa.int64()))  # of each struck component, its bits
 _TYPES = {  # of the columns that are not text, even if they hold no value
@@ -57,7 +64,8 @@ _TYPES = {  # of the columns that are not text, even if they hold no value
         ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
          "strike_tick", "struck_execution", "replans", "attempts"), pa.int64()),
     **dict.fromkeys(
-        (*QUALITY, *COSTS, "strike_s", "first_read_s", "simulated_s", "wall_s"), pa.float64()),
+        (*QUALITY, *COSTS, WEIGHT, "strike_s", "first_read_s", "simulated_s", "wall_s"),
+        pa.float64()),
 }  # fmt: skip
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
@@ -73,7 +81,8 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     fault's FAULT, each label as `label_NAME`, and all labels as text in `labels`. `succeeded` means
     that the mission reached its goal. `counted` means that it is golden, or that its fault struck
     something that was read or caught. `check_share` and `recovery_share_STAGE` are the shares of
-    the flight time that detection and recovery take.
+    the flight time that detection and recovery take. `weight` is the number of uniformly drawn
+    missions that a mission of a `stratum` stands for.
 
     Args:
         among: numbers of the missions to choose from; None means all.
@@ -124,6 +133,8 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
         "wall_s": entry.wall_s,
         "attempts": entry.attempts,
         "path": None if entry.path is None else str(entry.path),
+        STRATUM: entry.stratum,
+        WEIGHT: entry.weight,
         **measures_of(flight),
         **dict(zip(COSTS, shares, strict=True)),
     }
@@ -240,8 +251,9 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
     """Return the provenance of a campaign, from its ledger or from an export; {} if unknown.
 
     Returns:
-        `name` of the campaign; `planned`, the number of missions on its list; `versions` of the
-        programs; and `host`, with the `machine`, `cores` and `started` of the first record.
+        `name` of the campaign; `planned`, the number of missions on its list; `sampling`, how its
+        faults were drawn; `versions` of the programs; and `host`, with the `machine`,
+        `cores` and `started` of the first record.
     """
     table = source if isinstance(source, pa.Table) else source.export
     if table is not None:
@@ -251,6 +263,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
     return {
         "name": source.meta("name"),
         "planned": source.planned(),
+        "sampling": source.sampling.value,
         "versions": json.loads(source.meta("versions") or "{}") or record.versions,
         "host": {name: record.host[name] for name in _HOST if name in record.host},
     }

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from mavfi_cli.analysis.summary import Group
 from mavfi_cli.campaigns.ledger import LEDGER, Ledger
 from mavfi_cli.campaigns.missions import Labels
@@ -65,11 +67,23 @@ class FlightOverhead:
     share_in_all: Interval
 
     @classmethod
-    def of(cls, labels: Labels, costs: Sequence[DetectionCost], confidence: float) -> Self:
-        """Average the costs of one detector over its flights; at least one."""
+    def of(
+        cls,
+        labels: Labels,
+        weighted: Sequence[tuple[DetectionCost, float]],
+        confidence: float,
+    ) -> Self:
+        """Average the costs of one detector over its flights, at least one, by weight."""
+        costs = [cost for cost, _ in weighted]
+        weights = np.array([weight for _, weight in weighted])
 
         def mean(values: Iterable[float]) -> Interval:
-            return interval([*values], confidence=confidence, resamples=TABLE_RESAMPLES)
+            return interval(
+                [*values],
+                confidence=confidence,
+                resamples=TABLE_RESAMPLES,
+                weights=weights,
+            )
 
         return cls(
             labels={**labels, "detector": costs[0].detector},
@@ -99,11 +113,11 @@ def flight_overheads(
     """
     rows = []
     for group in groups:
-        costs: dict[str, list[DetectionCost]] = {}
+        costs: dict[str, list[tuple[DetectionCost, float]]] = {}
         for mission in ledger.results(group.codes("number")[group.counted].tolist()):
             cost = DetectionCost.of(mission.flight)
             if cost is not None:
-                costs.setdefault(cost.detector, []).append(cost)
+                costs.setdefault(cost.detector, []).append((cost, mission.weight))
         rows += [FlightOverhead.of(group.labels, costs[name], confidence) for name in sorted(costs)]
     return rows
 

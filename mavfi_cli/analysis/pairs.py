@@ -17,7 +17,9 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis import flights as tables
 from mavfi_cli.analysis.flights import BITS, COSTS, BoolArray, IntArray
+from mavfi_cli.campaigns.ledger import STRATUM
 from mavfi_cli.campaigns.missions import Injected, canonical
+from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
@@ -112,8 +114,17 @@ class Flights:
 
     @classmethod
     def of(cls, table: pa.Table) -> Flights:
-        """The flights of `analysis.flights.flights`, or of an export."""
+        """The flights of `analysis.flights.flights`, or of an export.
+
+        Raises:
+            ConfigError: they are a stratified sample, whose missions cannot be counted.
+        """
         there = set(table.column_names)
+        if STRATUM in there and table[STRATUM].null_count < table.num_rows:
+            raise ConfigError(
+                "the paper's tables and claims count missions, and those of a stratified sample "
+                "have weights: `mavfi campaign status --full` shows its settings"
+            )
         return cls(_beside_golden(_flown(pa.table({
             name: table[name].cast(kind) if name in there else pa.nulls(table.num_rows, kind)
             for name, kind in _COLUMNS.items()

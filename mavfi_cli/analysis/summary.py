@@ -5,6 +5,7 @@ Reads the short rows of the ledger, because a campaign may have a million missio
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,18 +16,19 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, untreated
 from mavfi_cli.analysis.pairs import partners
-from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.ledger import STRATUM, WEIGHT, Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
-from mavfi_cli.stats.shares import Interval, Share, wilson
+from mavfi_cli.stats.shares import Interval, Share
+from mavfi_cli.stats.strata import weighted_share
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
 INACTIVE = frozenset(kind.value for kind in Injected) - COUNTED
 _WHOLE = ("cell", "number")
-_WORDS = ("outcome", "injected", "pair")
+_WORDS = ("outcome", "injected", "pair", STRATUM)
 
 
 # Results ------------------------------------------------------------------------------------------
@@ -116,6 +118,7 @@ class CampaignSummary:
         missions: number on the list.
         over, missing: number with a result, and without one.
         confidence: confidence level of all intervals.
+        sampling: how faults were drawn, `uniform` or `stratified`.
         faults: comparisons of settings with faults with the golden one.
         protection: comparisons of protected settings with the unprotected one with the same faults.
     """
@@ -124,6 +127,7 @@ class CampaignSummary:
     missions: int
     over: int
     confidence: float
+    sampling: str
     cells: Sequence[SettingSummary]
     faults: Sequence[Comparison]
     protection: Sequence[Comparison]
@@ -143,9 +147,9 @@ class Group:
         planned, errors: number of missions on the list, and of those that could not begin.
         watched: whether a detector watches all of them.
         flights: the flown missions, in the order of the list: `number`, `outcome`, `injected`,
-            METRICS, `pair` and `strike`. Golden, faulty and protected flights of a mission share
-            the code `pair`. Labels that differ only in TREATMENT share the code `strike`, which
-            stands for the fault.
+            METRICS, `stratum`, `weight`, `pair` and `strike`. Golden, faulty and
+            protected flights of a mission share the code `pair`. Labels that differ only in
+            TREATMENT share the code `strike`, which stands for the fault.
     """
 
     labels: Labels
@@ -202,9 +206,37 @@ class Group:
         entries = pc.value_counts(self.flights[name]).to_pylist()
         return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
 
+    @cached_property
+    def stratified(self) -> bool:
+        """Whether some of the missions are of a stratified sample."""
+        return bool(self.flights[STRATUM].null_count < self.flights.num_rows)
+
+    @cached_property
+    def weights(self) -> FloatArray | None:
+        """The weight of each mission, (n,); None in a uniform sample."""
+        return numbers(self.flights, WEIGHT) if self.stratified else None
+
+    def share(self, hits: BoolArray, chosen: BoolArray, confidence: float = 0.95) -> Share:
+        """The share of hits among chosen missions, both (n,), by weight."""
+        weights = np.ones(len(hits)) if self.weights is None else self.weights
+        return weighted_share(
+            hits.tolist(),
+            chosen.tolist(),
+            weights.tolist(),
+            self.flights[STRATUM].to_pylist(),
+            confidence=confidence,
+        )
+
     def successes(self, metric: str) -> FloatArray:
         """A metric of the counted successful missions that have it."""
         return known(self.metrics[metric][self.succeeded & self.counted])
+
+    def mean(self, metric: str, confidence: float = 0.95) -> Interval:
+        """The mean of `successes`, by weight."""
+        values = self.metrics[metric]
+        there = self.succeeded & self.counted & ~np.isnan(values)
+        weights = None if self.weights is None else self.weights[there]
+        return _interval(values[there], confidence, weights)
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
         """Counted missions of equal pairs: row indices in this and in the other, (m,) each.
@@ -254,7 +286,8 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
 
 def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
     kinds = dict.fromkeys(_WHOLE, pa.int64()) | dict.fromkeys(_WORDS, pa.string())
-    schema = pa.schema(kinds | dict.fromkeys(METRICS, pa.float64()))
+    kinds |= {"changes": pa.string()} if ledger.stratified else {}
+    schema = pa.schema(kinds | dict.fromkeys((*METRICS, WEIGHT), pa.float64()))
     portions = [
         pa.table([pa.array(c, t) for c, t in zip(portion, schema.types, strict=True)], schema)
         for portion in ledger.columns(schema.names)
@@ -262,11 +295,21 @@ def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
     whole = pa.concat_tables(portions or [schema.empty_table()]).combine_chunks()
     strikes: dict[str, int] = {}
     coded = [strikes.setdefault(untreated(setting), len(strikes)) for setting in labels]
+    strike = np.array(coded, dtype=np.int64)[whole["cell"].to_numpy()]
+    if ledger.stratified:  # several faults strike one pair
+        faults = map(_fault_text, whole["changes"].to_pylist())
+        names = [f"{code} {fault}" for code, fault in zip(strike, faults, strict=True)]
+        strike = np.array([strikes.setdefault(name, len(strikes)) for name in names], np.int64)
     pairs = pc.dictionary_encode(whole["pair"]).combine_chunks()
     indices = pairs.indices if isinstance(pairs, pa.DictionaryArray) else pairs.chunk(0).indices
     return whole.set_column(whole.schema.get_field_index("pair"), "pair", indices).append_column(
-        "strike", pa.array(np.array(coded, dtype=np.int64)[whole["cell"].to_numpy()])
+        "strike", pa.array(strike)
     )
+
+
+def _fault_text(changes: str) -> str:
+    config = json.loads(changes)
+    return canonical([config.get("fault"), config.get("instruction")])
 
 
 def _parts(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
@@ -296,11 +339,19 @@ class _Match:
         """Success of the first and of the second flight of each pair, (m,) each."""
         return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
 
-    def differences(self, metric: str) -> FloatArray:
+    @property
+    def weights(self) -> FloatArray | None:
+        """The weight of each pair, (m,): that of its fault; None in a uniform sample."""
+        return None if self.second.weights is None else self.second.weights[self.at_second]
+
+    def difference(self, metric: str, confidence: float) -> Interval:
         """Second minus first, over the pairs in which both succeeded and have the metric."""
         first, second = self.success
         change = self.second.metrics[metric][self.at_second]
-        return known((change - self.first.metrics[metric][self.at_first])[first & second])
+        change = change - self.first.metrics[metric][self.at_first]
+        there = first & second & ~np.isnan(change)
+        weights = None if self.weights is None else self.weights[there]
+        return _interval(change[there], confidence, weights)
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
         """Worst cases relative to each pair's own golden flight, and to the mean of these.
@@ -382,7 +433,7 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
 
 def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     matches = [match for match in matches if len(match.at_second)]
-    tests = [McNemar.of(*match.success) for match in matches]
+    tests = [McNemar.of(*match.success, weights=match.weights) for match in matches]
     corrected = holm([test.p_value for test in tests])
     rows = []
     for match, test, p_value in zip(matches, tests, corrected, strict=True):
@@ -394,9 +445,7 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
                 name=match.second.name,
                 success=test,
                 corrected_p=p_value,
-                differences={
-                    name: _interval(match.differences(name), confidence) for name in METRICS
-                },
+                differences={name: match.difference(name, confidence) for name in METRICS},
                 over_own=over_own,
                 over_mean=over_mean,
             )
@@ -404,8 +453,8 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     return rows
 
 
-def _interval(values: FloatArray, confidence: float) -> Interval:
-    return interval(values, confidence=confidence, resamples=TABLE_RESAMPLES)
+def _interval(values: FloatArray, confidence: float, weights: FloatArray | None) -> Interval:
+    return interval(values, confidence=confidence, resamples=TABLE_RESAMPLES, weights=weights)
 
 
 def summarise(
@@ -418,6 +467,7 @@ def summarise(
         missions=missions,
         over=over,
         confidence=confidence,
+        sampling=ledger.sampling.value,
         cells=[_setting(group, confidence) for group in settings],
         faults=_against_golden(settings, confidence),
         protection=_protection(settings, confidence),
@@ -427,8 +477,7 @@ def summarise(
 
 def _setting(group: Group, confidence: float) -> SettingSummary:
     def success(fates: frozenset[str]) -> Share:
-        chosen = group.succeeded[group.among("injected", fates)]
-        return wilson(int(chosen.sum()), len(chosen), confidence=confidence)
+        return group.share(group.succeeded, group.among("injected", fates), confidence)
 
     return SettingSummary(
         labels=group.labels,
@@ -440,7 +489,7 @@ def _setting(group: Group, confidence: float) -> SettingSummary:
         success=success(COUNTED),
         inactive=success(INACTIVE),
         every=success(COUNTED | INACTIVE),
-        metrics={name: _interval(group.successes(name), confidence) for name in METRICS},
+        metrics={name: group.mean(name, confidence) for name in METRICS},
     )
 
 
@@ -458,7 +507,7 @@ def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality
                     labels=group.labels,
                     name=group.name,
                     metric=metric,
-                    mean=_interval(values, confidence),
+                    mean=group.mean(metric, confidence),
                     least=least,
                     median=middle,
                     most=most,

@@ -13,6 +13,7 @@ from typing import Self
 from mavfi_cli.campaigns.ledger import LEDGER, ExportedLedger, Ledger, is_export
 from mavfi_cli.campaigns.missions import (
     PlannedMission,
+    Sampling,
     canonical,
     changes_of,
     kind_of,
@@ -29,6 +30,7 @@ from mavfi_cli.campaigns.run import (
 )
 from mavfi_cli.campaigns.specification import FixedWorld, Flown, Keep, Spec
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec, replaced
+from mavfi_cli.campaigns.strata import ROUND, Rounds
 from mavfi_cli.companion.pipeline import CompanionParts
 from mavfi_cli.core.errors import (
     ConfigError,
@@ -57,6 +59,7 @@ def chosen(
     scale: float | None,
     changes: Sequence[str] = (),
     programs: Sequence[str | None] = (),
+    sampling: Sampling | None = None,
 ) -> tuple[Spec, Path]:
     """Find the named campaign and its folder.
 
@@ -68,13 +71,14 @@ def chosen(
             name.
         programs: programs that a folder's missions may name; see
             `MissionConfig.require_programs`.
+        sampling: how faults are drawn; None means as specified. It becomes part of the name too.
 
     Raises:
         ConfigError: the specification or the scale is invalid, or a preset without `out` has the
             same name as a campaign here.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, out, programs)
+    spec = chosen_spec(what, scale, changes, out, programs, sampling)
     if (folder := _folder(what)) is not None:
         return spec, folder
     if out is None:
@@ -88,16 +92,19 @@ def chosen_spec(
     changes: Sequence[str] = (),
     out: Path | None = None,
     programs: Sequence[str | None] = (),
+    sampling: Sampling | None = None,
 ) -> Spec:
     """Find the named specification as `chosen` does, but without its folder."""
     folder = _folder(what)
     if folder is None:
         spec = replaced(load_spec(what), changes)
-        return spec if scale is None else spec.scaled(scale)
+        spec = spec if scale is None else spec.scaled(scale)
+        return spec if sampling is None else spec.sampled(sampling)
     with Ledger(folder) as ledger:
-        if scale is not None or changes or out is not None:
+        if scale is not None or changes or out is not None or sampling is not None:
             raise ConfigError(
-                "cannot be combined with --scale, --set or --out, because the folder stores them",
+                "cannot be combined with --scale, --set, --sampling or --out, because the folder "
+                "stores them",
                 path=folder,
             )
         stored = stored_spec(ledger) or _Unflown.of(ledger)
@@ -237,8 +244,17 @@ def stopped(ledger: Ledger) -> list[str]:
     if spec is None or spec.stop is None:
         return []
     cells = ledger.cells()
-    queue = MissionQueue(iter(()), spec.stop, ledger.mission_cells(), ledger.fates())
+    queue = MissionQueue(
+        iter(()), spec.stop, ledger.mission_cells(), ledger.fates(), drawn=ledger.draws()
+    )
     return [label_text(cells[cell]) for cell in sorted(queue.stopped)]
+
+
+def rounds_of(spec: Spec, ledger: Ledger) -> Rounds | None:
+    """Return the rounds of a stratified campaign, whose list is stored; None for a uniform one."""
+    if spec.sampling is Sampling.UNIFORM:
+        return None
+    return Rounds(ledger, spec.seed, spec.stop.batch if spec.stop else ROUND)
 
 
 def begin(
@@ -261,6 +277,8 @@ def begin(
             world fits the rule of fixed worlds.
     """
     begun = (folder / LEDGER).is_file()
+    if append and spec.sampling is Sampling.STRATIFIED:
+        raise ConfigError("the rounds of a stratified campaign cannot grow", key="append")
     if missing_only and not begun:
         raise ConfigError("no campaign was begun there", path=folder)
     if begun:

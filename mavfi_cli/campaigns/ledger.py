@@ -5,6 +5,7 @@
     missions  the numbered list, written before the first mission flies
     results   one short row per finished mission
     records   its complete result.json, compressed
+    draws     of a stratified campaign: the faults that missions were given, strata and weights
 
 A mission is missing until it has a row in `results`. A kill at any moment leaves it with a complete
 row or with none.
@@ -15,13 +16,14 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import math
 import os
 import sqlite3
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mavfi_cli.campaigns.missions import (
     Injected,
@@ -30,6 +32,7 @@ from mavfi_cli.campaigns.missions import (
     MissionResult,
     PlannedMission,
     ResultState,
+    Sampling,
     canonical,
 )
 from mavfi_cli.core.config import structure
@@ -79,6 +82,23 @@ CREATE TABLE results (
 );
 CREATE TABLE records (number INTEGER PRIMARY KEY REFERENCES results, result BLOB NOT NULL);
 """
+_DRAWS = """
+CREATE TABLE IF NOT EXISTS draws (
+    number INTEGER PRIMARY KEY REFERENCES missions,
+    round INTEGER NOT NULL,
+    stratum TEXT NOT NULL,
+    weight REAL NOT NULL,
+    pair TEXT NOT NULL,
+    changes TEXT NOT NULL
+)
+"""
+# The missions as they fly: those of a uniform list, and those of a stratified one.
+_PLANNED = "(SELECT *, NULL AS stratum, 1.0 AS weight FROM missions)"
+_DRAWN = (
+    "(SELECT m.number, cell, COALESCE(d.pair, m.pair) AS pair, COALESCE(d.changes, m.changes) AS "
+    "changes, stratum, COALESCE(weight, 1.0) AS weight FROM missions AS m LEFT JOIN draws AS d "
+    "USING (number))"
+)
 _SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
     "replans", "simulated_s",
@@ -93,6 +113,23 @@ def _object(text: str | bytes) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise TypeError(f"must be a JSON object, got a {type(value).__name__}")
     return value
+
+
+class Drawn(NamedTuple):
+    """The fault that a mission of a stratified campaign was given.
+
+    Attributes:
+        round: the round of draws, from 0.
+        weight: number of uniformly drawn missions that it stands for.
+        pair, changes: as in the list of missions.
+    """
+
+    number: int
+    round: int
+    stratum: str
+    weight: float
+    pair: str
+    changes: str
 
 
 class Ledger:
@@ -118,6 +155,7 @@ class Ledger:
         """
         self.folder = folder
         self._path = folder if memory else folder / LEDGER
+        self._list = _PLANNED
         self._lock: int | None = None  # descriptor
         self._writing = writing
         with contextlib.ExitStack() as undo:
@@ -190,6 +228,7 @@ class Ledger:
             raise ConfigError(
                 f"a ledger {version}; this mavfi reads version {SCHEMA}", path=self._path
             )
+        self._list = _DRAWN if "draws" in tables else _PLANNED
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -249,18 +288,42 @@ class Ledger:
                 self._db.execute("INSERT INTO missions VALUES (?, ?, ?, ?)", row)
         return count
 
+    @property
+    def stratified(self) -> bool:
+        """True if faults are drawn by stratum, so that missions have unequal weights."""
+        return self._list == _DRAWN
+
+    @property
+    def sampling(self) -> Sampling:
+        """How the faults of the campaign are drawn."""
+        return Sampling.STRATIFIED if self.stratified else Sampling.UNIFORM
+
+    def draw(self, rows: Iterable[Drawn]) -> None:
+        """Store the faults that missions are given instead of those on the list, all or none."""
+        self._list = _DRAWN
+        with self._transaction():
+            self._db.execute(_DRAWS)
+            self._db.executemany("INSERT INTO draws VALUES (?, ?, ?, ?, ?, ?)", rows)
+
+    def draws(self) -> dict[int, Drawn]:
+        """Return the faults that missions were given, by number; empty in a uniform campaign."""
+        rows = self._rows("SELECT * FROM draws") if self.stratified else ()
+        return {row[0]: Drawn(*row) for row in rows}
+
     def fill(
         self,
         name: str,
         cells: Mapping[str, int],
         missions: Iterable[tuple[int, int, str, str]],
         results: Iterable[Json],
+        draws: Sequence[Drawn] = (),
     ) -> None:
         """Store all rows of a campaign, but no records.
 
         Args:
             cells: labels of the settings with their numbers.
             missions: number, cell, pair and changes of every mission.
+            draws: of a stratified campaign.
             results: columns of the table `results` by name; a missing column is empty.
 
         Raises:
@@ -275,6 +338,8 @@ class Ledger:
             self._db.executemany("INSERT INTO cells VALUES (?, ?)", rows)
             self._db.executemany("INSERT INTO missions VALUES (?, ?, ?, ?)", missions)
             self._db.executemany(f"INSERT INTO results VALUES ({marks})", given)
+        if draws:
+            self.draw(draws)
 
     def planned(self) -> int:
         """Number of missions in the list."""
@@ -305,23 +370,29 @@ class Ledger:
 
     # Missions to fly ------------------------------------------------------------------------------
 
-    def missing(self, *, errors: bool = False) -> Iterator[MissingMission]:
+    def missing(
+        self, *, errors: bool = False, among: Collection[int] | None = None
+    ) -> Iterator[MissingMission]:
         """Missions without a result, in the order of the list.
 
         They are read in portions, so results may be added meanwhile.
 
         Args:
             errors: include missions that could not begin.
+            among: numbers of the missions to choose from; None means all.
         """
-        over = "SELECT 1 FROM results WHERE results.number = missions.number"
+        chosen = "" if among is None else " AND number IN (SELECT value FROM json_each(?))"
+        numbers = [] if among is None else [json.dumps(sorted(among))]
+        over = "SELECT 1 FROM results WHERE results.number = planned.number"
         over += " AND state <> 'error'" if errors else ""
         last = -1
         while True:
             rows = list(
                 self._rows(
-                    "SELECT number, cell, changes FROM missions WHERE number > ? "
-                    f"AND NOT EXISTS ({over}) ORDER BY number LIMIT 1000",
+                    f"SELECT number, cell, changes FROM {self._list} AS planned WHERE number > ? "
+                    f"AND NOT EXISTS ({over}){chosen} ORDER BY number LIMIT 1000",
                     last,
+                    *numbers,
                 )
             )
             for number, cell, text in rows:
@@ -398,13 +469,14 @@ class Ledger:
         chosen = "" if numbers is None else "WHERE number IN (SELECT value FROM json_each(?)) "
         rows = self._rows(
             "SELECT number, labels, pair, changes, state, outcome, reason, injected, wall_s, "
-            "attempts, path, result FROM results JOIN missions USING (number) "
-            f"JOIN cells USING (cell) JOIN records USING (number) {chosen}ORDER BY number",
+            "attempts, path, result, stratum, weight "
+            f"FROM results JOIN {self._list} USING (number) JOIN cells USING (cell) "
+            f"JOIN records USING (number) {chosen}ORDER BY number",
             *([] if numbers is None else [json.dumps(list(numbers))]),
         )
         with contextlib.closing(rows):  # before the ledger, also after an error
             for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
-                wall_s, attempts, path, blob = rest
+                wall_s, attempts, path, blob, stratum, weight = rest
                 with reading(self._path):
                     over = MissionResult(
                         number=number,
@@ -421,6 +493,8 @@ class Ledger:
                         wall_s=wall_s,
                         attempts=attempts,
                         path=None if path is None else self.folder.absolute() / path,
+                        stratum=stratum,
+                        weight=weight,
                     )
                 yield over
 
@@ -431,7 +505,7 @@ class Ledger:
             RecordError: an export holds changes that give no valid mission.
         """
         rows = self._rows(
-            "SELECT number, changes FROM missions "
+            f"SELECT number, changes FROM {self._list} "
             "WHERE number IN (SELECT value FROM json_each(?)) ORDER BY number",
             json.dumps(list(numbers)),
         )
@@ -447,10 +521,10 @@ class Ledger:
         """Yield portions of columns of the flown missions, in the order of the list.
 
         Args:
-            names: columns of the tables `missions` and `results`.
+            names: columns of the tables `missions` and `results`, `stratum` and `weight`.
         """
         rows = self._rows(
-            f"SELECT {', '.join(names)} FROM results JOIN missions USING (number) "
+            f"SELECT {', '.join(names)} FROM results JOIN {self._list} USING (number) "
             "WHERE state = 'flown' ORDER BY number"
         )
         while portion := list(islice(rows, _PORTION)):
@@ -477,6 +551,7 @@ EXPORT = ".parquet"
 METADATA = b"mavfi"  # key of an export's provenance
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _LABEL = "label_"
+STRATUM, WEIGHT = "stratum", "weight"  # columns of a stratified sample; uniform missions weigh 1
 _ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # what an export without the column means
 
 
@@ -505,10 +580,26 @@ def stored_export(path: Path) -> pa.Table:
         problem = f"it has mission {twice} twice; exports of two campaigns are two files"
         raise _no_export(path, problem)
     try:
-        stored_provenance(table)
+        origin = stored_provenance(table)
     except (TypeError, ValueError):
         raise _no_export(path, "its metadata are damaged") from None
+    _require_weights(table, path, stratified=origin.get("sampling") == Sampling.STRATIFIED.value)
     return table
+
+
+def _require_weights(table: pa.Table, path: Path, *, stratified: bool) -> None:
+    """Refuse missions of a stratified sample without their weights, as after a careless merge."""
+    names = [name for name in (STRATUM, WEIGHT) if name in table.column_names]
+    rows = table.select(["number", *names]).to_pylist() if stratified or STRATUM in names else []
+    for row in rows:
+        weight = row.get(WEIGHT)
+        if (stratified or row[STRATUM] is not None) and not (
+            isinstance(weight, float) and 0.0 < weight < math.inf
+        ):
+            raise RecordError(
+                f"{path}: mission {row['number']} is of a stratified sample and must have a weight "
+                f"above 0, got {weight}; export the campaign again"
+            )
 
 
 def _no_export(path: Path, why: object) -> RecordError:
@@ -544,7 +635,12 @@ class ExportedLedger(Ledger):
             missions.append((row["number"], cell, row["pair"], row["changes"]))
         name = str(origin.get("name") or path.stem)
         known = ({key: value for key, value in row.items() if value is not None} for row in rows)
-        self.fill(name, cells, missions, (_ABSENT | row for row in known))
+        draws = [
+            Drawn(row["number"], 0, row[STRATUM], row[WEIGHT], row["pair"], row["changes"])
+            for row in rows
+            if row.get(STRATUM) is not None
+        ]
+        self.fill(name, cells, missions, (_ABSENT | row for row in known), draws)
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
         """An export has no records of flights.

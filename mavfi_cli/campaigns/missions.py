@@ -140,6 +140,13 @@ class MissingMission(NamedTuple):
     config: MissionConfig
 
 
+class Sampling(Enum):
+    """How the faults of a campaign are drawn."""
+
+    UNIFORM = "uniform"  # each fault by itself, by the rule of its level
+    STRATIFIED = "stratified"  # in rounds, more where outcomes have varied; missions have weights
+
+
 class ResultState(Enum):
     """Whether a mission has a result."""
 
@@ -220,6 +227,7 @@ class MissionResult:
         wall_s: wall time of the final attempt, s.
         attempts: number of attempts; above 1 after kills from outside the mission.
         path: absolute path of the kept run folder; None if it was not kept.
+        stratum, weight: of a stratified sample; None and 1 in a uniform one.
     """
 
     number: int
@@ -232,6 +240,8 @@ class MissionResult:
     wall_s: float
     attempts: int
     path: Path | None
+    stratum: str | None = None
+    weight: float = 1.0
 
     @property
     def flight(self) -> FlightRecord:

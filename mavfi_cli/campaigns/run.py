@@ -15,13 +15,13 @@ import os
 import shutil
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from mavfi_cli.campaigns.ledger import RUNS, Ledger
+from mavfi_cli.campaigns.ledger import RUNS, Drawn, Ledger
 from mavfi_cli.campaigns.missions import (
     COUNTED,
     Injected,
@@ -33,6 +33,7 @@ from mavfi_cli.campaigns.missions import (
 )
 from mavfi_cli.campaigns.progress import Progress, Spectator
 from mavfi_cli.campaigns.specification import Keep, Stop
+from mavfi_cli.campaigns.strata import Rounds
 from mavfi_cli.campaigns.workers import (
     TASK,
     Attempt,
@@ -50,7 +51,7 @@ from mavfi_cli.mission.instruction import CACHE, kept_in
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
-from mavfi_cli.stats.shares import wilson
+from mavfi_cli.stats.strata import weighted_share
 
 Row = tuple[str | None, str | None]  # outcome, what happened to the fault
 
@@ -207,14 +208,21 @@ def store_plan(
 
 
 def fly_missing(
-    ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None = None
+    ledger: Ledger,
+    options: Options,
+    spectator: Spectator,
+    stop: Stop | None = None,
+    rounds: Rounds | None = None,
 ) -> None:
     """Fly every mission without a result, up to the stopping rule.
+
+    Args:
+        rounds: of a stratified campaign.
 
     Raises:
         MavfiError: as `run_campaign`.
     """
-    run = _Run(ledger, options, spectator, stop)
+    run = _Run(ledger, options, spectator, stop, rounds)
     with _prepared(ledger.folder, run.profiles), interruptible() as interrupts:
         run.fly(interrupts)
 
@@ -236,11 +244,13 @@ class MissionQueue:
     """The missing missions in the order of the list, in batches if there is a stopping rule.
 
     Args:
-        missing: missions without a result.
+        missing: missions without a result; None while the next one is not drawn yet.
         stop: the stopping rule; None admits all missions.
         cells: setting of every mission, in the order of the list.
         over: number, outcome and fault's fate of every finished mission.
         shares: whether missions may share a flight.
+        drawn: strata and weights of the missions of a stratified campaign, by number.
+        stopped: the set to which stopped settings are added; None makes one.
 
     Attributes:
         stopped: settings that the rule has ended.
@@ -248,12 +258,14 @@ class MissionQueue:
 
     def __init__(
         self,
-        missing: Iterator[MissingMission],
+        missing: Iterator[MissingMission | None],
         stop: Stop | None,
         cells: Sequence[int] = (),
         over: Iterable[tuple[int, Row]] = (),
         *,
         shares: bool = False,
+        drawn: Mapping[int, Drawn] | None = None,
+        stopped: set[int] | None = None,
     ) -> None:
         self._shares = shares
         self._missing, self._stop, self._cells = missing, stop, cells
@@ -268,7 +280,8 @@ class MissionQueue:
         self._open = dict.fromkeys(self._members, stop.batch if stop else 0)
         self._over: dict[int, Row] = {}
         self._finished: Counter[int] = Counter()  # missions over below the open boundary
-        self.stopped: set[int] = set()
+        self._drawn = {} if drawn is None else drawn
+        self.stopped: set[int] = set() if stopped is None else stopped
         for number, row in over if stop else ():
             self.record(number, row)
 
@@ -341,15 +354,27 @@ class MissionQueue:
             self._finished[cell] += sum(number in self._over for number in batch)
 
     def _narrow(self, cell: int, stop: Stop) -> bool:
-        rows = [self._over[number] for number in self._members[cell][: self._open[cell]]]
-        counted = [outcome for outcome, injected in rows if injected in COUNTED]
-        share = wilson(counted.count("success"), len(counted), confidence=stop.confidence)
+        numbers = self._members[cell][: self._open[cell]]
+        rows = [self._over[number] for number in numbers]
+        draws = [self._drawn.get(number) for number in numbers]
+        share = weighted_share(
+            [outcome == "success" for outcome, _ in rows],
+            [injected in COUNTED for _, injected in rows],
+            [1.0 if draw is None else draw.weight for draw in draws],
+            [None if draw is None else draw.stratum for draw in draws],
+            confidence=stop.confidence,
+        )
         return (share.high - share.low) / 2.0 <= stop.margin
 
 
 class _Run:
     def __init__(
-        self, ledger: Ledger, options: Options, spectator: Spectator, stop: Stop | None
+        self,
+        ledger: Ledger,
+        options: Options,
+        spectator: Spectator,
+        stop: Stop | None,
+        rounds: Rounds | None,
     ) -> None:
         self._ledger = ledger
         self._options = options
@@ -358,11 +383,17 @@ class _Run:
         over = partial(ledger.fates, errors=not options.errors)
         self._jobs = options.jobs or len(os.sched_getaffinity(0))
         only = options.only
-        missing = ledger.missing(errors=options.errors)
-        wanted = (m for m in missing if only is None or m.number in only)
+        missing: Iterator[MissingMission | None] = ledger.missing(errors=options.errors)
+        stopped: set[int] = set()
+        if rounds is not None:
+            missing = rounds.missing(stopped, errors=options.errors)
+        wanted = (m for m in missing if m is None or only is None or m.number in only)
         cells = ledger.mission_cells() if stop else ()
         shares = options.task == TASK and not options.whole
-        self._queue = MissionQueue(wanted, stop, cells, over(), shares=shares)
+        drawn = {} if rounds is None else rounds.drawn
+        self._queue = MissionQueue(
+            wanted, stop, cells, over(), shares=shares, drawn=drawn, stopped=stopped
+        )
         self._again: list[MissingMission] = []
         self._alone: dict[int, str] = {}  # reasons why missions do not share a flight
         self._flying: dict[int, MissingMission] = {}
@@ -374,6 +405,7 @@ class _Run:
             for mission in ledger.missing(errors=options.errors)
             if mission.config.instruction is not None
             and options.profiles is None
+            and rounds is None  # draws may move to another golden flight
             and (options.planned is None or mission.number in options.planned)
         )
         names = [str(labels.get("setting", "")) for labels in ledger.cells()]

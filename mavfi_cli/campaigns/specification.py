@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
 
-from mavfi_cli.campaigns.missions import Label, Labels, PlannedMission, naming
+from mavfi_cli.campaigns.missions import Label, Labels, PlannedMission, Sampling, naming
 from mavfi_cli.core.config import structure, toml_text
 from mavfi_cli.core.errors import ConfigError, UnknownName, nearest
 from mavfi_cli.core.seeds import Stream
@@ -233,6 +233,7 @@ class Spec:
     first_seed: int = 1
     repetitions: int = 1
     keep: Keep = Keep.FAILURES  # run folders to keep: none, failures, sampled or all
+    sampling: Sampling = Sampling.UNIFORM  # how faults are drawn: uniform or stratified
     fixed: Factors = field(default_factory=dict)
     axes: Axes = field(default_factory=dict)
     settings: tuple[Setting, ...] = (Setting(),)
@@ -362,6 +363,7 @@ class Spec:
             "first seed": [self.first_seed],
             "fault seed": [self.seed],
             "settings": [setting.name for setting in self.settings],
+            "sampling": [self.sampling.value],
         }
 
     def _by_setting(self) -> dict[str, list[Any]]:
@@ -390,7 +392,16 @@ class Spec:
             "fixed_world": asdict(self.fixed_world) if self.fixed_world else {},
         }
         plain = {name: getattr(self, name) for name in names}
-        return toml_text({**plain, "keep": self.keep.value, **tables})
+        plain["keep"] = self.keep.value
+        if self.sampling is not Sampling.UNIFORM:  # other texts stay equal to those of ledgers
+            plain["sampling"] = self.sampling.value
+        return toml_text({**plain, **tables})
+
+    def sampled(self, sampling: Sampling) -> Spec:
+        """Return the same campaign with other draws, under a name that says so."""
+        if sampling is self.sampling:
+            return self
+        return replace(self, name=f"{self.name}-{sampling.value}", sampling=sampling)
 
 
 def _listed(values: Sequence[Any] | None) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mavfi_cli.autonomy import canonical_planner
+from mavfi_cli.campaigns.missions import Sampling
 from mavfi_cli.campaigns.specification import LISTS, MISSION, NAMES, Axes, Factors, Keep, Spec
 from mavfi_cli.core.config import (
     Shipped,
@@ -83,6 +84,8 @@ def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
     }
     if "keep" in values:
         values["keep"] = named_member(Keep, "policy of keeping runs", str(values["keep"]))
+    if "sampling" in values:
+        values["sampling"] = named_member(Sampling, "sampling", str(values["sampling"]))
     return structure(values, Spec, path=path, text=text)
 
 

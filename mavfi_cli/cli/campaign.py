@@ -18,6 +18,7 @@ from mavfi_cli.report.table import FORMATS
 
 if TYPE_CHECKING:
     from mavfi_cli.campaigns.ledger import Ledger
+    from mavfi_cli.campaigns.missions import Sampling
 
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _what = section("Missions")
@@ -28,6 +29,9 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
              help="Replace a factor of the preset or file, as in world=dense. May be repeated. "
                   "Quote a value that contains a comma, or write all values as a TOML list. The "
                   "change becomes part of the folder name.")  # fmt: skip
+_SAMPLING = _what("--sampling", type=click.Choice(["uniform", "stratified"]),
+                  help="How faults are drawn: each by itself, or in rounds, with more of them "
+                       "where outcomes have varied, and weights  [as specified].")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` that imply --full.
 _FULL = {"by", "confidence", "quality", "overhead", "failures"}
@@ -52,6 +56,7 @@ def campaign() -> None:
 @click.argument("what", metavar="WHAT", type=types.CAMPAIGN)
 @_what("--scale", type=types.SCALE, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
 @_SET
+@_SAMPLING
 @_what("--missing-only", is_flag=True,
        help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
 @_what("--append", is_flag=True, help="Add the missions that are not yet on the folder's list.")
@@ -83,15 +88,16 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     Ctrl-C waits for the missions in flight; a second one kills them. The next run resumes the
     campaign in either case.
     """
-    from mavfi_cli.campaigns.begin import begin, chosen
+    from mavfi_cli.campaigns.begin import begin, chosen, rounds_of
     from mavfi_cli.campaigns.run import Options, fly_missing
     from mavfi_cli.campaigns.specification import Keep
     from mavfi_cli.cli.progress import missions_view
 
     trusted = (options["firmware"], options["companion"])
     spec, folder = chosen(
-        what, options["out"], options["scale"], options["changes"], programs=trusted
-    )
+        what, options["out"], options["scale"], options["changes"], programs=trusted,
+        sampling=_sampling(options["sampling"]),
+    )  # fmt: skip
     flying = Options(
         **grouped.given_fields(
             Options,
@@ -109,8 +115,14 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
         ) as ledger,
     ):  # fmt: skip
         view.on_note(f"{ledger.meta('name')} in {ledger.folder}")
-        fly_missing(ledger, flying, view, spec.stop)
+        fly_missing(ledger, flying, view, spec.stop, rounds_of(spec, ledger))
         _show(ledger, as_json=as_json)
+
+
+def _sampling(value: str | None) -> Sampling | None:
+    from mavfi_cli.campaigns.missions import Sampling
+
+    return None if value is None else Sampling(value)
 
 
 @campaign.command()

@@ -305,6 +305,34 @@ def change_of(name: str, index: int, before: Scalar, kind: BitType, corruption: 
     )
 
 
+_REHEARSED = (
+    CollisionReport(stamp_s=0.0, collision=False, time_to_collision_s=1.0, future_collision_seq=0),
+    Trajectory(
+        stamp_s=0.0, waypoints=np.ones((2, 10)), durations_s=np.ones(2), trajectory_seq=0,
+        future_collision_seq=0,
+    ),
+    Command(stamp_s=0.0, velocity_enu_mps=np.ones(3), yaw_rad=1.0),
+)  # fmt: skip
+
+
+def rehearsed(fault: SourceFault, seed: int) -> tuple[float, Strike]:
+    """Draw the moment and the bits of a random fault without a flight.
+
+    Returns:
+        The moment as a fraction of the shortest possible flight, and a strike with the bits of each
+        component. In a flight the bits are others if the last waypoint of a plan is struck.
+    """
+    injector = SourceInjector(
+        fault, seed=seed, shortest_flight_s=1.0, listener=lambda _strike: None
+    )
+    due = Moment(stamp_s=0.0, flight_s=1.0, tick=0, phase="")
+    for message in _REHEARSED:
+        injector.pass_on(message, due)
+        if isinstance(message, Trajectory):
+            injector.strike_latched(message, due, 0)
+    return injector.drawn_time_s, injector.strikes[0]
+
+
 Memory = Mapping[str, NDArray[Any]]
 
 

@@ -27,9 +27,9 @@ from mavfi_cli.paper.items import (
     printed,
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
+from mavfi_cli.report.campaign import BY_WEIGHT
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
 from mavfi_cli.report.setting_table import SettingColumns
-from mavfi_cli.stats.shares import wilson
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 
@@ -51,7 +51,7 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
         RecordError: the kernels were not run, or an export contains no flight of the item.
     """
     item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
-    if item is None:
+    if item is None or (ledger.stratified and name is None):
         return _settings_table(ledger) if plan is None else _progress_table(ledger, plan), None
     if item.source is not Source.FLIGHTS:
         return _unflown(item, ledger.folder.parent), None
@@ -176,19 +176,27 @@ def _settings_table(ledger: Ledger) -> PaperTable:
     settings = SettingColumns.of([group.labels for group in merged])
     rows = []
     for group in merged:
-        won = group.succeeded[group.counted]
-        success = PaperCell.of_share(wilson(int(won.sum()), len(won)))
-        means = (PaperCell.of_mean(k * group.successes(name)) for name, k in _MEANS.values())
+        share = group.share(group.succeeded, group.counted)
+        success = PaperCell.of_share(share)
+        means = [PaperCell.of_interval(group.mean(name), k) for name, k in _MEANS.values()]
+        if ledger.stratified:
+            effective = share.total if share.effective is None else share.effective
+            means.insert(0, PaperCell(value=float(effective), count=share.total))
         labels = tuple(settings.cells(group.labels, group.name))
         rows.append(PaperRow(labels=labels, cells=(success, *means)))
     about = "success: golden missions and faults that struck; means: the successful of them"
+    by_weight = [PaperColumn(title="effective n", digits=0)] if ledger.stratified else []
     return PaperTable(
         name=_SETTINGS,
         title=f"{ledger.meta('name') or ledger.folder.name}: settings",
         labels=settings.heads,
-        columns=(PaperColumn(title="success, %", ends=0), *(PaperColumn(title=x) for x in _MEANS)),
+        columns=(
+            PaperColumn(title="success, %", ends=0),
+            *by_weight,
+            *(PaperColumn(title=x) for x in _MEANS),
+        ),
         rows=tuple(rows),
-        notes=(*settings.notes, about),
+        notes=(*settings.notes, about, *([BY_WEIGHT] if ledger.stratified else [])),
     )
 
 

@@ -27,7 +27,7 @@ from mavfi_cli.analysis.summary import (
 )
 from mavfi_cli.campaigns.begin import stopped, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import label_text
+from mavfi_cli.campaigns.missions import Sampling, label_text
 from mavfi_cli.campaigns.specification import FixedWorld
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import Json
@@ -36,8 +36,12 @@ from mavfi_cli.mission.measures import HOST_CHECKS
 from mavfi_cli.report.setting_table import SettingColumns, SettingRow
 from mavfi_cli.report.table import number, percent, rate, spread
 from mavfi_cli.stats.paired import WorstCase
-from mavfi_cli.stats.shares import Interval
+from mavfi_cli.stats.shares import Interval, Share
 
+BY_WEIGHT = (
+    "stratified sample: rates and means are by weight; effective n uniform missions would give the "
+    "same interval"
+)
 _STAGES = tuple(stage.value for stage in Stage)
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),
@@ -137,8 +141,16 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
     means = [SettingRow(row.labels, row.name, _mean_cells(row)) for row in summary.cells]
     otherwise = ["ended otherwise"] if any(row.cells[-1] for row in fates) else []
     head = ["over", "success", _sure(summary.confidence), "of all", "inactive", *otherwise]
+    stratified = summary.sampling == Sampling.STRATIFIED.value
+    if stratified:
+        head[2:2] = ["rate", "effective n"]
+        fates = [
+            row._replace(cells=[*row.cells[:2], *_weighted_cells(setting.success), *row.cells[2:]])
+            for setting, row in zip(summary.cells, fates, strict=True)
+        ]
     lines = [
         *settings.notes,
+        *([BY_WEIGHT] if stratified else []),
         *settings.lines(head, fates),
         "",
         *settings.lines(["mean time", "mean distance", "mean energy", "mean replans"], means),
@@ -152,6 +164,11 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
         if comparisons:
             lines += ["", title, *_comparison_lines(settings, comparisons)]
     return lines
+
+
+def _weighted_cells(share: Share) -> list[str]:
+    effective = share.total if share.effective is None else share.effective
+    return [percent(share.share), str(effective)]
 
 
 def _sure(confidence: float) -> str:

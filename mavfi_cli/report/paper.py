@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from mavfi_cli.report.drawing import (
 )
 from mavfi_cli.report.table import FORMATS, Table, number, with_ends
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
-from mavfi_cli.stats.shares import Share
+from mavfi_cli.stats.shares import Interval, Share
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +60,13 @@ class PaperCell:
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
         """A mean with its bootstrap interval."""
-        return cls(**asdict(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
+        return replace(cls.of_interval(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
+
+    @classmethod
+    def of_interval(cls, mean: Interval, scale: float = 1.0) -> PaperCell:
+        """A number with its interval, in another unit."""
+        ends = {"value": mean.value, "low": mean.low, "high": mean.high}
+        return cls(**{k: scale * v for k, v in ends.items()}, count=mean.count)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

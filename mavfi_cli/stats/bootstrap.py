@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ def interval(
     confidence: float = 0.95,
     resamples: int = RESAMPLES,
     seed: int = 1,
+    weights: FloatArray | None = None,
 ) -> Interval:
     """A statistic with its bootstrap interval, or the normal one for the mean of LARGE samples.
 
@@ -51,9 +53,13 @@ def interval(
     Args:
         values: (n,) one value per mission; the differences for a paired difference.
         statistic: reduces the last axis of an array.
+        weights: (n,) weights of a stratified sample, for its weighted mean; None for equal ones.
     """
     sample = np.asarray(values, dtype=np.float64)
     count = len(sample)
+    if weights is not None and len(set(weights.tolist())) > 1:
+        rows = partial(_weighted_mean, sample, weights)
+        return interval_of_rows(count, rows, resamples=resamples, confidence=confidence)
     if count == 0:
         return NO_INTERVAL
     value = low = high = float(statistic(sample))
@@ -90,8 +96,16 @@ def _resampled(
     return ends
 
 
+def _weighted_mean(values: FloatArray, weights: FloatArray, rows: IntArray) -> FloatArray:
+    return np.asarray((values * weights)[rows].sum(axis=-1) / weights[rows].sum(axis=-1))
+
+
 def interval_of_rows(
-    count: int, statistic: Callable[[IntArray], FloatArray], *, resamples: int
+    count: int,
+    statistic: Callable[[IntArray], FloatArray],
+    *,
+    resamples: int,
+    confidence: float = 0.95,
 ) -> Interval:
     """A statistic of several columns with its interval, by resampling their rows together.
 
@@ -102,4 +116,5 @@ def interval_of_rows(
         np.arange(count, dtype=np.float64),
         lambda rows: statistic(rows.astype(np.int64)),
         resamples=resamples,
+        confidence=confidence,
     )

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
@@ -35,6 +36,7 @@ class McNemar:
         both, neither: pairs in which both or neither succeeded.
         only_first, only_second: pairs in which only one succeeded.
         p_value: two-sided, exact.
+        weighted: the difference by the weights of a stratified sample; None in a uniform one.
     """
 
     both: int
@@ -42,25 +44,42 @@ class McNemar:
     only_second: int
     neither: int
     p_value: float
+    weighted: float | None = None
 
     @classmethod
-    def of(cls, first: Sequence[bool] | BoolArray, second: Sequence[bool] | BoolArray) -> McNemar:
+    def of(
+        cls,
+        first: Sequence[bool] | BoolArray,
+        second: Sequence[bool] | BoolArray,
+        *,
+        weights: FloatArray | None = None,
+    ) -> McNemar:
         """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
+
+        With weights, the p-value is that of `sign_flips` of the weighted differences.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
+            weights: (n,) weights of a stratified sample; None for equal ones.
         """
         from scipy.stats import binomtest
 
         ends = 2 * np.asarray(first, dtype=np.int64) + np.asarray(second, dtype=np.int64)
         neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
         differing = only_first + only_second
+        p_value = float(binomtest(only_first, differing).pvalue) if differing else 1.0
+        weighted = None
+        if weights is not None:
+            changes = weights * (np.asarray(second, np.int64) - np.asarray(first, np.int64))
+            weighted = float(changes.sum() / weights.sum()) if len(changes) else math.nan
+            p_value = sign_flips(changes.tolist())
         return cls(
             both=both,
             only_first=only_first,
             only_second=only_second,
             neither=neither,
-            p_value=float(binomtest(only_first, differing).pvalue) if differing else 1.0,
+            p_value=p_value,
+            weighted=weighted,
         )
 
     @property
@@ -71,6 +90,8 @@ class McNemar:
     @property
     def difference(self) -> float:
         """Success rate of the second minus that of the first; NaN without pairs."""
+        if self.weighted is not None:
+            return self.weighted
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
 
 

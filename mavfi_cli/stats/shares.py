@@ -42,13 +42,19 @@ NO_INTERVAL = Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Share:
-    """A proportion with its Wilson score interval."""
+    """A proportion with its interval.
+
+    Attributes:
+        effective: of a stratified sample, the number of uniformly drawn observations with as narrow
+            an interval; None for a uniform sample.
+    """
 
     count: int
     total: int
     share: float
     low: float
     high: float
+    effective: int | None = None
 
     @property
     def counts(self) -> str:
@@ -97,17 +103,19 @@ def wilson(
     """
     if total == 0:
         return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
-    p, n, z = count / total, total / design_effect, z_of(confidence)
+    low, high = score_interval(count / total, total / design_effect, confidence)
+    return Share(count=count, total=total, share=count / total, low=low, high=high)
+
+
+def score_interval(share: float, number: float, confidence: float) -> tuple[float, float]:
+    """Ends of Wilson's interval of a share of a number of observations, above 0."""
+    z = z_of(confidence)
     z2 = z**2
-    centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = z * math.sqrt(p * (1 - p) / n + z2 / (4 * n**2)) / (1 + z2 / n)
-    return Share(
-        count=count,
-        total=total,
-        share=p,
-        low=max(0.0, centre - half) if count else 0.0,
-        high=min(1.0, centre + half) if count < total else 1.0,
-    )
+    centre = (share + z2 / (2 * number)) / (1 + z2 / number)
+    root = math.sqrt(share * (1 - share) / number + z2 / (4 * number**2))
+    half = z * root / (1 + z2 / number)
+    low = max(0.0, centre - half) if share else 0.0
+    return low, min(1.0, centre + half) if share < 1.0 else 1.0
 
 
 def unseen_share(total: int, confidence: float = 0.95) -> float:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+from mavfi_cli.campaigns.strata import stratum_of
 from mavfi_cli.core.config import structure
 from mavfi_cli.core.errors import RecordError, VehicleProcessError, WorldError
 from mavfi_cli.core.seeds import Stream
@@ -66,6 +67,8 @@ def keep_profile(changes, out):
 def record(changes, seed, world, value):
     rng = Stream.MISSION.generator(seed)
     outcome = value if world == "end" else "success"
+    if world == "fragile" and harmful(changes):
+        outcome = "collision"
     return {
         "schema": 1,
         "outcome": outcome,
@@ -78,9 +81,22 @@ def record(changes, seed, world, value):
         },
         "pilot": {"replans": replans(changes, world, int(rng.integers(5)))},
         "simulated_s": 30.0,
-        "fault": None,
+        "fault": {"state": "applied", "strikes": []} if fault_of(changes) else None,
+        "kernels": {"planner": {"invocations": seed % 3 + 1}},
         "referee": None if world == "untrue" else {},
     }
+
+
+def fault_of(changes):
+    return changes.get("fault") or changes.get("instruction")
+
+
+def harmful(changes):
+    """In `fragile`, every other flip of an exponent bit, and later requests of a plan."""
+    config = structure(changes, MissionConfig)
+    fault = config.fault or config.instruction
+    stratum = stratum_of(fault, config.seed % 3 + 1) if fault else ()
+    return "later request" in stratum or ("exponent" in stratum and fault.seed % 2 == 0)
 
 
 def replans(changes, world, drawn):

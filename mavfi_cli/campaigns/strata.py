@@ -1,0 +1,344 @@
+"""Draws the faults of a stratified campaign in rounds, more of them where outcomes have varied.
+
+A stratum is what a seed says about its fault before any flight: the field, its half and the state
+of the highest bit, or the node, and the moment. Every repetition has a pool of seeds. The
+shares of the strata in the pools are those in the population, whatever the rule that draws a fault
+from its seed. A round gives each stratum a number of missions, and each mission a seed from a pool.
+Its weight is the number of seeds for which it stands, so that no estimate depends on the choice.
+
+The missions of a round are drawn after all earlier missions have ended, from their results and the
+campaign's seed. So a resumed campaign draws the same faults, in whatever order missions end.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+from mavfi_cli.campaigns.ledger import Drawn, Ledger
+from mavfi_cli.campaigns.missions import (
+    COUNTED,
+    MissingMission,
+    PlannedMission,
+    changes_of,
+    kind_of,
+)
+from mavfi_cli.core.config import structure
+from mavfi_cli.core.seeds import Stream
+from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field
+from mavfi_cli.fi.fault import When
+from mavfi_cli.fi.injector import rehearsed
+from mavfi_cli.mission.measures import record_of
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.stats.strata import allocate, rounded, spread
+
+T = TypeVar("T")
+ROUND = 25  # repetitions of a round, if no stopping rule has batches
+POOL = 48  # seeds of each repetition from which faults are drawn
+_WIDE = 8  # bits of a field from which on its halves are apart
+_PLANNER = "planner"
+_THIRDS = ("early", "midway", "late")
+Stratum = tuple[str, ...]  # from the coarsest part to the finest
+Fault = FaultConfig | InstructionConfig
+
+
+# The stratum of a seed ----------------------------------------------------------------------------
+
+
+def stratum_of(fault: Fault, requests: int = 0) -> Stratum:
+    """Return the finest stratum of a fault, by its seed.
+
+    Args:
+        requests: plans that the golden flight requests; 0 if that is unknown.
+    """
+    if isinstance(fault, InstructionConfig):
+        node = fault.node()
+        # The invocation is this number scaled to those of the golden flight.
+        drawn = int(Stream.FAULT.generator(fault.seed, "instruction").integers(1 << 32))
+        moment = drawn / (1 << 32)
+        if node != _PLANNER:
+            return node, _third(moment)
+        first = moment * requests < 1.0
+        return node, ("first request" if first else "later request") if requests else "any request"
+    if fault.attacks_detector or fault.killed_node is not None:
+        return ()
+    source = fault.draw()
+    moment, strike = rehearsed(source, fault.seed)
+    parts: list[str] = []
+    struck = [(max(change.bits), change.state) for change in strike.changes if change.bits]
+    if struck:
+        bit, name = max(struck)
+        state = next(state for state in source.states if state.name == name)
+        parts = [*_part_of(NUMPY_TYPES[state.dtype.value], bit), name]
+    return *parts, *([_third(moment)] if source.trigger.when is When.RANDOM else [])
+
+
+def _third(moment: float) -> str:
+    return _THIRDS[int(moment * len(_THIRDS))]
+
+
+def _part_of(kind: BitType, bit: int) -> tuple[str, str]:
+    """The field of a bit and its half, such as `exponent` and `upper half`."""
+    fields = {own: bits for own, bits in kind.fields.items() if own is not Field.ANY}
+    name, bits = next(
+        ((own.value, bits) for own, bits in fields.items() if bit in bits),
+        ("value", range(kind.width)),
+    )
+    upper = bit >= bits[len(bits) // 2]
+    return name, "whole" if len(bits) < _WIDE else "upper half" if upper else "lower half"
+
+
+def coarsened(strata: Sequence[Stratum], least: float) -> frozenset[Stratum]:
+    """Merge strata from the finest part on, so that each has a share of at least `least`.
+
+    Returns:
+        The strata that remain. A seed belongs to the longest beginning of its own stratum among
+        them; the empty one has the rest.
+    """
+    kept: set[Stratum] = {()}
+    left = Counter(strata)
+    for length in range(max(map(len, strata)), 0, -1):
+        for stratum in sorted(own for own in left if len(own) == length):
+            if left[stratum] >= least * len(strata):
+                kept.add(stratum)
+            else:
+                left[stratum[:-1]] += left.pop(stratum)
+    return frozenset(kept)
+
+
+def _coarse(stratum: Stratum, kept: frozenset[Stratum]) -> Stratum:
+    return next(own for end in range(len(stratum), -1, -1) if (own := stratum[:end]) in kept)
+
+
+# Rounds -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Strike:
+    """One fault of the list, and the missions that it strikes: with each detector, and without.
+
+    Attributes:
+        config: one of these missions.
+        numbers, bare: the missions, and those without a detector.
+    """
+
+    config: MissionConfig
+    numbers: list[int] = field(default_factory=list)
+    bare: list[int] = field(default_factory=list)
+
+    @property
+    def fault(self) -> Fault:
+        fault = self.config.fault or self.config.instruction
+        assert fault is not None
+        return fault
+
+
+class Rounds:
+    """The rounds of a stratified campaign.
+
+    Missions with equal faults and other detectors are given the same draw, as on the list.
+
+    Args:
+        ledger: ledger of the campaign, open for writing; its list is stored.
+        seed: root of the seeds of all faults.
+        size: repetitions of a round; the last round has up to twice as many.
+
+    Attributes:
+        drawn: the faults that missions were given so far, by number.
+    """
+
+    def __init__(self, ledger: Ledger, seed: int, size: int = ROUND) -> None:
+        self._ledger, self._seed, self._size = ledger, seed, size
+        ledger.draw(())
+        self.drawn = ledger.draws()
+        strikes: dict[str, dict[tuple[MissionConfig, Fault], _Strike]] = {}
+        plain: dict[str, list[tuple[int, MissionConfig]]] = {}
+        for number, _, _, text in ledger.rows():
+            config = structure(json.loads(text), MissionConfig)
+            fault = config.fault or config.instruction
+            kind = kind_of(changes_of(config), ("seed", "detector"))
+            if fault is None:
+                plain.setdefault(kind, []).append((number, config))
+                continue
+            group = strikes.setdefault(kind, {})
+            strike = group.setdefault((config.golden, fault), _Strike(config=config))
+            strike.numbers.append(number)
+            if config.detector is None:
+                strike.bare.append(number)
+        self._groups = {kind: self._in_rounds([*own.values()]) for kind, own in strikes.items()}
+        begins = {  # the round in which a golden flight is needed first
+            strike.config.golden: place
+            for rounds in self._groups.values()
+            for place in range(len(rounds) - 1, -1, -1)
+            for strike in rounds[place]
+        }
+        self._plain: dict[int, list[tuple[int, MissionConfig]]] = {}
+        for missions in plain.values():
+            for place, part in enumerate(self._in_rounds(missions)):
+                for mission in part:
+                    first = min(place, begins.get(mission[1].golden, place))
+                    self._plain.setdefault(first, []).append(mission)
+
+    def _in_rounds(self, members: Sequence[T]) -> list[Sequence[T]]:
+        last = max(1, len(members) // self._size) - 1
+        cuts = [*(place * self._size for place in range(last + 1)), len(members)]
+        return [members[begin:end] for begin, end in itertools.pairwise(cuts)]
+
+    def missing(self, stopped: Collection[int], *, errors: bool) -> Iterator[MissingMission | None]:
+        """Yield the missing missions, and draw each round when all earlier missions are over.
+
+        Args:
+            stopped: settings that the stopping rule has ended so far.
+            errors: include missions that could not begin.
+
+        Yields:
+            None while an earlier mission is not over.
+        """
+        cells = self._ledger.mission_cells()
+        begun: list[int] = []
+        for number in sorted({*range(max(map(len, self._groups.values()), default=0)),
+                              *self._plain}):  # fmt: skip
+            for part in self._parts(number):
+                while any(cells[mission.number] not in stopped
+                          for mission in self._ledger.missing(among=begun)):  # fmt: skip
+                    yield None
+                if any(strike.numbers[0] in part for strike in self._strikes(number)):
+                    self._draw(number)
+                yield from self._ledger.missing(errors=errors, among=part)
+                begun = part
+
+    def _strikes(self, number: int) -> list[_Strike]:
+        return [
+            strike
+            for rounds in self._groups.values()
+            for strike in (rounds[number] if number < len(rounds) else ())
+        ]
+
+    def _parts(self, number: int) -> list[list[int]]:
+        """The missions of a round; its golden flights come first if draws depend on them."""
+        strikes = self._strikes(number)
+        plain = [mission for mission, _ in self._plain.get(number, ())]
+        struck = [mission for strike in strikes for mission in strike.numbers]
+        first = any(isinstance(strike.fault, InstructionConfig) for strike in strikes)
+        parts = [plain, struck] if first else [plain + struck]
+        return [sorted(part) for part in parts if part]
+
+    # One round
+
+    def _draw(self, number: int) -> None:
+        """Draw the faults of a round, unless they are stored."""
+        if any(strike.numbers[0] in self.drawn for strike in self._strikes(number)):
+            return
+        rows: list[Drawn] = []
+        for kind, rounds in self._groups.items():
+            if number < len(rounds):
+                rows += self._drawn(kind, rounds, number)
+        self._ledger.draw(rows)
+        self.drawn.update((row.number, row) for row in rows)
+
+    def _drawn(
+        self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
+    ) -> Iterator[Drawn]:
+        """Draw the faults of one kind of mission in a round."""
+        strikes = rounds[number]
+        first = [stratum for pool in self._pools(kind, rounds, 0) for _, stratum in pool]
+        kept = coarsened(first, 2.0 / len(rounds[0]))
+        pools = [
+            [(seed, _coarse(stratum, kept)) for seed, stratum in pool]
+            for pool in self._pools(kind, rounds, number)
+        ]
+        strata = sorted({stratum for pool in pools for _, stratum in pool})
+        sizes = [[sum(own == stratum for _, own in pool) / POOL for stratum in strata]
+                 for pool in pools]  # fmt: skip
+        totals = [math.fsum(column) for column in zip(*sizes, strict=True)]
+        spreads = self._spreads(rounds[:number])
+        counts = allocate(
+            [total / len(pools) for total in totals],
+            [spreads.get(_text(stratum), spread(0, 0)) for stratum in strata],
+            len(pools),
+        )
+        rng = Stream.FAULT.generator(self._seed, "rounds", kind, number)
+        expected = [
+            [count * size / total for size, count, total in zip(row, counts, totals, strict=True)]
+            for row in sizes
+        ]
+        chosen: list[list[tuple[int, Stratum, float]]] = []
+        for pool, numbers in zip(pools, rounded(expected, rng), strict=True):
+            chosen.append([])
+            for stratum, wanted, count, total in zip(strata, numbers, counts, totals, strict=True):
+                seeds = [seed for seed, own in pool if own == stratum]
+                picked = rng.choice(len(seeds), size=wanted, replace=wanted > len(seeds))
+                chosen[-1] += [(seeds[place], stratum, total / count) for place in picked]
+        # A repetition keeps its own world where it can; others are struck several times.
+        further = [(strike, *draw) for strike, draws in zip(strikes, chosen, strict=True)
+                   for draw in draws[1:]]  # fmt: skip
+        for strike, draws in zip(strikes, chosen, strict=True):
+            place, seed, stratum, weight = (strike, *draws[0]) if draws else further.pop(0)
+            yield from self._rows(strike, number, place, seed, _text(stratum), weight)
+
+    def _rows(
+        self, strike: _Strike, number: int, place: _Strike, seed: int, stratum: str, weight: float
+    ) -> Iterator[Drawn]:
+        """Give the missions of a strike a fault in the world and flight of a repetition."""
+        for mission, config in zip(
+            strike.numbers, self._ledger.configs(strike.numbers), strict=True
+        ):
+            level = "fault" if config.fault is not None else "instruction"
+            fault: Any = replace(strike.fault, seed=seed)
+            moved: Any = {"seed": place.config.seed, level: fault}
+            _, pair, changes = PlannedMission(config=replace(config, **moved)).stored
+            yield Drawn(mission, number, stratum, weight, pair, changes)
+
+    def _pools(
+        self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
+    ) -> list[list[tuple[int, Stratum]]]:
+        """Seeds and their strata, for each strike of a round."""
+        requests = self._requests(rounds[number])
+        begin = sum(map(len, rounds[:number]))
+        pools = []
+        for place, strike in enumerate(rounds[number], start=begin):
+            seeds = [
+                Stream.FAULT.seed(self._seed, "pool", kind, place, draw) for draw in range(POOL)
+            ]
+            plans = requests.get(strike.config.golden, 0)
+            pools.append([(seed, stratum_of(replace(strike.fault, seed=seed), plans))
+                          for seed in seeds])  # fmt: skip
+        return pools
+
+    def _requests(self, strikes: Sequence[_Strike]) -> dict[MissionConfig, int]:
+        """Number of plans that the golden flight of each strike requests, where it is known."""
+        wanted = {strike.config.golden for strike in strikes
+                  if isinstance(strike.fault, InstructionConfig)}  # fmt: skip
+        numbers = [
+            mission
+            for missions in self._plain.values()
+            for mission, config in missions
+            if config in wanted  # without a detector
+        ]
+        found: dict[MissionConfig, int] = {}
+        for result in self._ledger.results(numbers):
+            kernels = record_of(result.result).kernels
+            found[result.mission.config] = int(kernels.get(_PLANNER, {}).get("invocations", 0))
+        return found
+
+    def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
+        """Spread of the losses in each stratum, without a detector if such missions are flown."""
+        over = dict(self._ledger.fates())
+        lost: dict[str, list[bool]] = {}
+        for strike in itertools.chain.from_iterable(rounds):
+            for mission in strike.bare or strike.numbers:
+                if mission in over:
+                    outcome, fate = over[mission]
+                    stratum = self.drawn[mission].stratum
+                    lost.setdefault(stratum, []).append(outcome != "success" and fate in COUNTED)
+        return {stratum: spread(sum(own), len(own)) for stratum, own in lost.items()}
+
+
+def _text(stratum: Stratum) -> str:
+    return ", ".join(stratum) or "other"
