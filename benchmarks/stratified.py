@@ -91,9 +91,10 @@ def show(name: str, cells: Cells, missions: int, repetitions: int) -> None:
         effective = np.mean([share.effective or share.total for share in shares])
         error = values.std(ddof=1) / np.sqrt(repetitions)
         print(
-            f"  {kind:10} mean {100 * values.mean():.2f} +- {100 * error:.2f} %, standard deviation "
-            f"{100 * values.std(ddof=1):.2f} points, interval {100 * width:.2f} points wide, covers "
-            f"{100 * covered:.1f} %, effective n {effective:.0f} of {missions}"
+            f"  {kind:10} mean {100 * values.mean():.2f} +- {100 * error:.2f} %, "
+            f"standard deviation {100 * values.std(ddof=1):.2f} points, "
+            f"interval {100 * width:.2f} points wide, covers {100 * covered:.1f} %, "
+            f"effective n {effective:.0f} of {missions}"
         )
 
 

@@ -69,6 +69,7 @@ _TYPES = {  # of the columns that are not text, even if they hold no value
 }  # fmt: skip
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
+SETTLING = "settling"  # meta of a reproduction whose claims were settled (`reproduce --settle`)
 _HOST = ("machine", "cores", "started")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -252,8 +253,8 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
 
     Returns:
         `name` of the campaign; `planned`, the number of missions on its list; `sampling`, how its
-        faults were drawn; `versions` of the programs; and `host`, with the `machine`,
-        `cores` and `started` of the first record.
+        faults were drawn; `settling`, what was flown to settle claims; `versions` of the programs;
+        and `host`, with the `machine`, `cores` and `started` of the first record.
     """
     table = source if isinstance(source, pa.Table) else source.export
     if table is not None:
@@ -264,6 +265,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
         "name": source.meta("name"),
         "planned": source.planned(),
         "sampling": source.sampling.value,
+        SETTLING: json.loads(source.meta(SETTLING) or "null"),
         "versions": json.loads(source.meta("versions") or "{}") or record.versions,
         "host": {name: record.host[name] for name in _HOST if name in record.host},
     }

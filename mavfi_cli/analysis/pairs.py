@@ -141,6 +141,11 @@ class Flights:
             first.setdefault(changes, place)
         return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
 
+    def without(self, left_out: Iterable[bool]) -> Flights:
+        """The flights for which `left_out` (n,) is false, compared among themselves."""
+        kept = pa.array([not own for own in left_out], pa.bool_())
+        return Flights(_beside_golden(self.table.select(_NOTHING_FLOWN.column_names).filter(kept)))
+
     def __len__(self) -> int:
         return int(self.table.num_rows)
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 
-from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, section
-from mavfi_cli.cli.types import ITEM, JOBS, OUT, STACK, UPSETS
+from mavfi_cli.cli.grouped import GroupedCommand, given_fields, option, refuse_given, section
+from mavfi_cli.cli.types import ABOVE_ZERO, ITEM, JOBS, OUT, STACK, UPSETS
 from mavfi_cli.core.option_types import Number, OutFile
-from mavfi_cli.core.terminal import echo, note
+from mavfi_cli.core.terminal import echo, echo_lines, note
 
 _what = section("Missions")
 _execution = section("Execution")
@@ -26,6 +26,10 @@ _output = section("Output")
             "fraction.")  # fmt: skip
 @_what("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
+@_what("--settle", is_flag=True,
+       help="Then fly further missions where claims are undecided, until each is decided. Tests "
+            "and intervals hold at any number of looks.")  # fmt: skip
+@_what("--hours", type=ABOVE_ZERO, help="With --settle: most wall time for these missions, h.")
 @_execution("--jobs", type=JOBS, help="Number of parallel missions  [one per core].")
 @_execution("--whole", is_flag=True,
             help="Fly every mission from its start, as in `mavfi campaign run`.")  # fmt: skip
@@ -44,6 +48,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     from mavfi_cli.core.files import plain
     from mavfi_cli.paper.flying import reproduce as run
     from mavfi_cli.paper.items import FlightsPlan, items_named
+    from mavfi_cli.paper.settling import require_settleable, settle
     from mavfi_cli.paper.status import tables
     from mavfi_cli.spec.stack import load_stack
 
@@ -51,21 +56,27 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     plan = FlightsPlan(
         items=items_named(names), stack=options["stack"], scale=options["scale"], out=options["out"]
     )
+    if options["settle"]:
+        require_settleable(plan)
+    else:
+        refuse_given(("hours",), "needs --settle")
     with missions_view(quiet=quiet) as view:
-        run(
-            plan,
-            Options(**given_fields(Options)),
-            view,
-            lambda forecast: view.on_note(forecast.summary),
-        )
+        flying = Options(**given_fields(Options))
+        run(plan, flying, view, lambda forecast: view.on_note(forecast.summary))
+        settled = None
+        if options["settle"]:
+            settled = settle(plan, flying, view, options["hours"])
     if as_json:
         summary = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
-                "items": [asdict(table) for table in tables(plan)]}  # fmt: skip
+                "items": [asdict(table) for table in tables(plan)],
+                "settling": settled}  # fmt: skip
         echo(json.dumps(plain(summary), indent=2, default=str))
         return
     for table in tables(plan):
         one_line = f"{table.title}\n  {table.result}\n"
         echo(table.formatted("text") if len(plan.items) == 1 else one_line, nl=False)
+    if settled is not None:
+        echo_lines(["", "Claims at all looks together", *settled])
     if any(item.preset for item in plan.items):
         echo(f"\nTables and figures  mavfi campaign report {plan.folder} --item ITEM")
         echo(f"The page            mavfi report {plan.out} -o report.html")

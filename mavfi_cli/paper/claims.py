@@ -18,6 +18,7 @@ from typing import Any
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.paper.measures import MEASURES, NOT_FLOWN, OF_KERNELS, WITHOUT_FATES, Kernels
+from mavfi_cli.paper.settled import Settling
 from mavfi_cli.paper.verdicts import (
     ISOLATED,
     Claim,
@@ -37,12 +38,18 @@ _NONE = {Fate.SILENT: "none of the faults is silent", Fate.DEAD: "none of the fa
 _WHOLE = ("points", "percent")  # units of shares, which end at 1
 
 
-def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim]:
+def judged(
+    flights: Mapping[str, Flights],
+    kernels: Kernels,
+    settled: Mapping[str, Settling] | None = None,
+) -> list[JudgedClaim]:
     """All claims with their verdicts, in the order of CLAIMS.
 
     Args:
         flights: flights by stack.
+        settled: by stack, what was flown to settle claims; none for the other stacks.
     """
+    settled = settled or {}
     judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
     for _, family in groupby(CLAIMS, attrgetter("item")):
         members = list(family)
@@ -54,7 +61,9 @@ def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim
         for stack, those in flights.items():
             for fate in Fate:
                 applicable = [claim for claim in flown if fate in claim.fates]
-                verdicts = _judge(applicable, those.of_fate(fate), kernels)
+                verdicts = _judge(
+                    applicable, those.of_fate(fate), kernels, fate, settled.get(stack)
+                )
                 for claim, judgement in zip(applicable, verdicts, strict=True):
                     cells = judgements[claim.name].setdefault(stack, {})
                     if judgement.why == NOT_FLOWN.why != cells.get(Fate.ALL, judgement).why:
@@ -63,17 +72,42 @@ def judged(flights: Mapping[str, Flights], kernels: Kernels) -> list[JudgedClaim
     return [JudgedClaim(claim=claim, judgements=judgements[claim.name]) for claim in CLAIMS]
 
 
-def _judge(family: Sequence[Claim], flights: Flights, kernels: Kernels) -> list[Judgement]:
+def _judge(
+    family: Sequence[Claim],
+    flights: Flights,
+    kernels: Kernels,
+    fate: Fate = Fate.ALL,
+    settled: Settling | None = None,
+) -> list[Judgement]:
+    looks = None
+    if settled is not None:
+        looks = [settled.first_look(claim.name, fate.value) for claim in family]
     ranges = [(claim.low, claim.high) for claim in family]
     findings = [claim.find(flights, kernels) for claim in family]
-    verdicts = judge(findings, ranges)
+    verdicts = judge(findings, ranges, looks)
     by_name = {claim.name: verdict for claim, verdict in zip(family, verdicts, strict=True)}
     void = False
     for place, claim in enumerate(family):
         if claim.premise and by_name[claim.premise].verdict is Verdict.CONTRADICTED:
             void, why = True, f"its premise does not hold here: {claim.premise} is contradicted"
             findings[place] = Finding(counts=findings[place].counts, why=why)
-    return judge(findings, ranges) if void else verdicts
+    if void:
+        verdicts = judge(findings, ranges, looks)
+    if settled is None:
+        return verdicts
+    return [
+        replace(
+            verdict,
+            without_size=excludes(claim.size, verdict.bounds),
+            history=settled.describe(claim.name),
+        )
+        for claim, verdict in zip(family, verdicts, strict=True)
+    ]
+
+
+def excludes(size: float | None, bounds: Interval | None) -> bool:
+    """Return True if an effect lies within less than a size of 0, by its bounds."""
+    return size is not None and bounds is not None and -size < bounds.low and bounds.high < size
 
 
 # claims.toml --------------------------------------------------------------------------------------
@@ -86,6 +120,7 @@ def _read(path: Path) -> Iterator[Claim]:
         counts = [(wins, missions) for wins, missions in entry.pop("paper_counts", ())]
         if counts:
             entry["paper_tells"] = _in_the_paper(entry["paper_tells"], counts)
+        size = entry.get("size")
         low, high, rule = _range(entry)
         yield Claim(
             item=entry["name"].partition("-")[0],
@@ -93,6 +128,7 @@ def _read(path: Path) -> Iterator[Claim]:
             low=low,
             high=high,
             rule=rule,
+            size=size,
             isolated=measure in OF_KERNELS,
             fates=(Fate.ALL,) if measure in WITHOUT_FATES else tuple(Fate),
             **entry,

@@ -204,7 +204,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
     sdc = {name: kernel.outcomes["sdc"] for name, kernel in kernels.items()}
     silent = {name: (share.count, share.total) for name, share in sdc.items()}
     step("judging the claims")
-    claims = judged(flights, kernels)
+    claims = judged(flights, kernels, evidence.settled)
     step("counting what protects")
     maps = {stack: state_map(as_paper[stack]) for stack in stacks}
     flows = {stack: kernel_flows(flights[stack], silent) for stack in stacks}

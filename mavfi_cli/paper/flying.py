@@ -95,7 +95,7 @@ def reproduce(
         seconds = kernels.forecast_s()
         left = replace(left, runs=runs, seconds=seconds, disk_bytes=runs * _RECORD_BYTES)
     if any(item.preset for item in plan.items):
-        with _opened(plan) as ledger:
+        with opened(plan) as ledger:
             wanted = frozenset(plan.numbers(ledger))
             kept = frozenset(plan.kept(ledger))
             options = replace(options, only=wanted, planned=wanted, kept=kept)
@@ -127,8 +127,12 @@ class _Ahead(Spectator):
         self._spectator.on_note(text)
 
 
-def _opened(plan: FlightsPlan) -> Ledger:
-    """The ledger of the plan's stack with the list of all items at the plan's scale."""
+def opened(plan: FlightsPlan) -> Ledger:
+    """The ledger of the plan's stack with the list of all items at the plan's scale.
+
+    Raises:
+        ConfigError: the folder holds another campaign, or one begun with other versions.
+    """
     if (plan.folder / LEDGER).is_file():
         with Ledger(plan.folder) as ledger:
             _require_same(plan, FlightsPlan.stored(ledger))

@@ -190,16 +190,23 @@ class FlightsPlan:
         ]
         once: dict[Key, PlannedMission] = {}
         for _, mission in sorted(planned, key=itemgetter(0)):
-            once.setdefault(_key_of(mission), mission)
+            once.setdefault(key_of(mission), mission)
         return list(once.values())
 
     def kinds(self, *items: Item) -> list[PlannedMission]:
         """The first mission of each kind; the others differ in seeds."""
         return [mission for spec in self._specs(items, 1.0) for mission in spec.kinds()]
 
+    def numbered(self, item: Item, first: int, end: int) -> list[tuple[PlannedMission, int]]:
+        """Missions of an item with their repetitions, from `first` to below `end`."""
+        specs = (spec.scaled(end / spec.repetitions) for spec in self._specs([item], 1.0))
+        missions = ((mission, mission.config.seed - spec.first_seed)
+                    for spec in specs for mission in spec.missions())  # fmt: skip
+        return [own for own in missions if own[1] >= first]
+
     def keys(self, *items: Item) -> list[Key]:
         """The configurations of the missions, as the ledger stores them."""
-        return [_key_of(mission) for mission in self.missions(*items)]
+        return [key_of(mission) for mission in self.missions(*items)]
 
     def numbers(self, ledger: Ledger, *items: Item) -> list[int]:
         """The numbers of the missions in a ledger, in the order of its list."""
@@ -209,7 +216,7 @@ class FlightsPlan:
         """The numbers of the missions whose run folders any item needs."""
         specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
         return _numbers_of(
-            ledger, (_key_of(mission) for spec in specs for mission in spec.missions())
+            ledger, (key_of(mission) for spec in specs for mission in spec.missions())
         )
 
     def _specs(self, items: Iterable[Item], scale: float) -> list[Spec]:
@@ -225,5 +232,6 @@ def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:
     return [number for number, _, _, changes in ledger.rows() if changes in wanted]
 
 
-def _key_of(mission: PlannedMission) -> Key:
+def key_of(mission: PlannedMission) -> Key:
+    """The configuration of a mission, as the ledger stores it."""
     return canonical(changes_of(mission.config))

@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from mavfi_cli.analysis.flights import flights, provenance, read_export
+from mavfi_cli.analysis.flights import SETTLING, flights, provenance, read_export
 from mavfi_cli.analysis.kernels import KERNELS, IsolatedKernel, KernelSummary
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.begin import stored_spec
@@ -22,6 +22,7 @@ from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.items import FlightsPlan
+from mavfi_cli.paper.settled import Settling
 
 _EXPORT, _SPEC = ".parquet", ".toml"
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
@@ -40,6 +41,7 @@ class CampaignSource:
         versions: versions of the programs that flew it; empty if an export does not record them.
         host: host of the first record; empty if an export does not record it.
         digest: SHA-256 of an exported file; empty for a folder.
+        settling: what was flown to settle claims; None if nothing was.
         again: command that flies the rest of its list; empty if it is not known.
     """
 
@@ -52,6 +54,7 @@ class CampaignSource:
     versions: Mapping[str, str] = field(default_factory=dict)
     host: Mapping[str, Any] = field(default_factory=dict)
     digest: str = ""
+    settling: Settling | None = None
     again: str = ""
 
     @property
@@ -121,6 +124,16 @@ class Evidence:
         """The summary of each attacked kernel; if several sources have one, that of the last."""
         return {kernel.name: kernel for source in self.kernels for kernel in source.kernels}
 
+    @property
+    def settled(self) -> Mapping[str, Settling]:
+        """By stack, what was flown to settle claims; if several sources have it, of the last."""
+        return {
+            stack: source.settling
+            for source in self.campaigns
+            if source.settling is not None
+            for stack in source.stacks
+        }
+
     def flights(self, stack: str | None = None) -> Flights:
         """The flights of a stack, each mission once; None means all stacks."""
         return Flights.pooled([campaign.flights for campaign in self.campaigns], stack)
@@ -177,6 +190,7 @@ def _campaign(
 ) -> CampaignSource:
     errors = table["state"].to_pylist().count(ResultState.ERROR.value)
     known = {name: origin[name] for name in ("planned", "versions", "host") if name in origin}
+    more["settling"] = Settling.of(origin.get(SETTLING))
     more |= {"flights": Flights.of(table), "errors": errors}
     return CampaignSource(path=path, spec=spec, **known, **more)
 

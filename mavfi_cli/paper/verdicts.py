@@ -15,11 +15,13 @@ from enum import Enum
 from mavfi_cli.analysis.kernels import IsolatedKernel
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.stats.paired import holm
+from mavfi_cli.stats.sequences import anytime_count, anytime_interval, anytime_p
 from mavfi_cli.stats.shares import Interval, wilson, z_of
 
 ISOLATED = "isolated kernels"
 LEVEL = 0.05  # of a family
 _FAMILY = 4  # claims of a figure or table that `margin` allows for
+_HALVES = 2  # of the level: for the first look, and for all looks together
 _STEP = 0.005  # margins are multiples of half a point
 _Z = z_of(1.0 - LEVEL)
 
@@ -58,8 +60,14 @@ class Judgement:
         why: why nothing can decide the claim; empty for the other verdicts.
         p: p-value of the test against the nearest end of the range, corrected for its family; 1
             without an effect.
+        p_alone: p-value of the same test without a correction for its family or for looks.
         needed: observations that decide an undecided claim if the effect stays as it is; infinite
             if it lies on an end of the range.
+        bounds: of settled missions, the 95 % interval at all looks together; else None.
+        without_size: whether the bounds exclude an effect of the claim's size on either side of 0:
+            two one-sided tests (D. J. Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15,
+            1987).
+        history: of settled missions, what was flown for this claim, in words.
     """
 
     verdict: Verdict
@@ -67,7 +75,11 @@ class Judgement:
     counts: str = ""
     why: str = ""
     p: float = 1.0
+    p_alone: float = 1.0
     needed: float = 0.0
+    bounds: Interval | None = None
+    without_size: bool = False
+    history: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +90,7 @@ class Claim:
         item: table, figure or section, such as `fig6`.
         find: function that computes the finding from a stack's flights and the isolated kernels.
         low, high: ends of the range of the effect.
+        size: the size of the effect that the paper states; None without one.
         rule: the range, and where it comes from, in words.
         isolated: whether it is about isolated kernels instead of flights.
         fates: what the faults may do to their nodes; each fate is judged separately.
@@ -91,6 +104,7 @@ class Claim:
     low: float
     high: float
     rule: str
+    size: float | None = None
     paper: str = "no number printed"
     unit: str = "points"
     paper_tells: str = "drawn only, without counts"
@@ -116,19 +130,52 @@ class JudgedClaim:
         return None if judgement is None else judgement.verdict
 
 
-def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) -> list[Judgement]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstLook:
+    """The test of a claim before any mission was added to settle it.
+
+    Attributes:
+        p: p-value of the claim alone.
+        inside: whether the effect lay in the claim's range.
+    """
+
+    p: float
+    inside: bool
+
+
+def judge(
+    findings: Sequence[Finding],
+    ranges: Sequence[tuple[float, float]],
+    first: Sequence[FirstLook | None] | None = None,
+) -> list[Judgement]:
     """Judge a family of claims.
+
+    Where missions were added until claims were decided, half of the level is spent on the first
+    look, whose number of missions was planned, and half on all looks together. So a p-value is
+    twice the smaller of that of the first look and that of `anytime_p`.
 
     Args:
         findings: finding of each claim.
         ranges: low and high end of each claim's range, which belong to it.
+        first: where missions were added, the first look at each claim, None if it had no effect;
+            None where none was added.
     """
     z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
     tested = [place for place, value in enumerate(z) if not math.isnan(value)]
-    p = dict(zip(tested, holm([_two_sided(z[place]) for place in tested]), strict=True))
-    wanted_z = z_of(1.0 - LEVEL / len(tested)) if tested else _Z
+    counts = [0 if finding.effect is None else finding.effect.count for finding in findings]
+    inside = [finding.effect is not None and low <= finding.effect.value <= high
+              for finding, (low, high) in zip(findings, ranges, strict=True)]  # fmt: skip
+    alone = {place: _two_sided(z[place]) for place in tested}
+    tests = [
+        alone[place]
+        if first is None
+        else _at_any_look(z[place], counts[place], first[place], inside=inside[place])
+        for place in tested
+    ]
+    p = dict(zip(tested, holm(tests), strict=True))
+    level = LEVEL / max(1, len(tested))
     judged = []
-    for place, (finding, (low, high)) in enumerate(zip(findings, ranges, strict=True)):
+    for place, finding in enumerate(findings):
         judgement = Judgement(
             verdict=Verdict.NOT_DECIDABLE,
             counts=finding.counts,
@@ -136,16 +183,21 @@ def judge(findings: Sequence[Finding], ranges: Sequence[tuple[float, float]]) ->
         )
         if place in p and finding.effect is not None:
             undecided = p[place] >= LEVEL
-            inside = low <= finding.effect.value <= high
-            decided = Verdict.REPRODUCED if inside else Verdict.CONTRADICTED
-            more = (wanted_z / z[place]) ** 2 if z[place] else math.inf
+            decided = Verdict.REPRODUCED if inside[place] else Verdict.CONTRADICTED
+            needed = math.inf
+            if first is not None:
+                needed = anytime_count(z[place], counts[place], level / _HALVES)
+            elif z[place]:
+                needed = counts[place] * (z_of(1.0 - level) / z[place]) ** 2
             judgement = replace(
                 judgement,
                 verdict=Verdict.UNDECIDED if undecided else decided,
                 effect=finding.effect,
                 why="",
                 p=p[place],
-                needed=finding.effect.count * more if undecided else 0.0,
+                p_alone=alone[place],
+                needed=needed if undecided else 0.0,
+                bounds=None if first is None else anytime_interval(finding.effect),
             )
         judged.append(judgement)
     return judged
@@ -169,6 +221,13 @@ def _z(effect: Interval | None, low: float, high: float) -> float:
         _Z * distance / side if side else math.inf if distance else 0.0
         for distance, side in distances
     )
+
+
+def _at_any_look(z: float, count: int, first: FirstLook | None, *, inside: bool) -> float:
+    p = anytime_p(z, count)
+    if first is not None and first.inside is inside:
+        p = min(p, first.p)
+    return min(1.0, _HALVES * p)
 
 
 def _two_sided(z: float) -> float:

@@ -14,8 +14,8 @@ from mavfi_cli.campaigns.begin import begin, opened, rounds_of, stopped
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.missions import Sampling
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import fly_missing
-from mavfi_cli.campaigns.specification import Stop
+from mavfi_cli.campaigns.run import Options, fly_missing
+from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.campaigns.specification_file import parse_spec
 from mavfi_cli.campaigns.strata import coarsened, stratum_of
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
@@ -89,12 +89,10 @@ def flown(spec, folder, options, spectator=None):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The folder of a campaign, with its draws and losses."""
-    from conftest import Campaign
-
     folder = tmp_path_factory.mktemp("strata") / "campaign"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
-        return folder, *flown(SPEC, folder, Campaign(folder).options)
+        return folder, *flown(SPEC, folder, Options(jobs=2, keep=Keep.NONE, task="fake_task"))
 
 
 def test_draws_depend_on_neither_workers_nor_a_kill(whole, campaign):
@@ -113,9 +111,9 @@ def test_the_weights_of_a_round_add_up_and_harm_gets_more_missions(whole):
     for number in (0, 1):
         mine = [draw for draw in bare if draw.round == number]
         assert sum(draw.weight for draw in mine) == pytest.approx(len(mine)) == 25
-    later = Counter(draw.stratum.partition(",")[0] for draw in bare if draw.round == 1)
-    first = Counter(draw.stratum.partition(",")[0] for draw in bare if draw.round == 0)
-    assert later["exponent"] > first["exponent"]
+    weights = {draw.stratum: draw.weight for draw in bare if draw.round == 1}
+    assert all(weight < 1.0 for name, weight in weights.items() if name.startswith("exponent"))
+    assert weights["mantissa, upper half"] > 1.0
 
 
 def test_detectors_fly_the_same_faults(whole):
@@ -142,7 +140,8 @@ def test_status_says_so_and_gives_an_effective_number(whole):
     assert "stratified sample" in "\n".join(table.notes)
     golden, struck, _ = report.summary.cells
     assert golden.success.effective is None
-    assert struck.success.effective > struck.success.total == 50
+    assert struck.success.total == 50
+    assert 30 < struck.success.effective < 100  # small strata doubt what they hold
     assert struck.every.share == pytest.approx(1.0 - 11 / 128, abs=0.05)
 
 

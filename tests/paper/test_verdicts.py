@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from mavfi_cli.paper.verdicts import Finding, Verdict, judge, margin
+from mavfi_cli.paper.claims import excludes
+from mavfi_cli.paper.verdicts import Finding, FirstLook, Verdict, judge, margin
 from mavfi_cli.stats.shares import Interval, wilson
 
 FREE = (-math.inf, math.inf)
@@ -81,3 +82,31 @@ def test_a_margin_lets_a_family_of_four_come_out_either_way(missions):
     assert verdicts(round(4 * least * missions), least, UP) == {Verdict.REPRODUCED}
     assert verdicts(0, -least, least) == {Verdict.REPRODUCED}
     assert verdicts(round(4 * least * missions), -least, least) == {Verdict.CONTRADICTED}
+
+
+def test_half_of_the_level_is_for_the_first_look_and_half_for_all_looks():
+    finding, ends = between(0.1, 0.2), (0.05, UP)
+    fixed = alone(finding, *ends)
+    (look,) = judge([finding], [ends], [None])
+    assert fixed.verdict is Verdict.REPRODUCED
+    assert look.p > 2 * fixed.p
+    assert (fixed.bounds, look.p_alone) == (None, fixed.p)
+    assert look.bounds.low < 0.1 < 0.2 < look.bounds.high
+    (first,) = judge([finding], [ends], [FirstLook(p=fixed.p, inside=True)])
+    assert first.p == pytest.approx(2 * fixed.p)
+    (other,) = judge([finding], [ends], [FirstLook(p=fixed.p, inside=False)])
+    assert other.p == look.p
+
+
+def test_a_settled_claim_needs_more_missions():
+    finding = between(0.0, 0.2, count=100)
+    (look,) = judge([finding], [(0.05, UP)], [None])
+    assert look.needed > 2 * alone(finding, 0.05, UP).needed
+
+
+def test_bounds_within_the_size_on_both_sides_exclude_an_effect_of_it():
+    bounds = between(-0.003, 0.008).effect
+    assert excludes(0.009, bounds)
+    assert not excludes(0.007, bounds)
+    assert not excludes(None, bounds)
+    assert not excludes(0.009, None)

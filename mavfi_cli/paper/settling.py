@@ -1,0 +1,331 @@
+"""Settles claims: flies missions where they are undecided, until each is decided or time is over.
+
+Every look judges all claims anew, by tests that hold at any look (`stats.sequences`). The next
+missions are those of the claim that the fewest seconds would decide, if its effect stays as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+
+import pyarrow as pa
+
+from mavfi_cli.analysis.flights import SETTLING, flights
+from mavfi_cli.analysis.kernels import KERNELS, IsolatedKernel, KernelSummary
+from mavfi_cli.analysis.pairs import Fate, Flights
+from mavfi_cli.campaigns.ledger import Ledger
+from mavfi_cli.campaigns.missions import PlannedMission, changes_of, kind_of
+from mavfi_cli.campaigns.progress import Spectator, duration
+from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
+from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.paper.claims import judged
+from mavfi_cli.paper.flying import opened
+from mavfi_cli.paper.items import BY_NAME, KERNELS_FOLDER, FlightsPlan, Source, key_of
+from mavfi_cli.paper.settled import SettledClaim, Settling
+from mavfi_cli.paper.verdicts import Claim, FirstLook, Judgement, Verdict
+
+BATCH = 10  # repetitions between two looks
+_MOST = 100_000  # repetitions of a claim's missions
+_SEARCHED = 100  # of them at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenClaim:
+    """An undecided claim, and what would decide it.
+
+    Attributes:
+        judgement: its judgement so far.
+        kinds: kinds of missions that it counts.
+        missions, seconds: missions that would decide it if the effect stays as it is, and their
+            wall time; infinite if no number decides.
+        repetition_s: wall time of one more repetition of its missions, s.
+    """
+
+    claim: Claim
+    judgement: Judgement
+    kinds: frozenset[str]
+    missions: float
+    seconds: float
+    repetition_s: float
+
+    @property
+    def summary(self) -> str:
+        """What would decide the claim, in one line."""
+        if math.isinf(self.missions):
+            return f"{self.claim.name}: no number of missions decides it, if the effect stays"
+        return (
+            f"{self.claim.name}: {self.missions:,.0f} missions, about {duration(self.seconds)}, "
+            "if the effect stays"
+        )
+
+
+def require_settleable(plan: FlightsPlan) -> None:
+    """Refuse a list that cannot grow.
+
+    Raises:
+        ConfigError: the items fly no missions, or the place holds an export.
+    """
+    if plan.out.suffix == ".parquet" or plan.folder.is_file():
+        raise ConfigError("the list of an export is frozen: no mission can be added", path=plan.out)
+    if not any(item.source is Source.FLIGHTS for item in plan.items):
+        names = ", ".join(item.name for item in plan.items)
+        raise ConfigError(f"must be given an item that flies missions, got {names}", key="settle")
+
+
+def settle(
+    plan: FlightsPlan,
+    options: Options,
+    spectator: Spectator,
+    hours: float | None,
+) -> list[str]:
+    """Fly missions until the claims of the items are decided, or the time is over.
+
+    Args:
+        plan: a plan whose missions have been flown.
+        hours: most wall time, h; None has no limit.
+
+    Returns:
+        A line for each claim that was undecided: how it was decided, or what cannot be told.
+
+    Raises:
+        ConfigError: the folder holds another campaign, or began with other versions.
+        MavfiError: a mission cannot be flown.
+    """
+    begun, limit_s = time.monotonic(), math.inf if hours is None else 3600.0 * hours
+    jobs = options.jobs or len(os.sched_getaffinity(0))
+    with opened(plan) as ledger:
+        look = _Look(plan, jobs)
+        settling = Settling.of(ledger.meta(SETTLING)) or Settling(first=look.first(ledger))
+        before: dict[str, OpenClaim] = {}
+        looked, lines = False, list[str]()
+        while True:
+            still = look.open_claims(ledger, settling)
+            settling = _stored(ledger, settling, look)
+            if not looked:
+                for line in _cost(still, limit_s):
+                    spectator.on_note(line)
+            looked = True
+            for line in _decided(before, look.judgements):
+                spectator.on_note(line)
+                lines.append(line)
+            before = {entry.claim.name: entry for entry in still}
+            left_s = limit_s - (time.monotonic() - begun)
+            flyable = [
+                entry
+                for entry in still
+                if entry.kinds and entry.repetition_s <= left_s and not entry.judgement.without_size
+            ]
+            if not flyable:
+                break
+            chosen = min(flyable, key=lambda entry: (entry.seconds, entry.repetition_s))
+            repetitions = int(min(BATCH, max(1.0, left_s / max(chosen.repetition_s, 1e-9))))
+            since = time.monotonic()
+            flown = _fly(plan, ledger, chosen, repetitions, options, spectator)
+            name, seconds = chosen.claim.name, time.monotonic() - since
+            own = settling.claims.get(name, SettledClaim())
+            own = replace(own, looks=own.looks + 1, missions=own.missions + flown,
+                          seconds=own.seconds + seconds)  # fmt: skip
+            claims = {**settling.claims, name: own}
+            settling = replace(settling, looks=settling.looks + 1, claims=claims)
+    return [*lines, *map(_undecided, still)]
+
+
+def _stored(ledger: Ledger, settling: Settling, look: _Look) -> Settling:
+    """Store what was flown, with the verdict on each claim."""
+    claims = {
+        name: replace(own, verdict=look.judgements[name].verdict.value)
+        for name, own in settling.claims.items()
+        if name in look.judgements
+    }
+    settling = replace(settling, claims={**settling.claims, **claims})
+    ledger.set_meta({SETTLING: settling.to_json()})
+    return settling
+
+
+class _Look:
+    """Judges the claims of a plan, and finds the missions that they count.
+
+    Attributes:
+        judgements: the judgement of every claim at the last look, by name.
+    """
+
+    def __init__(self, plan: FlightsPlan, jobs: int) -> None:
+        self._plan, self._jobs = plan, jobs
+        self._kinds: dict[str, frozenset[str]] = {}
+        self.judgements: dict[str, Judgement] = {}
+        path = plan.out / KERNELS_FOLDER / KERNELS
+        summary = KernelSummary.read(path).kernels if path.is_file() else ()
+        self._kernels = {kernel.name: kernel for kernel in summary}
+
+    def first(self, ledger: Ledger) -> dict[str, dict[str, FirstLook]]:
+        """Look at all claims before any mission is added."""
+        stack = self._plan.stack
+        return {
+            entry.claim.name: {
+                fate.value: FirstLook(
+                    p=own.p_alone,
+                    inside=entry.claim.low <= own.effect.value <= entry.claim.high,
+                )
+                for fate, own in entry.judgements.get(stack, {}).items()
+                if own.effect is not None
+            }
+            for entry in judged({stack: self._flown(flights(ledger))}, self._kernels)
+        }
+
+    def _flown(self, table: pa.Table) -> Flights:
+        """The flights that claims count."""
+        whole = Flights.of(table)
+        return whole.chosen(stack=self._plan.stack, as_paper=True, at=(None, "random"))
+
+    def open_claims(self, ledger: Ledger, settling: Settling) -> list[OpenClaim]:
+        """Return the undecided claims of the items that missions may decide."""
+        stack = self._plan.stack
+        table = flights(ledger)
+        flown = self._flown(table)
+        verdicts = judged({stack: flown}, self._kernels, {stack: settling})
+        names = {item.name for item in self._plan.items}
+        own = [
+            (entry.claim, entry.judgements[stack][Fate.ALL])
+            for entry in verdicts
+            if entry.claim.item in names and stack in entry.judgements
+        ]
+        self.judgements = {claim.name: judgement for claim, judgement in own}
+        rows = zip(table["changes"].to_pylist(), table["wall_s"].to_pylist(), strict=True)
+        walls: dict[str, list[float]] = {}
+        for changes, wall_s in rows:
+            walls.setdefault(_kind(changes), []).append(wall_s)
+        return [
+            self._open(claim, judgement, flown, walls)
+            for claim, judgement in own
+            if judgement.verdict is Verdict.UNDECIDED and BY_NAME[claim.item].preset
+        ]
+
+    def _open(
+        self, claim: Claim, judgement: Judgement, flown: Flights,
+        walls: Mapping[str, Sequence[float]],
+    ) -> OpenClaim:  # fmt: skip
+        planned = [_kind_of(mission) for mission in self._plan.kinds(BY_NAME[claim.item])]
+        if claim.name not in self._kinds:
+            self._kinds[claim.name] = counted_kinds(claim, flown, planned, self._kernels)
+        kinds = self._kinds[claim.name]
+        assert judgement.effect is not None
+        missions = Counter(planned)
+        repetition_s = math.fsum(
+            missions[kind] * fmean(walls.get(kind) or [0.0]) / self._jobs for kind in kinds
+        )
+        flown_missions = sum(len(walls.get(kind, ())) for kind in kinds)
+        share = judgement.needed / judgement.effect.count - 1.0
+        more = max(1.0, share * flown_missions) if kinds else math.inf
+        one = sum(missions[kind] for kind in kinds) or 1
+        return OpenClaim(
+            claim=claim, judgement=judgement, kinds=kinds, missions=more,
+            seconds=more / one * repetition_s if kinds else math.inf, repetition_s=repetition_s,
+        )  # fmt: skip
+
+
+def _kind_of(mission: PlannedMission) -> str:
+    return kind_of(changes_of(mission.config), ("seed",))
+
+
+def _kind(changes: str) -> str:
+    return kind_of(json.loads(changes), ("seed",))
+
+
+def counted_kinds(
+    claim: Claim,
+    flown: Flights,
+    planned: Iterable[str],
+    kernels: Mapping[str, IsolatedKernel],
+) -> frozenset[str]:
+    """The planned kinds of missions on which a claim's effect depends.
+
+    A kind counts if the effect is another one without its flights.
+    """
+    kinds = [_kind(changes) for changes in flown["changes"]]
+    whole = claim.find(flown, kernels)
+    return frozenset(
+        kind
+        for kind in set(planned).intersection(kinds)
+        if claim.find(flown.without(own == kind for own in kinds), kernels) != whole
+    )
+
+
+def _fly(
+    plan: FlightsPlan,
+    ledger: Ledger,
+    entry: OpenClaim,
+    repetitions: int,
+    options: Options,
+    spectator: Spectator,
+) -> int:
+    """Fly further repetitions of a claim's missions; return their number."""
+    over = {number for number, _ in ledger.fates()}
+    flown = {changes for number, _, _, changes in ledger.rows() if number in over}
+    first = _first_missing(plan, entry, flown)
+    wanted = [
+        mission
+        for mission, _ in plan.numbered(BY_NAME[entry.claim.item], first, first + repetitions)
+        if _kind_of(mission) in entry.kinds and key_of(mission) not in flown
+    ]
+    store_plan(ledger, wanted, append=True)
+    keys = {key_of(mission) for mission in wanted}
+    numbers = frozenset(n for n, _, _, changes in ledger.rows() if changes in keys)
+    fly_missing(ledger, replace(options, only=numbers, planned=numbers), spectator)
+    return len(numbers)
+
+
+def _first_missing(plan: FlightsPlan, entry: OpenClaim, flown: Collection[str]) -> int:
+    """The first repetition of which a mission has not flown."""
+    item = BY_NAME[entry.claim.item]
+    for first in range(0, _MOST, _SEARCHED):
+        for mission, repetition in plan.numbered(item, first, first + _SEARCHED):
+            if _kind_of(mission) in entry.kinds and key_of(mission) not in flown:
+                return repetition
+    return _MOST
+
+
+# Words --------------------------------------------------------------------------------------------
+
+
+def _cost(still: Sequence[OpenClaim], limit_s: float) -> list[str]:
+    """What deciding the open claims costs, if all effects stay as they are."""
+    if not still:
+        return ["every claim that missions can decide is decided"]
+    some = [entry for entry in still if not math.isinf(entry.seconds)]
+    lines = [f"{len(still)} claims are undecided:", *(f"  {entry.summary}" for entry in still)]
+    whole = sum(entry.seconds for entry in some)
+    given = "no limit" if math.isinf(limit_s) else f"at most {duration(limit_s)}"
+    lines.append(
+        f"at most {duration(whole)} for {len(some)} of them on this machine; {given} is given"
+    )
+    return lines
+
+
+def _decided(before: Mapping[str, OpenClaim], now: Mapping[str, Judgement]) -> list[str]:
+    return [
+        f"{name}: {now[name].verdict.value}{_bounds(entry.claim, now[name])}"
+        for name, entry in before.items()
+        if now[name].verdict is not Verdict.UNDECIDED
+    ]
+
+
+def _undecided(entry: OpenClaim) -> str:
+    return f"{entry.claim.name}: cannot tell{_bounds(entry.claim, entry.judgement)}"
+
+
+def _bounds(claim: Claim, judgement: Judgement) -> str:
+    """The bounds of an effect, and whether they exclude the claim's size."""
+    effect, bounds = judgement.effect, judgement.bounds
+    if effect is None or bounds is None:
+        return f" ({judgement.why})"
+    scale, unit = (1.0, "") if claim.unit == "number" else (100.0, f" {claim.unit}")
+    low, high = (f"{scale * end:.3g}" for end in (bounds.low, bounds.high))
+    size = "; no effect of the claim's size" if judgement.without_size else ""
+    return f"; with n = {effect.count:,} the effect lies between {low} and {high}{unit}{size}"
