@@ -46,6 +46,7 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
     from mavfi_cli.campaigns.run import Options
     from mavfi_cli.cli.progress import missions_view
     from mavfi_cli.core.files import plain
+    from mavfi_cli.paper.flying import opened
     from mavfi_cli.paper.flying import reproduce as run
     from mavfi_cli.paper.items import FlightsPlan, items_named
     from mavfi_cli.paper.settling import require_settleable, settle
@@ -65,7 +66,8 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
         run(plan, flying, view, lambda forecast: view.on_note(forecast.summary))
         settled = None
         if options["settle"]:
-            settled = settle(plan, flying, view, options["hours"])
+            with opened(plan) as ledger:
+                settled = settle(plan, ledger, flying, view, options["hours"])
     if as_json:
         summary = {"folder": plan.folder, "stack": plan.stack, "scale": plan.scale,
                 "items": [asdict(table) for table in tables(plan)],

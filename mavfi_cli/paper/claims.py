@@ -18,13 +18,13 @@ from typing import Any
 from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.paper.measures import MEASURES, NOT_FLOWN, OF_KERNELS, WITHOUT_FATES, Kernels
-from mavfi_cli.paper.settled import Settling
 from mavfi_cli.paper.verdicts import (
     ISOLATED,
     Claim,
     Finding,
     JudgedClaim,
     Judgement,
+    Settling,
     Verdict,
     judge,
     margin,

@@ -26,10 +26,8 @@ from mavfi_cli.campaigns.progress import Spectator, duration
 from mavfi_cli.campaigns.run import Options, fly_missing, store_plan
 from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.paper.claims import judged
-from mavfi_cli.paper.flying import opened
 from mavfi_cli.paper.items import BY_NAME, KERNELS_FOLDER, FlightsPlan, Source, key_of
-from mavfi_cli.paper.settled import SettledClaim, Settling
-from mavfi_cli.paper.verdicts import Claim, FirstLook, Judgement, Verdict
+from mavfi_cli.paper.verdicts import Claim, FirstLook, Judgement, SettledClaim, Settling, Verdict
 
 BATCH = 10  # repetitions between two looks
 _MOST = 100_000  # repetitions of a claim's missions
@@ -81,6 +79,7 @@ def require_settleable(plan: FlightsPlan) -> None:
 
 def settle(
     plan: FlightsPlan,
+    ledger: Ledger,
     options: Options,
     spectator: Spectator,
     hours: float | None,
@@ -89,51 +88,50 @@ def settle(
 
     Args:
         plan: a plan whose missions have been flown.
+        ledger: its ledger, open for writing.
         hours: most wall time, h; None has no limit.
 
     Returns:
         A line for each claim that was undecided: how it was decided, or what cannot be told.
 
     Raises:
-        ConfigError: the folder holds another campaign, or began with other versions.
         MavfiError: a mission cannot be flown.
     """
     begun, limit_s = time.monotonic(), math.inf if hours is None else 3600.0 * hours
     jobs = options.jobs or len(os.sched_getaffinity(0))
-    with opened(plan) as ledger:
-        look = _Look(plan, jobs)
-        settling = Settling.of(ledger.meta(SETTLING)) or Settling(first=look.first(ledger))
-        before: dict[str, OpenClaim] = {}
-        looked, lines = False, list[str]()
-        while True:
-            still = look.open_claims(ledger, settling)
-            settling = _stored(ledger, settling, look)
-            if not looked:
-                for line in _cost(still, limit_s):
-                    spectator.on_note(line)
-            looked = True
-            for line in _decided(before, look.judgements):
+    look = _Look(plan, jobs)
+    settling = Settling.of(ledger.meta(SETTLING)) or Settling(first=look.first(ledger))
+    before: dict[str, OpenClaim] = {}
+    looked, lines = False, list[str]()
+    while True:
+        still = look.open_claims(ledger, settling)
+        settling = _stored(ledger, settling, look)
+        if not looked:
+            for line in _cost(still, limit_s):
                 spectator.on_note(line)
-                lines.append(line)
-            before = {entry.claim.name: entry for entry in still}
-            left_s = limit_s - (time.monotonic() - begun)
-            flyable = [
-                entry
-                for entry in still
-                if entry.kinds and entry.repetition_s <= left_s and not entry.judgement.without_size
-            ]
-            if not flyable:
-                break
-            chosen = min(flyable, key=lambda entry: (entry.seconds, entry.repetition_s))
-            repetitions = int(min(BATCH, max(1.0, left_s / max(chosen.repetition_s, 1e-9))))
-            since = time.monotonic()
-            flown = _fly(plan, ledger, chosen, repetitions, options, spectator)
-            name, seconds = chosen.claim.name, time.monotonic() - since
-            own = settling.claims.get(name, SettledClaim())
-            own = replace(own, looks=own.looks + 1, missions=own.missions + flown,
-                          seconds=own.seconds + seconds)  # fmt: skip
-            claims = {**settling.claims, name: own}
-            settling = replace(settling, looks=settling.looks + 1, claims=claims)
+        looked = True
+        for line in _decided(before, look.judgements):
+            spectator.on_note(line)
+            lines.append(line)
+        before = {entry.claim.name: entry for entry in still}
+        left_s = limit_s - (time.monotonic() - begun)
+        flyable = [
+            entry
+            for entry in still
+            if entry.kinds and entry.repetition_s <= left_s and not entry.judgement.without_size
+        ]
+        if not flyable:
+            break
+        chosen = min(flyable, key=lambda entry: (entry.seconds, entry.repetition_s))
+        repetitions = int(min(BATCH, max(1.0, left_s / max(chosen.repetition_s, 1e-9))))
+        since = time.monotonic()
+        flown = _fly(plan, ledger, chosen, repetitions, options, spectator)
+        name, seconds = chosen.claim.name, time.monotonic() - since
+        own = settling.claims.get(name, SettledClaim())
+        own = replace(own, looks=own.looks + 1, missions=own.missions + flown,
+                      seconds=own.seconds + seconds)  # fmt: skip
+        claims = {**settling.claims, name: own}
+        settling = replace(settling, looks=settling.looks + 1, claims=claims)
     return [*lines, *map(_undecided, still)]
 
 

@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import MavfiError, RecordError
 from mavfi_cli.core.files import file_digest, reading
 from mavfi_cli.core.installed import installed_versions, version_differences
 from mavfi_cli.paper.items import FlightsPlan
-from mavfi_cli.paper.settled import Settling
+from mavfi_cli.paper.verdicts import Settling
 
 _EXPORT, _SPEC = ".parquet", ".toml"
 _OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries

@@ -27,9 +27,8 @@ from mavfi_cli.paper.items import (
     printed,
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
-from mavfi_cli.report.campaign import BY_WEIGHT
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
-from mavfi_cli.report.setting_table import SettingColumns
+from mavfi_cli.report.setting_table import BY_WEIGHT, SettingColumns
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 

@@ -33,15 +33,11 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import Json
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.setting_table import SettingColumns, SettingRow
+from mavfi_cli.report.setting_table import BY_WEIGHT, SettingColumns, SettingRow
 from mavfi_cli.report.table import number, percent, rate, spread
 from mavfi_cli.stats.paired import WorstCase
 from mavfi_cli.stats.shares import Interval, Share
 
-BY_WEIGHT = (
-    "stratified sample: rates and means are by weight; effective n uniform missions would give the "
-    "same interval"
-)
 _STAGES = tuple(stage.value for stage in Stage)
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),

@@ -9,6 +9,11 @@ from typing import NamedTuple
 from mavfi_cli.campaigns.missions import Label, Labels, label_text, label_value, ordered
 from mavfi_cli.report.table import WIDTH, Table
 
+BY_WEIGHT = (
+    "stratified sample: rates and means are by weight; effective n uniform missions would give the "
+    "same interval"
+)
+
 
 class SettingRow(NamedTuple):
     """The labels and the name of a setting with its cells of a table."""

@@ -15,10 +15,9 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.paper import flying, settling
 from mavfi_cli.paper.claims import judged
 from mavfi_cli.paper.items import FlightsPlan, items_named
-from mavfi_cli.paper.settled import SettledClaim, Settling
 from mavfi_cli.paper.settling import require_settleable, settle
 from mavfi_cli.paper.sources import Evidence
-from mavfi_cli.paper.verdicts import Verdict
+from mavfi_cli.paper.verdicts import SettledClaim, Settling, Verdict
 
 TASK = Options(jobs=2, task="fake_task")
 SCALE = 0.05
@@ -41,6 +40,11 @@ class Notes(Spectator):
         self.lines.append(text)
 
 
+def settled(plan, spectator, hours):
+    with flying.opened(plan) as ledger:
+        return settle(plan, ledger, TASK, spectator, hours)
+
+
 def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
     """No made-up fault does harm, which contradicts that fields of a number differ in harm."""
     monkeypatch.setattr(settling, "BATCH", 150)
@@ -49,7 +53,7 @@ def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
     with Ledger(plan.folder) as ledger:
         before = ledger.over()
     notes = Notes()
-    lines = settle(plan, TASK, notes, None)
+    lines = settled(plan, notes, None)
     assert [line.partition(";")[0] for line in lines] == ["fig9-fields: contradicted"]
     assert "the effect lies between" in lines[0]
     assert notes.lines[0] == "1 claims are undecided:"
@@ -62,7 +66,7 @@ def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
     own = stored.claims["fig9-fields"]
     assert (own.missions, own.verdict) == (added, "contradicted")
     assert own.looks == stored.looks
-    assert settle(plan, TASK, Notes(), 0.001) == []  # it is decided
+    assert settled(plan, Notes(), 0.001) == []  # it is decided
     pq.write_table(table, tmp_path / "settled.parquet")
     evidence = Evidence.gather([tmp_path / "settled.parquet"])
     claims = judged({"mavbench": evidence.flights("mavbench")}, {}, evidence.settled)
@@ -79,7 +83,7 @@ def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
 def test_time_that_is_too_short_flies_nothing_and_says_what_it_cannot_tell(tmp_path):
     plan = FlightsPlan(items=items_named(["fig9"]), stack="mavbench", scale=SCALE, out=tmp_path)
     flying.reproduce(plan, TASK, Spectator(), lambda _: None)
-    (line,) = settle(plan, TASK, Notes(), 1e-9)
+    (line,) = settled(plan, Notes(), 1e-9)
     assert line.startswith("fig9-fields: cannot tell; with n = ")
 
 
