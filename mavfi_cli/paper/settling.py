@@ -35,7 +35,7 @@ _SEARCHED = 100  # of them at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OpenClaim:
+class _OpenClaim:
     """An undecided claim, and what would decide it.
 
     Attributes:
@@ -101,7 +101,7 @@ def settle(
     jobs = options.jobs or len(os.sched_getaffinity(0))
     look = _Look(plan, jobs)
     settling = Settling.of(ledger.meta(SETTLING)) or Settling(first=look.first(ledger))
-    before: dict[str, OpenClaim] = {}
+    before: dict[str, _OpenClaim] = {}
     looked, lines = False, list[str]()
     while True:
         still = look.open_claims(ledger, settling)
@@ -182,7 +182,7 @@ class _Look:
         whole = Flights.of(table)
         return whole.chosen(stack=self._plan.stack, as_paper=True, at=(None, "random"))
 
-    def open_claims(self, ledger: Ledger, settling: Settling) -> list[OpenClaim]:
+    def open_claims(self, ledger: Ledger, settling: Settling) -> list[_OpenClaim]:
         """Return the undecided claims of the items that missions may decide."""
         stack = self._plan.stack
         table = flights(ledger)
@@ -208,10 +208,10 @@ class _Look:
     def _open(
         self, claim: Claim, judgement: Judgement, flown: Flights,
         walls: Mapping[str, Sequence[float]],
-    ) -> OpenClaim:  # fmt: skip
+    ) -> _OpenClaim:  # fmt: skip
         planned = [_kind_of(mission) for mission in self._plan.kinds(BY_NAME[claim.item])]
         if claim.name not in self._kinds:
-            self._kinds[claim.name] = counted_kinds(claim, flown, planned, self._kernels)
+            self._kinds[claim.name] = _counted_kinds(claim, flown, planned, self._kernels)
         kinds = self._kinds[claim.name]
         assert judgement.effect is not None
         missions = Counter(planned)
@@ -222,7 +222,7 @@ class _Look:
         share = judgement.needed / judgement.effect.count - 1.0
         more = max(1.0, share * flown_missions) if kinds else math.inf
         one = sum(missions[kind] for kind in kinds) or 1
-        return OpenClaim(
+        return _OpenClaim(
             claim=claim, judgement=judgement, kinds=kinds, missions=more,
             seconds=more / one * repetition_s if kinds else math.inf, repetition_s=repetition_s,
         )  # fmt: skip
@@ -236,7 +236,7 @@ def _kind(changes: str) -> str:
     return kind_of(json.loads(changes), ("seed",))
 
 
-def counted_kinds(
+def _counted_kinds(
     claim: Claim,
     flown: Flights,
     planned: Iterable[str],
@@ -258,7 +258,7 @@ def counted_kinds(
 def _fly(
     plan: FlightsPlan,
     ledger: Ledger,
-    entry: OpenClaim,
+    entry: _OpenClaim,
     repetitions: int,
     options: Options,
     spectator: Spectator,
@@ -279,7 +279,7 @@ def _fly(
     return len(numbers)
 
 
-def _first_missing(plan: FlightsPlan, entry: OpenClaim, flown: Collection[str]) -> int:
+def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str]) -> int:
     """The first repetition of which a mission has not flown."""
     item = BY_NAME[entry.claim.item]
     for first in range(0, _MOST, _SEARCHED):
@@ -292,7 +292,7 @@ def _first_missing(plan: FlightsPlan, entry: OpenClaim, flown: Collection[str]) 
 # Words --------------------------------------------------------------------------------------------
 
 
-def _cost(still: Sequence[OpenClaim], limit_s: float) -> list[str]:
+def _cost(still: Sequence[_OpenClaim], limit_s: float) -> list[str]:
     """What deciding the open claims costs, if all effects stay as they are."""
     if not still:
         return ["every claim that missions can decide is decided"]
@@ -306,7 +306,7 @@ def _cost(still: Sequence[OpenClaim], limit_s: float) -> list[str]:
     return lines
 
 
-def _decided(before: Mapping[str, OpenClaim], now: Mapping[str, Judgement]) -> list[str]:
+def _decided(before: Mapping[str, _OpenClaim], now: Mapping[str, Judgement]) -> list[str]:
     return [
         f"{name}: {now[name].verdict.value}{_bounds(entry.claim, now[name])}"
         for name, entry in before.items()
@@ -314,7 +314,7 @@ def _decided(before: Mapping[str, OpenClaim], now: Mapping[str, Judgement]) -> l
     ]
 
 
-def _undecided(entry: OpenClaim) -> str:
+def _undecided(entry: _OpenClaim) -> str:
     return f"{entry.claim.name}: cannot tell{_bounds(entry.claim, entry.judgement)}"
 
 
