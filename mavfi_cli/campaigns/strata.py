@@ -33,7 +33,6 @@ from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES, BitType, Field
 from mavfi_cli.fi.fault import When
 from mavfi_cli.fi.injector import rehearsed
-from mavfi_cli.mission.measures import record_of
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.strata import allocate, rounded, spread
@@ -323,8 +322,8 @@ class Rounds:
         ]
         found: dict[MissionConfig, int] = {}
         for result in self._ledger.results(numbers):
-            kernels = record_of(result.result).kernels
-            found[result.mission.config] = int(kernels.get(_PLANNER, {}).get("invocations", 0))
+            planner = result.flight.kernels.get(_PLANNER)
+            found[result.mission.config] = 0 if planner is None else planner.invocations
         return found
 
     def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
