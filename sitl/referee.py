@@ -128,12 +128,12 @@ class Referee:
         position = np.array(position_enu_m, dtype=np.float64)
         quaternion = np.array(quaternion_flu_enu, dtype=np.float64)
         velocity = np.array(velocity_enu_mps, dtype=np.float64)
-        if not math.isfinite(float(position.sum() + quaternion.sum())):
+        if not all(map(math.isfinite, (*position.tolist(), *quaternion.tolist()))):
             raise VehicleProcessError(f"at {stamp_s:.3f} s the vehicle's state is not finite")
         pose = _Pose(stamp_s, position, quaternion, velocity)
         before, self._last = self._last or pose, pose
         if armed:
-            self.distance_m += math.dist(before.position, position)
+            self.distance_m += math.dist(before.position.tolist(), position.tolist())
         may_land = may_land or not armed
         crashed = self._crashes(before.velocity, pose, on_ground=on_ground, may_land=may_land)
         collision = None if self.collision is not None else self._hit(before, pose, crashed=crashed)

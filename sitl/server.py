@@ -90,13 +90,13 @@ class Client(Peer):
 
         Raises LinkLost if the peer is gone.
         """
-        with self._simulation.wall.measure("wait"):
+        with self._simulation.wall.sample("wait"):
             data = self.transport.receive(timeout_s)
         return self.take(data) if data else []
 
     def take(self, data: bytes) -> list[Any]:
         """Handle received bytes. Return the handled messages."""
-        with self._simulation.wall.measure("link"):
+        with self._simulation.wall.sample("link"):
             messages = self._codec.decode(data, datagram=self.transport.datagram)
             for message in messages:
                 if message.get_msgId() in _COMMANDS:
@@ -111,7 +111,7 @@ class Client(Peer):
 
         Return False if none is due.
         """
-        with self._simulation.wall.measure("link"):
+        with self._simulation.wall.sample("link"):
             due = self._simulation.camera_due
             if not self._wants_frames:
                 due = [message for message in due if message.get_msgId() not in _FRAMES]

@@ -104,6 +104,7 @@ class Simulation:
         Args:
             between: Called with the stamp of every physics step within the tick, us.
         """
+        self.wall.begin_tick()
         self._fly(between)
         self.stamp_us += TICK_US
         self._look()
@@ -113,10 +114,11 @@ class Simulation:
         assert isinstance(autopilot, Autopilot)
         autopilot.fly()
         setpoint, motors_on = autopilot.snapshot.setpoint, autopilot.snapshot.motors_on
-        for step in range(1, STEPS_A_TICK + 1):
+        count = STEPS_A_TICK if between is None else 1
+        for step in range(count, STEPS_A_TICK + 1, count):
             if self._wreck is None:
-                with self.wall.measure("physics"):
-                    vehicle.step(setpoint, motors_on)
+                with self.wall.sample("physics"):
+                    vehicle.step(setpoint, motors_on, count)
             if between is not None and step < STEPS_A_TICK:
                 between(self.stamp_us + step * STEP_US)
 
@@ -150,10 +152,10 @@ class Simulation:
         truth = self._wreck or self.vehicle.truth
         position = enu_from_ned(truth.position_ned_m)
         quaternion = flu_enu_from_frd_ned(truth.quaternion_frd_ned)
-        with self.wall.measure("referee"):
+        with self.wall.sample("referee"):
             self._judge(truth, position, quaternion)
         autopilot.observe(self.stamp_us, truth)
-        with self.wall.measure("camera"):
+        with self.wall.sample("camera"):
             self.camera_due = self._photograph(position, quaternion)
 
     def _photograph(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Any]:

@@ -134,6 +134,7 @@ class _ActivePlan:
     def __init__(self, params: PilotParams) -> None:
         self._params = params
         self.checked: Trajectory | None = None
+        self._located: tuple[Trajectory | None, float, int] = (None, 0.0, 0)
         self.stand()
 
     def stand(self) -> None:
@@ -176,7 +177,15 @@ class _ActivePlan:
     @property
     def waypoint(self) -> int:
         """Index of the current waypoint; 0 without a trajectory."""
-        return 0 if self.trajectory is None else waypoint_index(self.trajectory, self.time_s)
+        return 0 if self.trajectory is None else self.waypoint_at(self.trajectory, self.time_s)
+
+    def waypoint_at(self, trajectory: Trajectory, time_s: float) -> int:
+        """Return the index of a trajectory's waypoint at a time. The newest answer is kept."""
+        known, known_s, index = self._located
+        if trajectory is not known or time_s != known_s:
+            index = waypoint_index(trajectory, time_s)
+            self._located = trajectory, time_s, index
+        return index
 
     def reference(self, ahead_s: float = 0.0) -> FloatArray:
         """Return the reference (10,), in the order of WAYPOINT_FIELDS, `ahead_s` from now.

@@ -19,7 +19,7 @@ from mavfi_cli.autonomy import planners
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import Pilot, PilotParams, PlanRequest
-from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState, waypoint_index
+from mavfi_cli.autonomy.tracking import TrackingInputs, TrackingState
 from mavfi_cli.companion.executor import Executor, LatencyModel, Node, TurnOver
 from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.kernels import ControlInput, Kernels
@@ -281,7 +281,9 @@ class Companion:
             due_s=self._now_s + (latency_s if latency_s >= SAME_TICK_S else 0.0),
             command=command,
             inputs=inputs,
-            waypoint=0 if followed is None else waypoint_index(followed, inputs.time_s),
+            waypoint=0
+            if followed is None
+            else self.pilot.active.waypoint_at(followed, inputs.time_s),
             attempt=attempt,
             frame_s=frame_s,
         )

@@ -52,6 +52,9 @@ def _floats(vector: Vector | Sequence[float]) -> Sequence[float]:
 
 def enu_from_ned(vector: Vector) -> Vector:
     """Convert NED components (..., 3), in any unit, to ENU components (..., 3), or back."""
+    if vector.shape == (3,):
+        north, east, down = vector.tolist()
+        return np.array((east, north, -down))
     swapped = vector[..., [1, 0, 2]].copy()
     swapped[..., 2] *= -1.0
     return swapped
@@ -81,13 +84,14 @@ def flu_enu_from_frd_ned(quaternion: Vector | Sequence[float]) -> Vector:
     q_enu = q(ENU<-NED) * q_ned * q(FRD<-FLU), with q(ENU<-NED) = (0, s, s, 0), s = sqrt(1/2),
     and q(FRD<-FLU) = (0, 1, 0, 0). The result is a unit quaternion with w >= 0.
     """
-    w, x, y, z = (float(c) for c in quaternion)
+    w, x, y, z = _floats(quaternion)
     # (0, s, s, 0) * (w, x, y, z)
     s = _HALF_SQRT2
     aw, ax, ay, az = -s * (x + y), s * (w + z), s * (w - z), s * (y - x)
     # (aw, ax, ay, az) * (0, 1, 0, 0)
-    out = np.array([-ax, aw, az, -ay])
-    return out if out[0] >= 0.0 else -out
+    if -ax >= 0.0:
+        return np.array((-ax, aw, az, -ay))
+    return np.array((ax, -aw, -az, ay))
 
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Vector:
@@ -107,13 +111,13 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 def yaw_from_quaternion(quaternion: Vector | Sequence[float]) -> float:
     """Return the yaw of a quaternion (4,), in [-pi, pi], rad."""
-    w, x, y, z = (float(c) for c in quaternion)
+    w, x, y, z = _floats(quaternion)
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def rotation_matrix(quaternion: Vector) -> NDArray[np.float64]:
     """Return the rotation matrix (3, 3) of a unit quaternion (4,): world = R @ body."""
-    w, x, y, z = (float(c) for c in quaternion)
+    w, x, y, z = _floats(quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ _MAX_LISTED_STRIKES = 100
 _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Command: "command"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
+class Moment(NamedTuple):
     """The state of the mission at one moment, with which triggers are compared."""
 
     stamp_s: float

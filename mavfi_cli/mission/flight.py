@@ -305,6 +305,7 @@ class Flight:
 
     def _turn(self) -> None:
         """Receive messages and run the control tick of every state among them."""
+        self.wall.begin_tick()
         if self._clock is not None:
             self._turn_by_wall(self._clock)
         elif data := self._receive(self._patience_s):
@@ -330,13 +331,13 @@ class Flight:
             self._go_without(clock, waited_s)
 
     def _receive(self, timeout_s: float) -> bytes:
-        with self.wall.measure("wait"):
+        with self.wall.sample("wait"):
             return self.link.receive(timeout_s)
 
     def _take(self, data: bytes) -> float | None:
         """Handle the messages in the data. Return the stamp of the newest state, s, or None."""
         newest_s, telemetry = None, self._session.telemetry
-        with self.wall.measure("link"):
+        with self.wall.sample("link"):
             for message in self.link.messages(data, self.stamp_s):
                 number = type(message).id
                 if number in IMAGE_MESSAGES:  # most of all
@@ -384,9 +385,9 @@ class Flight:
             companion.executor.advance(stamp_s)
         if companion is not None and state is not None and self._airborne():
             self._offer_frames(companion)
-            with self.wall.measure("pilot"):
+            with self.wall.sample("pilot"):
                 self._control(stamp_s, state, companion)
-        with self.wall.measure("link"):
+        with self.wall.sample("link"):
             self.link.send(self._session.tick(stamp_s), stamp_s)
         if companion is not None:
             companion.executor.compute()

@@ -240,9 +240,11 @@ class Trace:
         for column, name in enumerate(_STATE_COLUMNS):
             columns[name] = pa.array(vehicle[:, column])
         kinds = {DType.FLOAT64: pa.float64(), DType.INT32: pa.int32(), DType.BOOL: pa.bool_()}
+        distinct = {kind: _distinct(self._messages[kind]) for kind in _KINDS}
         for state in STATES:
-            values = [entry and state.read(*entry) for entry in self._messages[state.message]]
-            columns[state.name] = pa.array(values, kinds[state.dtype])
+            entries, rows = distinct[state.message]
+            values = [entry and state.read(*entry) for entry in entries]
+            columns[state.name] = pa.array([values[row] for row in rows], kinds[state.dtype])
         for name, kind in (("report", CollisionReport), ("trajectory", Trajectory)):
             stamps = [entry and entry[0].stamp_s for entry in self._messages[kind]]
             columns[f"{name}_stamp_s"] = pa.array(stamps, pa.float64())
@@ -271,6 +273,22 @@ class Trace:
                 taken = _between(values[before, column], values[after, column], shares)
                 columns[name] = pa.array(np.where(known, taken, np.nan), mask=~known)
         return columns
+
+
+_Entry = tuple[Message, int] | None  # a message and the index of its waypoint
+
+
+def _distinct(entries: Sequence[_Entry]) -> tuple[list[_Entry], list[int]]:
+    """Return the entries without repetitions of the one before, and a row's place in them."""
+    kept: list[_Entry] = []
+    rows, last = [], (0, 0)
+    for entry in entries:
+        known = (0, -1) if entry is None else (id(entry[0]), entry[1])
+        if known != last:
+            kept.append(entry)
+            last = known
+        rows.append(len(kept) - 1)
+    return kept, rows
 
 
 def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> FloatArray:

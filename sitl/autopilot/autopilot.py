@@ -135,7 +135,7 @@ class Autopilot(Links):
         """True if a gentle ground contact now counts as a landing."""
         if self.commander.mode is not FlightMode.OFFBOARD:
             return True
-        north, east, down = self.snapshot.setpoint[3:6]
+        north, east, down = self.snapshot.setpoint[3:6].tolist()
         return bool(math.hypot(north, east) < _STRAIGHT_DOWN_MPS and down > 0.0)
 
     def fly(self) -> None:

@@ -247,7 +247,7 @@ class Commander:
     def _detect_landing(self, truth: Truth, *, wants_up: bool) -> None:
         """Update `landed`, with PX4's LNDMC_TRIG_TIME as hysteresis."""
         before = self.landed
-        north, east, down = map(abs, truth.velocity_ned_mps)
+        north, east, down = map(abs, truth.velocity_ned_mps.tolist())
         moves = not north + east + down < _STILL_MPS
         if self.landed or not truth.on_ground or wants_up or moves:
             self.landed = self.landed and truth.on_ground
@@ -317,11 +317,12 @@ class Commander:
 # Position, velocity, acceleration (NED; m, m/s, m/s^2), yaw (rad) and yaw rate (rad/s) (11,); NaN
 # means not controlled.
 Setpoint = Vector
+_UNSET = np.full(11, math.nan)
 
 
 def no_setpoint() -> Setpoint:
     """Return a setpoint that controls nothing."""
-    return np.full(11, math.nan)
+    return _UNSET.copy()
 
 
 @dataclass(slots=True, kw_only=True)

@@ -190,8 +190,11 @@ def _return_height_m(now: Snapshot) -> float:
 
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
     """OFFBOARD: the newest accepted setpoint, with zero velocity along an axis without a value."""
-    out[:] = now.offboard
-    out[3:6][np.isnan(out[:3]) & np.isnan(out[3:6])] = 0.0
+    values = now.offboard.tolist()
+    for axis in range(3):
+        if math.isnan(values[axis]) and math.isnan(values[3 + axis]):
+            values[3 + axis] = 0.0
+    out[:] = values
     _limit_velocity(out, now.parameters)
 
 

@@ -72,10 +72,12 @@ class Parameters:
         self._table = _parameter_table(system_id)
         self._index = {row.name: number for number, row in enumerate(self._table)}
         self._values: list[float | int] = [row.stored(row.default) for row in self._table]
+        self._effective: dict[str, float] = {}  # as computed since the last change
 
     def restore(self, other: Parameters) -> None:
         """Take all values of the same system's parameters."""
         self._values = list(other._values)
+        self._effective.clear()
 
     def __len__(self) -> int:
         return len(self._table)
@@ -90,9 +92,13 @@ class Parameters:
 
     def effective(self, name: str) -> float:
         """Return the stored value, clamped to the parameter's limits."""
-        number = self._index[name]
-        row = self._table[number]
-        return float(min(max(self._values[number], row.low), row.high))
+        known = self._effective.get(name)
+        if known is None:
+            number = self._index[name]
+            row = self._table[number]
+            known = float(min(max(self._values[number], row.low), row.high))
+            self._effective[name] = known
+        return known
 
     def write(self, name: str, wire_value: float, wire_type: int) -> bool | None:
         """Store the value of a PARAM_SET, decoded by its type. Return True if it has changed.
@@ -111,6 +117,7 @@ class Parameters:
         if row.read_only or not math.isfinite(value) or value == self._values[number]:
             return False
         self._values[number] = row.stored(value)
+        self._effective.clear()
         return True
 
     def message(self, index: int) -> Any:

@@ -155,6 +155,36 @@ def _refresh(
     _account_energy(truth, regression, battery, dt_s, armed)
 
 
+@compiled
+def _control(
+    state: Vector, truth: Vector, setpoint: Vector, gains: Vector, armed: bool, commands: Vector
+) -> None:
+    """Run the flight controller; change its state and the commands in place."""
+    new, chosen = cascade.control_step(state, truth, setpoint, gains, armed)
+    state[:] = new
+    commands[:] = chosen
+
+
+@compiled
+def _refresh_and_control(
+    raw: Vector,
+    commands: Vector,
+    regression: Vector,
+    battery: Vector,
+    dt_s: float,
+    armed: bool,
+    truth: Vector,
+    stamp_s: float,
+    state: Vector,
+    setpoint: Vector,
+    gains: Vector,
+) -> None:
+    """Do what lies between two steps of the physics, in one call."""
+    truth[T_STAMP] = stamp_s
+    _refresh(raw, commands, regression, battery, dt_s, armed, truth)
+    _control(state, truth, setpoint, gains, armed, commands)
+
+
 class Quadrotor:
     """Deterministic physics and flight controller of one quadrotor.
 
@@ -184,31 +214,38 @@ class Quadrotor:
         self._regression = profile.energy.coefficients(profile.extra_payload_kg)
         self._battery = profile.battery.parameters()
         self._state = np.zeros(cascade.STATE_SIZE)
+        self._commands = np.zeros(4)
         self._raw = np.zeros(physics.RAW_SIZE)
         self._flat = np.zeros(TRUTH_SIZE)
         self._flat[T_REMAINING] = 1.0
         self._steps = 0
         self.truth = Truth(self._flat)
+        self._physics.read(self._raw)
         self._refresh(np.zeros(4), 0.0, armed=False)
 
-    def step(self, setpoint: Vector, armed: bool) -> None:
-        """Advance physics and flight controller by one step; the motors stop unless `armed`.
+    def step(self, setpoint: Vector, armed: bool, count: int = 1) -> None:
+        """Advance flight controller and physics by steps; the motors stop unless `armed`.
 
         The setpoint (11,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
         rad/s. Values that are not finite are not controlled.
         """
-        self._state, commands = cascade.control_step(
-            self._state, self._flat, setpoint, self._gains, armed
-        )
+        commands, law = self._commands, (self._state, self._flat, setpoint, self._gains, armed)
+        _control(*law, commands)
+        for _ in range(count - 1):
+            self._physics.advance(commands, self._raw)
+            self._steps += 1
+            _refresh_and_control(
+                self._raw, commands, self._regression, self._battery, self.dt_s, armed, self._flat,
+                self._steps * self.dt_s, self._state, setpoint, self._gains,
+            )  # fmt: skip
         self.drive(commands, armed=armed)
 
     def drive(self, commands: Vector, *, armed: bool) -> None:
         """Advance the physics by one step under motor commands (4,) in 0..1."""
-        self._physics.advance(commands)
+        self._physics.advance(commands, self._raw)
         self._steps += 1
         self._flat[T_STAMP] = self._steps * self.dt_s
         self._refresh(commands, self.dt_s, armed=armed)
 
     def _refresh(self, commands: Vector, dt_s: float, *, armed: bool) -> None:
-        self._physics.read(self._raw)
         _refresh(self._raw, commands, self._regression, self._battery, dt_s, armed, self._flat)

@@ -169,7 +169,7 @@ def test_triggers_strike_once_at_their_moment(trigger, moments, expected):
         (Trigger(when=When.PHASE, phase="evading"), [moment(), moment(phase="evading")]),
         (
             Trigger(when=When.FORESEEN),
-            [moment(), replace(moment(), foresees=True), moment(phase="flying")],
+            [moment(), moment()._replace(foresees=True), moment(phase="flying")],
         ),
     ],
 )
