@@ -145,7 +145,7 @@ _GROUPS = {  # all keys, in the order of the output
     "Follower": (
         "stretches_clock", "skips_endless_slices", "guards_tracking", "tracking_guard_m",
         "position_gain_per_s", "climb_gain_per_s", "integral_gain_per_s2", "damping_gain",
-        "feeds_acceleration_forward", "control_owns_queue",
+        "feeds_acceleration_forward", "control_owns_queue", "slice_period_s",
     ),
     "Collision check": (
         "check_radius_m", "refuses_far_waypoints", "farthest_waypoint_m", "shifts_path_to_vehicle",
@@ -155,12 +155,13 @@ _GROUPS = {  # all keys, in the order of the output
     ),
     "Planning": (
         "planner_radius_m", "plans_in_motion", "rejected_plan_pause_s", "slows_where_blind",
+        "smoother",
     ),
     "Mission": ("goal_tolerance_m", "arrives_at_rest", "turns_before_departure"),
-    "Nodes": ("owns_sequence_numbers", "processes"),
+    "Nodes": ("owns_sequence_numbers", "restores_counters", "standby", "processes"),
 }  # fmt: skip
 _KEY = max(len(key) for keys in _GROUPS.values() for key in keys) + 2
-_VALUE = 7  # columns of a truth value or a number
+_VALUE = 8  # columns of a truth value, a number or a short word
 _MORE_STACKS = """
 `mavfi stacks NAME` explains every key, `mavfi stacks NAME NAME` shows where stacks differ.
 NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true."""
@@ -229,8 +230,9 @@ def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return ", ".join(" + ".join(nodes) for nodes in value) or "none"
-    return f"{value:g}"
+        names = (node if isinstance(node, str) else " + ".join(node) for node in value)
+        return ", ".join(names) or "none"
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 # States -------------------------------------------------------------------------------------------
