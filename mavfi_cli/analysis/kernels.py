@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from mavfi_cli.core.errors import RecordError, lack_of
+from mavfi_cli.core.files import read_bounded
 from mavfi_cli.stats.shares import Share
 
 KERNELS = "kernels.json"
+_LARGEST = 1 << 24  # bytes of a summary
 OUTCOMES = ("benign", "sdc", "crash", "hang")
 
 
@@ -57,7 +59,7 @@ class KernelSummary:
     def read(cls, path: Path) -> Self:
         """Read a summary; RecordError if the file is missing or is no summary."""
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = json.loads(read_bounded(path, _LARGEST))
             plan = data["plan"]
             return cls(
                 path=path,
@@ -74,8 +76,6 @@ class KernelSummary:
                 seed=int(plan["seed"]),
                 flight=str(plan["flight"]),
             )
-        except OSError as error:
-            raise RecordError(f"{path}: {error.strerror or error}") from None
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             lack = lack_of(error)
             raise RecordError(f"{path}: not a summary of `mavfi kernels` ({lack})") from None

@@ -8,7 +8,6 @@ the scores do not depend on the threshold. They include the checks of the plan i
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,8 +16,8 @@ import pyarrow as pa
 
 from mavfi_cli.analysis.detectors import NONE, Scored, harmful
 from mavfi_cli.analysis.flights import chosen
-from mavfi_cli.core.errors import ModelError
-from mavfi_cli.core.files import Json, write_json
+from mavfi_cli.core.errors import ModelError, RecordError
+from mavfi_cli.core.files import Json, read_json, write_json
 from mavfi_cli.core.types import BY_NAME, Outcome, StackMark, Stage, Trajectory
 from mavfi_cli.detect.base import Model
 from mavfi_cli.detect.offline import Columns, FlightSamples, PlanStrike, columns_of, replay
@@ -32,6 +31,7 @@ from mavfi_cli.spec.mission import OWN_AUTOPILOT
 from mavfi_cli.spec.stack import load_stack
 
 SCORES = "scores.json"
+_LARGEST = 1 << 27  # bytes of stored scores
 _WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these
 
 
@@ -55,8 +55,8 @@ def scored(
     """
     store = folder / SCORES
     kept: dict[str, dict[str, float | None]] = {}
-    with contextlib.suppress(OSError, ValueError):  # missing or damaged
-        kept = json.loads(store.read_text(encoding="utf-8"))
+    with contextlib.suppress(RecordError):  # missing or damaged
+        kept = read_json(store, _LARGEST)
     names = {
         detector.name: f"{detector.name}/{'+'.join(sorted(detector.protect))}/{_WAY}/"
         f"{detector.model_digest(stack)}"

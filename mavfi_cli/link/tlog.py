@@ -17,12 +17,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from mavfi_cli.core.errors import RecordError
+from mavfi_cli.core.files import read_bounded
 from mavfi_cli.link.codec import Codec, Message, Signing, dialect, frame_length, frame_of
 from mavfi_cli.link.endpoint import TWO_AUTOPILOTS
 from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
+_LARGEST = 1 << 30  # bytes of a log that is read
 _FLUSH_INTERVAL_S = 1.0  # of the stamps
 
 
@@ -43,10 +45,7 @@ def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
     Raises:
         RecordError: The file cannot be read.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordError(f"{path}: cannot read: {error.strerror or error}") from None
+    data = read_bounded(path, _LARGEST)
     codec, start = Codec(0, 0), 0
     while (length := frame_length(data, start + 8, len(data))) > 0:
         unix_s = int.from_bytes(data[start : start + 8], "big") / 1e6

@@ -11,12 +11,16 @@ from pathlib import Path
 
 import pytest
 
+from mavfi_cli.analysis.kernels import KernelSummary
 from mavfi_cli.campaigns import ledger as ledgers
 from mavfi_cli.campaigns.begin import SPEC
 from mavfi_cli.campaigns.ledger import LEDGER, LOCK, Ledger
 from mavfi_cli.campaigns.missions import ResultState
 from mavfi_cli.campaigns.specification_file import parse_spec
-from mavfi_cli.mission.run_folder import RESULT
+from mavfi_cli.core.errors import RecordError
+from mavfi_cli.fi.tracer.record import read as read_fault
+from mavfi_cli.link.tlog import tlog_messages
+from mavfi_cli.mission.run_folder import FAULT, RESULT
 from mavfi_cli.spec.fault import FaultConfig
 
 _TEXT = "mine"
@@ -205,3 +209,21 @@ def test_the_lock_of_a_campaign_is_no_link(hostile, precious, command_line, monk
     assert code == 1
     assert f"{LOCK}: is a link" in err
     assert (precious / "file").read_text() == _TEXT
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        (FAULT, lambda folder: read_fault(folder / FAULT)),
+        ("kernels.json", lambda folder: KernelSummary.read(folder / "kernels.json")),
+        ("flight.tlog", lambda folder: list(tlog_messages(folder / "flight.tlog"))),
+    ],
+)
+def test_a_record_is_neither_a_pipe_nor_a_link(name, read, precious, tmp_path):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(RecordError, match=f"{name}: is not a regular file"):
+        read(tmp_path)
+    (tmp_path / name).unlink()
+    (tmp_path / name).symlink_to(precious / "file")
+    with pytest.raises(RecordError, match=name):
+        read(tmp_path)

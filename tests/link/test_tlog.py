@@ -158,5 +158,5 @@ def test_a_foreign_flight_tells_its_date_by_its_first_state(tmp_path: Path) -> N
     assert unix_time_of_stamp_0(path) == pytest.approx(1_790_000_007.46)
     path.write_bytes(b"")
     assert unix_time_of_stamp_0(path) == EPOCH_UNIX_S
-    with pytest.raises(RecordError, match="none: cannot read"):
+    with pytest.raises(RecordError, match="none: "):
         unix_time_of_stamp_0(tmp_path / "none")

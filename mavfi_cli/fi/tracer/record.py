@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
-from mavfi_cli.core.files import Json, write_text
+from mavfi_cli.core.files import Json, read_json, write_text
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
     InstructionCorruption,
@@ -27,6 +27,7 @@ from mavfi_cli.fi.tracer.inject import Followed, Injection
 from mavfi_cli.fi.tracer.record_fields import FaultRecord, StageRecord
 
 VERSION = 2  # version 1 had whole registers as operands
+_LARGEST = 1 << 24  # bytes of a record
 
 
 def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecord:
@@ -145,12 +146,9 @@ def read(path: Path) -> FaultRecord:
     Raises:
         RecordError: no such file, or it is not a fault record.
     """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise RecordError(f"{path}: not a fault record ({error})") from None
-    if not isinstance(record, dict) or "trigger" not in record:
+    record = read_json(path, _LARGEST)
+    if "trigger" not in record:
         raise RecordError(f"{path}: not a fault record")
+    if record.get("version") != VERSION:
+        raise RecordError(f"{path}: not a fault record of version {VERSION}")
     return cast(FaultRecord, record)
