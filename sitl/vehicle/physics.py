@@ -128,12 +128,11 @@ class Physics:
         ]
         self._run = self._fdm.run
 
-    def advance(self, commands: Vector, raw: Vector) -> None:
-        """Advance one step with motor commands (4,) in 0..1, and `read`."""
+    def advance(self, commands: Vector) -> None:
+        """Advance one step with motor commands (4,) in 0..1."""
         for write, command in zip(self._writers, commands.tolist(), strict=True):
             write(command)
         self._run()
-        raw[:] = [read() for read in self._readers]
 
     def read(self, raw: Vector) -> None:
         """Fill `raw` (RAW_SIZE,) in JSBSim's units: ft, ft/s, rad, rad/s, rpm, ft lbf/s."""

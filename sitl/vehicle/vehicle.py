@@ -220,7 +220,6 @@ class Quadrotor:
         self._flat[T_REMAINING] = 1.0
         self._steps = 0
         self.truth = Truth(self._flat)
-        self._physics.read(self._raw)
         self._refresh(np.zeros(4), 0.0, armed=False)
 
     def step(self, setpoint: Vector, armed: bool, count: int = 1) -> None:
@@ -232,7 +231,8 @@ class Quadrotor:
         commands, law = self._commands, (self._state, self._flat, setpoint, self._gains, armed)
         _control(*law, commands)
         for _ in range(count - 1):
-            self._physics.advance(commands, self._raw)
+            self._physics.advance(commands)
+            self._physics.read(self._raw)
             self._steps += 1
             _refresh_and_control(
                 self._raw, commands, self._regression, self._battery, self.dt_s, armed, self._flat,
@@ -242,10 +242,11 @@ class Quadrotor:
 
     def drive(self, commands: Vector, *, armed: bool) -> None:
         """Advance the physics by one step under motor commands (4,) in 0..1."""
-        self._physics.advance(commands, self._raw)
+        self._physics.advance(commands)
         self._steps += 1
         self._flat[T_STAMP] = self._steps * self.dt_s
         self._refresh(commands, self.dt_s, armed=armed)
 
     def _refresh(self, commands: Vector, dt_s: float, *, armed: bool) -> None:
+        self._physics.read(self._raw)
         _refresh(self._raw, commands, self._regression, self._battery, dt_s, armed, self._flat)
