@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
 from mavfi_cli.attack.place import Golden
 from mavfi_cli.attack.target import JudgedPlace, RunOutcome, RunVerdict
+from mavfi_cli.attack.tracer_thread import Notice
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.counted import CountedStop
@@ -29,7 +27,7 @@ from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
-from mavfi_cli.fi.tracer.tracee import Ended, ExecutionCounter, Mechanism, Tracee
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
@@ -241,9 +239,6 @@ def run_out(tracee: Tracee) -> Ended:
 
 # -- a process that keeps running
 
-Notice = Callable[[], None]
-T = TypeVar("T")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveAttack:
@@ -308,75 +303,3 @@ def attack_live(
     return LiveAttack(
         injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
     )
-
-
-class TracerThread(Generic[T]):
-    """Runs work that traces a node in a thread of its own.
-
-    Args:
-        work: receives a function that it calls once the node runs towards the awaited event.
-    """
-
-    def __init__(self, work: Callable[[Notice], T]) -> None:
-        self._armed, self._done = threading.Event(), Future[T]()
-
-        def run() -> None:
-            try:
-                self._done.set_result(work(self._armed.set))
-            except BaseException as error:  # the thread's boundary: `result` raises it again
-                self._done.set_exception(error)
-            finally:
-                self._armed.set()
-
-        threading.Thread(target=run, daemon=True).start()
-
-    def await_armed(self) -> None:
-        """Wait until the node runs towards the awaited event; raise any earlier error."""
-        self._armed.wait()
-        if self._done.done():
-            self._done.result()
-
-    def result(self) -> T:
-        """Wait until the work is done; return its result or raise its error."""
-        return self._done.result()
-
-
-class EntryCounter:
-    """Counts the executions of one instruction in a node that keeps running.
-
-    If the operating system cannot count, a tracer stops the node at each execution. The count is
-    exact whenever the node has answered, because it answers after its last stop.
-
-    Args:
-        pid: the node; closing the counter may end it.
-    """
-
-    def __init__(self, pid: int, address: int) -> None:
-        self._pid, self._address, self._stops = pid, address, 0
-        self._counter: ExecutionCounter | None = None
-        self._tracer: TracerThread[None] | None = None
-        if Mechanism.best() is Mechanism.PERF:
-            self._counter = ExecutionCounter(pid, address)
-        else:
-            self._tracer = TracerThread(self._count)
-            self._tracer.await_armed()
-
-    def read(self) -> int:
-        """Return the number of executions since the counter was created."""
-        return self._stops if self._counter is None else self._counter.read()
-
-    def close(self) -> None:
-        """Remove the counter, and end the node if it had to be traced."""
-        if self._counter is not None:
-            self._counter.close()
-        if self._tracer is not None:
-            with suppress(ProcessLookupError):
-                os.kill(self._pid, signal.SIGKILL)
-            self._tracer.result()
-
-    def _count(self, armed: Notice) -> None:
-        tracee = Tracee.attach(self._pid)
-        tracee.breakpoint_at(self._address)
-        armed()
-        while tracee.resume() is None:
-            self._stops += tracee.registers.ip == self._address

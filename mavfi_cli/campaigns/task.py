@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
     from mavfi_cli.core.files import leave_unsynced
     from mavfi_cli.mission.instruction import CACHE
     from mavfi_cli.mission.progress import Watcher
-    from mavfi_cli.mission.run import fly_mission
+    from mavfi_cli.mission.run import fly_golden, fly_mission
     from mavfi_cli.mission.shared_flight import SharedFlight
     from mavfi_cli.spec.mission import MissionConfig
 
@@ -52,14 +53,27 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         number: (structure(changes, MissionConfig), Path(folder))
         for number, changes, folder in task["missions"]
     }
-    config, _ = next(iter(branches.values()))
+    config, folder = next(iter(branches.values()))
+    profiles = (folder / CACHE).resolve()  # the runner has linked it to the campaign's profiles
     if forks is None:
-        profiles = (out / CACHE).resolve()  # the runner has linked it to the campaign's profiles
         host = {"alone": task["alone"]} if task["alone"] else {}
         return fly_mission(config, out, Watcher(), profiles=profiles, host=host).path
 
     def fork(number: int) -> bool:
         return forks.fork(number, branches[number][1], task["limit_s"])
 
-    shared = SharedFlight(branches, fork)
-    return fly_mission(replace(config, fault=None), out, Watcher(), shared=shared).path
+    strike = None
+    if any(config.instruction is not None for config, _ in branches.values()):
+        from mavfi_cli.mission.instruction.injection import keep_orders, struck_nodes
+
+        if config.detector is not None:  # its nodes may get other orders than the golden ones
+            keep_orders(config.golden, profiles, fly_golden)
+        strike = partial(struck_nodes, profiles=profiles)
+    shared = SharedFlight(branches, fork, strike)
+    flown = replace(config, fault=None, instruction=None)
+    try:
+        return fly_mission(flown, out, Watcher(), shared=shared).path
+    except SystemExit:
+        if (further := shared.further()) is None:
+            raise
+    return fly_mission(flown, out, Watcher(), shared=further).path

@@ -229,13 +229,19 @@ class Executor:
         for mate in node.mates:
             mate.process = node.process
 
-    def isolate_late(self, name: str, fresh: Mapping[str, Callable[[Any, float], Any]]) -> None:
+    def isolate_late(
+        self,
+        name: str,
+        fresh: Mapping[str, Callable[[Any, float], Any]],
+        process: NodeProcess | None = None,
+    ) -> None:
         """Run a node that has already worked in a separate process, as `isolate`.
 
         Args:
             fresh: Unused kernels by node, from which the process is restarted.
+            process: As for `isolate`.
         """
-        self.isolate(name)
+        self.isolate(name, process)
         for node, kernel in fresh.items():
             self.nodes[node].kernel = kernel
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mavfi_cli.companion.executor import Executor
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.files import Json, write_json
@@ -206,6 +207,39 @@ class SourceInjection(NoInjection):
         state = next(iter(self._units))
         reader = Reader(name=self._reader, stamp_s=strikes[0].stamp_s, state=state)
         return RecordedActivation(activation="read", first_reader=reader)
+
+
+class StruckNode(NoInjection):
+    """The injection of a fault that has struck its node outside the flight.
+
+    Attributes:
+        node, order: the node, and the number of the struck order, from 1.
+        effect: what the fault did to the node, in one word.
+        process: the node from this order on; None if it is as without the fault.
+    """
+
+    def __init__(
+        self, node: str, order: int, effect: str, process: NodeProcess | None, text: str
+    ) -> None:
+        super().__init__()
+        self.node, self.order, self.effect, self.process = node, order, effect, process
+        self._news, self._text = list[str](), text
+        if process is not None:
+            process.answered = self.note_answer
+
+    def note_answer(self) -> None:
+        """Note that the flight has taken the answer to the order, or the loss of the node."""
+        self._news, self._text = [self._text] if self._text else [], ""
+
+    def news(self) -> list[str]:
+        """See `NoInjection`."""
+        news, self._news = self._news, []
+        return news
+
+    def close(self) -> None:
+        """End the node."""
+        if self.process is not None:
+            self.process.close(kill=True)
 
 
 def _strike_text(strike: Strike) -> str:

@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -31,7 +32,9 @@ Run = Callable[[Any, float], Any]
 # but only on whether they were exceeded.
 HANG_CPU_S = 5.0
 HANG_WALL_S = 120.0
+HUNG = "hung: killed by the watchdog"
 _LOOK_S = 0.25
+_EXIT_FIELD = 52  # proc_pid_stat(5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,11 +43,6 @@ class _Order:
     node: str
     input: Any
     start_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Rehearse:
-    """Request to let a fork process the next order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +70,8 @@ class NodeProcess:
 
     Args:
         ending: Describes the process's end if another waiter reaped it, else returns None.
-        answered: Called after each answer or loss, before the process gets another input.
+        answered: Called after each answer or loss, before the process gets another input; may be
+            set later.
         patient: Never treat the process as hung, because a debugger may hold it.
     """
 
@@ -88,12 +87,13 @@ class NodeProcess:
         self._socket = connection
         self.pid = pid
         self._ending = ending
-        self._answered = answered
+        self.answered = answered
         self._patient = patient
         if not patient:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in mid-message
         self._answers: dict[int, _Answer] = {}
         self._count = 0
+        self._ahead = False
         self._gone = False  # True after it was reaped, as its id may then be reused
 
     @classmethod
@@ -115,25 +115,22 @@ class NodeProcess:
         If the process has already ended, `take` reports it.
         """
         self._count += 1
+        if self._ahead:
+            self._ahead = False
+            return self._count
         order = _Order(number=self._count, node=node, input=value, start_s=start_s)
         with contextlib.suppress(OSError):
             send(self._socket, order)
         return order.number
 
-    def rehearse(self) -> int:
-        """Fork the process. The fork processes the next order and ends without an answer.
+    def work_ahead(self, number: int) -> None:
+        """Note that the process has got the next order, which has this number, already."""
+        self._count, self._ahead = number - 1, True
 
-        The process continues unchanged once the fork has ended.
-
-        Returns:
-            Process id of the fork, which waits for an order.
-
-        Raises:
-            OSError, EOFError: The process has ended.
-        """
-        send(self._socket, _Rehearse())
-        fork: int = receive(self._socket)
-        return fork
+    def rehearse(self, node: str, value: Any, start_s: float) -> None:
+        """Send an input to a fork that shares the connection; it has the next order's number."""
+        self.order(node, value, start_s)
+        self._count -= 1
 
     def take(self, number: int) -> tuple[Any, float]:
         """Wait for the output of an order. Return it with its host time in seconds.
@@ -144,7 +141,7 @@ class NodeProcess:
         try:
             answer = self._await(number)
         finally:
-            self._answered()
+            self.answered()
         if answer.error is not None:
             how, _, trace = answer.error.partition("\n")
             raise NodeLost(hung=False, how=how, traceback=trace)
@@ -157,11 +154,11 @@ class NodeProcess:
                 while not select.select([self._socket], [], [], _LOOK_S)[0]:
                     used = self._cpu_s() - used_s > HANG_CPU_S
                     if (used or time.monotonic() - begun_s > HANG_WALL_S) and not self._patient:
-                        raise NodeLost(hung=True, how="hung: killed by the watchdog")
+                        raise NodeLost(hung=True, how=HUNG)
                 answer: _Answer = receive(self._socket)
                 self._answers[answer.number] = answer
         except TimeoutError:
-            raise NodeLost(hung=True, how="hung: killed by the watchdog") from None
+            raise NodeLost(hung=True, how=HUNG) from None
         except (OSError, EOFError):
             raise NodeLost(hung=False, how=self._end()) from None
         except NodeLost:
@@ -183,12 +180,16 @@ class NodeProcess:
         self._gone = True
         if ending is not None:
             return ending
-        with contextlib.suppress(ChildProcessError):
+        status: int | None
+        try:
             _, status = os.waitpid(self.pid, 0)
-            if os.WIFSIGNALED(status):
-                return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
-            return f"ended with code {os.waitstatus_to_exitcode(status)}"
-        return "ended"
+        except ChildProcessError:
+            status = _status_of(self.pid)
+        if status is None:
+            return "ended"
+        if os.WIFSIGNALED(status):
+            return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+        return f"ended with code {os.waitstatus_to_exitcode(status)}"
 
     def close(self, *, kill: bool = False) -> None:
         """End the process, which exits by itself when the connection closes unless it is stuck."""
@@ -212,10 +213,7 @@ class NodeProcess:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         try:
             while True:
-                order: _Order | _Rehearse = receive(connection)
-                if isinstance(order, _Rehearse):
-                    _rehearse(connection, runs)
-                    continue
+                order: _Order = receive(connection)
                 begun = perf_counter()
                 output, error = None, None
                 try:
@@ -233,12 +231,34 @@ class NodeProcess:
             os._exit(1)
 
 
-def _rehearse(connection: socket.socket, runs: Mapping[str, Run]) -> None:
-    def run() -> int:
-        order: _Order = receive(connection)
-        runs[order.node](order.input, order.start_s)
+def _status_of(pid: int) -> int | None:
+    """Return the wait status of a process whose parent is another; None if that has reaped it."""
+    with contextlib.suppress(OSError):
+        process = os.pidfd_open(pid)
+        try:
+            select.select([process], [], [])
+            stat = Path(f"/proc/{pid}/stat").read_text()
+            return int(stat.rpartition(")")[2].split()[_EXIT_FIELD - 3])
+        finally:
+            os.close(process)
+    return None
+
+
+class LostNode(NodeProcess):
+    """A process that has ended, or hung, over the order that it gets next."""
+
+    def __init__(self, loss: NodeLost) -> None:
+        self._loss = loss
+        self.answered = lambda: None
+
+    def order(self, node: str, value: Any, start_s: float) -> int:
+        """See `NodeProcess`."""
         return 0
 
-    pid = fork(run)
-    send(connection, pid)
-    os.waitpid(pid, 0)
+    def take(self, number: int) -> tuple[Any, float]:
+        """See `NodeProcess`."""
+        self.answered()
+        raise self._loss
+
+    def close(self, *, kill: bool = False) -> None:
+        """See `NodeProcess`."""

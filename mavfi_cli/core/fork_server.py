@@ -45,7 +45,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
@@ -217,18 +217,25 @@ def _guard(control: socket.socket, packet: bytes, descriptor: int, module: _Modu
     return 0
 
 
-def _end_of(worker: int, reading: int, channel: socket.socket, deadline_s: float) -> Json:
+def _end_of(
+    worker: int,
+    reading: int,
+    channel: socket.socket,
+    deadline_s: float,
+    others: Sequence[int] = (),
+) -> Json:
     """Wait for the end of a worker and of its descendants. Return how it ended, and its report.
 
     Args:
         reading: end of the pipe from which its report is read.
+        others: children of this process that are not the worker's.
 
     Raises:
         ConnectionError: the client closed the channel.
     """
     late = _await(worker, channel, deadline_s)
     _, status = os.waitpid(worker, 0)
-    _end_children()
+    _end_children(others)
     end: Json = {"report": _report_of_worker(reading)}
     if late:
         end["timeout"] = True
@@ -331,6 +338,7 @@ class Forks:
         _request(_PR_SET_CHILD_SUBREAPER, 1)
         deadline_s = time.monotonic() + limit_s
         reading, writing = os.pipe()
+        others = _children()
         try:
             child = fork(None)
         except OSError as error:
@@ -345,7 +353,7 @@ class Forks:
             _begin(folder, worker)
             return True
         os.close(writing)
-        end = _end_of(child, reading, self._channel, deadline_s)
+        end = _end_of(child, reading, self._channel, deadline_s, others)
         now_s = time.monotonic()
         end |= {"key": key, "wall_s": round(now_s - self._since_s, 6)}
         self._since_s = now_s
@@ -399,12 +407,12 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def _end_children() -> None:
-    """Kill and reap every descendant of this process.
+def _end_children(others: Sequence[int] = ()) -> None:
+    """Kill and reap every descendant of this process, except some children.
 
     This process inherits the children of a killed child, so the loop repeats until there are none.
     """
-    while children := _children():
+    while children := [pid for pid in _children() if pid not in others]:
         for pid in children:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)

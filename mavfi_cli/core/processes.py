@@ -47,8 +47,18 @@ def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
 
 def send(connection: socket.socket, value: Any) -> None:
     """Send one value."""
+    connection.sendall(message_of(value))
+
+
+def message_of(value: Any) -> bytes:
+    """Return the bytes with which `send` sends a value."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
-    connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
+    return len(data).to_bytes(_LENGTH, "little") + data
+
+
+def value_of(message: bytes) -> Any:
+    """Return the value of a whole message. Raises as `receive`."""
+    return _Values(io.BytesIO(message[_LENGTH:])).load()
 
 
 def receive(connection: socket.socket) -> Any:
@@ -66,7 +76,6 @@ _BUILT_IN = {
     "builtins": ("range", "complex", "set", "frozenset"),
     "numpy": ("ndarray", "dtype"),
     "numpy._core.multiarray": ("_reconstruct", "scalar"),
-    "numpy._core.numeric": ("_frombuffer",),
     "pathlib": ("Path", "PosixPath"),
 }
 
@@ -75,6 +84,8 @@ class _Values(pickle.Unpickler):
     """Unpickles only mavfi's dataclasses and enumerations, and numpy's values."""
 
     def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("numpy._core.numeric", "_frombuffer"):
+            return _array
         if module in sys.modules and name in _BUILT_IN.get(module, ()):
             return getattr(sys.modules[module], name)
         if module.startswith(("mavfi_cli.", "sitl.")):
@@ -82,6 +93,16 @@ class _Values(pickle.Unpickler):
             if dataclasses.is_dataclass(kind) or (type(kind) is EnumMeta):
                 return kind
         raise pickle.UnpicklingError(f"{module}.{name} is not a message type")
+
+
+def _array(buffer: Any, dtype: Any, shape: Any, order: Any, *axes: Any) -> Any:
+    """Return an array with numpy's own object for a common dtype.
+
+    A pickle encodes which objects are identical. So the bytes of a message do not depend on
+    whether its arrays have been received.
+    """
+    make = sys.modules["numpy._core.numeric"]._frombuffer
+    return make(buffer, sys.modules["numpy"].dtype(dtype.str), shape, order, *axes)
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:

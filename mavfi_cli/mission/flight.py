@@ -19,6 +19,7 @@ import numpy as np
 from mavfi_cli.autonomy.pilot import TURN_S, PilotMode
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.companion.pipeline import Companion, CompanionParts
 from mavfi_cli.companion.protection import NoProtection, Protection
 from mavfi_cli.core.errors import (
@@ -209,15 +210,19 @@ class Flight:
         self._config = config
         self.link.continue_in(tlog)
 
-    def isolate_late(self, name: str) -> Executor:
-        """Run a node that has already worked in its own process; it restarts with fresh state."""
+    def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor:
+        """Run a node that has already worked in its own process; it restarts with fresh state.
+
+        Args:
+            process: As for `Executor.isolate`.
+        """
         assert self.companion is not None
         assert self._briefing is not None
         fresh = Companion(
             self._config, self._parts, self._briefing, WallClock(), NoInjection(), NoProtection()
         )
         executor = self.companion.executor
-        executor.isolate_late(name, fresh.executor.process_of(name))
+        executor.isolate_late(name, fresh.executor.process_of(name), process)
         return executor
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:

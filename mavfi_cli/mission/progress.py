@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mavfi_cli.autonomy.pilot import PilotMode
 from mavfi_cli.core.flight_record import Event
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import Briefing, VehicleState
+from mavfi_cli.core.types import Briefing, FloatArray, VehicleState
 from mavfi_cli.link.session import OffboardSession, Phase
 from mavfi_cli.link.telemetry import Telemetry
 
@@ -49,15 +49,21 @@ class Watcher:
 
 
 class Recorder:
-    """Records the briefing, and the input and start stamp of every invocation, by node."""
+    """Records the briefing, and the input and start stamp of every invocation, by node.
+
+    Attributes:
+        sequence: Nodes in the order of all starts.
+    """
 
     def __init__(self) -> None:
         self.briefing: Briefing | None = None
         self.orders: dict[str, list[tuple[Any, float]]] = {}
+        self.sequence: list[str] = []
 
     def on_start(self, node: str, value: Any, start_s: float) -> None:
         """Record the start of an invocation."""
         self.orders.setdefault(node, []).append((value, start_s))
+        self.sequence.append(node)
 
 
 class FlightLogger:
@@ -74,13 +80,19 @@ class FlightLogger:
 
     def note(self, stamp_s: float, kind: str, text: str, state: VehicleState | None) -> None:
         """Log an event at the vehicle's position."""
-        place = None
-        if state is not None:
-            x, y, z = (round(float(c), 3) for c in state.position_enu_m)
-            place = (x, y, z)
-        event = Event(stamp_s=round(stamp_s, 3), kind=kind, text=text, position_enu_m=place)
+        place = None if state is None else state.position_enu_m
+        event = self.event(stamp_s, kind, text, place)
         self.events.append(event)
         self._watcher.on_event(event)
+
+    @staticmethod
+    def event(stamp_s: float, kind: str, text: str, place_enu_m: FloatArray | None) -> Event:
+        """Return an event at a position (3,), both rounded as in a record."""
+        place = None
+        if place_enu_m is not None:
+            x, y, z = (round(float(c), 3) for c in place_enu_m)
+            place = (x, y, z)
+        return Event(stamp_s=round(stamp_s, 3), kind=kind, text=text, position_enu_m=place)
 
     def log_tick(
         self,

@@ -94,6 +94,8 @@ def fly_mission(
     parts = CompanionParts.of(config)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
+    if shared is not None:
+        recorder = shared.recorder
     injection = shared or _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
     with (
         _rare_collections(),
@@ -114,7 +116,7 @@ def fly_mission(
             if shared is not None:
                 config, folder = shared.end()
                 flight_begun_s += flight.wall.skipped_s
-                added["forked_s"] = shared.forked_s
+                added |= shared.host
         flight_wall_s = time.perf_counter() - flight_begun_s
         if vehicle is not None and (failure := vehicle.end()):
             flight.explain(str(failure))

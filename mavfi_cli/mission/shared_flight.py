@@ -5,29 +5,43 @@ once: a process flies without a fault, and forks itself when a fault is due. The
 from there on; the flight waits until it has ended, and continues. Missions whose fault was never
 due, and those without a fault, are forked when the flight is over.
 
+A fault in an instruction is struck after the flight, in a rehearsal of its node. If it is masked,
+its mission is forked from the end of the flight, too. If it has changed the node or ended it, the
+same flight is flown once more, as far as the last of these faults. The mission is forked when its
+node begins the struck invocation, and takes over the struck node.
+
 Every record is that of the mission flown alone, except its host section.
 """
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from mavfi_cli.companion.executor import Executor
-from mavfi_cli.companion.injection import NoInjection, SourceInjection
+from mavfi_cli.companion.injection import NoInjection, SourceInjection, StruckNode
 from mavfi_cli.companion.protection import NoProtection
 from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.flight_record import Strike
-from mavfi_cli.core.types import Trajectory
+from mavfi_cli.core.types import FloatArray, Trajectory
 from mavfi_cli.core.wall import WallClock
 from mavfi_cli.fi.injector import Moment, NoInjector
+from mavfi_cli.mission.progress import FlightLogger, Recorder
 from mavfi_cli.mission.run_folder import RunFolder
-from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
+if TYPE_CHECKING:
+    from mavfi_cli.companion.node_process import NodeProcess
+    from mavfi_cli.companion.pipeline import Companion
+
+_CALLED = "control"  # the node that answers within the tick of its order
 M = TypeVar("M")
 
 
@@ -36,10 +50,20 @@ class _Flight(Protocol):
 
     wall: WallClock
     stamp_s: float
+    logger: FlightLogger
+    companion: Companion | None
+
+    @property
+    def place_enu_m(self) -> FloatArray: ...
 
     def take(self, config: MissionConfig, tlog: Path) -> None: ...
 
-    def isolate_late(self, name: str) -> Executor: ...
+    def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor: ...
+
+
+StrikeNodes = Callable[
+    [MissionConfig, Mapping[int, InstructionConfig], Recorder], Mapping[int, StruckNode]
+]
 
 
 class _Struck(Exception):
@@ -53,32 +77,49 @@ class SharedFlight(NoInjection):
     """The injection of a shared flight; in a fork, that of the fork's mission.
 
     Args:
-        branches: missions by number, equal except for their source-level faults.
+        branches: missions by number, equal except for their faults.
         fork: forks this process for a mission and returns True in the fork; in this process,
             returns False after the fork's end.
+        strike: strikes nodes in rehearsals, for missions with faults in instructions: receives the
+            flown mission, the faults by number, and what recorded the flight.
 
     Attributes:
         flight: the flight, which is set before its first message.
         config: the mission of this fork; None in the shared flight.
         folder: the fork's run folder.
-        forked_s: stamp at which it was forked, s.
+        host: entries of the host section of the fork's record.
+        recorder: records the orders of the nodes, if there are faults in instructions.
     """
 
     flight: _Flight
     folder: RunFolder
 
-    def __init__(self, branches: Mapping[int, Branch], fork: Callable[[int], bool]) -> None:
+    def __init__(
+        self,
+        branches: Mapping[int, Branch],
+        fork: Callable[[int], bool],
+        strike: StrikeNodes | None = None,
+    ) -> None:
         super().__init__()
-        self._fork = fork
+        self._fork, self._strike_nodes = fork, strike
+        self._requests = {
+            number: config.instruction
+            for number, (config, _) in branches.items()
+            if config.instruction is not None
+        }
+        self.recorder = Recorder() if self._requests else None
+        self._struck: dict[int, StruckNode] = {}  # nodes that a further flight takes over
+        self._ticks: list[tuple[float, int, FloatArray]] = []  # stamp, number of events, position
         self._injections = {
             number: NoInjection()
             if config.fault is None
             else _ForkedInjection(config.fault, self, number)
             for number, (config, _) in branches.items()
+            if number not in self._requests
         }
         self._branches = branches
         self.config: MissionConfig | None = None
-        self.forked_s = 0.0
+        self.host: dict[str, Any] = {}
         self.injector = _Injectors(self._injections)
 
     @property
@@ -102,7 +143,12 @@ class SharedFlight(NoInjection):
 
     def news(self) -> list[str]:
         """See `NoInjection`."""
-        return [] if self._own is None else self._own.news()
+        if self._own is not None:
+            return self._own.news()
+        if self._requests and self.recorder is not None and self.recorder.sequence:
+            flight = self.flight
+            self._ticks.append((flight.stamp_s, len(flight.logger.events), flight.place_enu_m))
+        return []
 
     def finish(self) -> dict[str, object] | None:
         """See `NoInjection`."""
@@ -117,7 +163,7 @@ class SharedFlight(NoInjection):
             return False
         self._injections.clear()
         self._injections[number] = injection
-        self.config, self.forked_s = config, round(self.flight.stamp_s, 3)
+        self.config, self.host["forked_s"] = config, round(self.flight.stamp_s, 3)
         self.folder = RunFolder.new(out, config.world, config.seed)
         injection.begin(self.folder.fault)
         self.flight.take(config, self.folder.tlog)
@@ -129,10 +175,105 @@ class SharedFlight(NoInjection):
         Raises:
             SystemExit: this is the shared flight, which has no mission of its own.
         """
-        if self.config is None and not any(map(self.depart, list(self._injections))):
-            raise SystemExit
+        if self.config is None:
+            struck = self._strike()
+            self._injections |= struck
+            number = next(filter(self.depart, list(self._injections)), None)
+            if number is None:
+                raise SystemExit
+            if number in struck:
+                self._log_strike(struck[number])
         assert self.config is not None
         return self.config, self.folder
+
+    def further(self) -> SharedFlight | None:
+        """Return the flight of the missions whose nodes are not what they are without the faults.
+
+        None in a fork, or if there are none.
+        """
+        if self.config is not None or not self._struck:
+            return None
+        branches = {number: self._branches[number] for number in self._struck}
+        return _StruckFlight(branches, self._fork, self._struck)
+
+    def _strike(self) -> dict[int, StruckNode]:
+        """Strike the faults in instructions. Return those that are masked."""
+        if self._strike_nodes is None or self.recorder is None or not self.recorder.sequence:
+            return {}
+        config, _ = next(iter(self._branches.values()))
+        flown = replace(config, fault=None, instruction=None)
+        struck = self._strike_nodes(flown, self._requests, self.recorder)
+        self._struck = {number: node for number, node in struck.items() if node.process is not None}
+        return {number: node for number, node in struck.items() if node.process is None}
+
+    def _log_strike(self, injection: StruckNode) -> None:
+        """Log the strike at the tick that took the answer of the struck invocation."""
+        self.host["struck"] = injection.effect
+        assert self.flight.companion is not None
+        timetable = self.flight.companion.executor.timetable
+        runs = [run for run in timetable if run.node == injection.node]
+        run = runs[injection.order - 1]
+        due_s = run.start_s if run.node == _CALLED else run.end_s
+        at = bisect.bisect_left(self._ticks, due_s, key=lambda tick: tick[0])
+        injection.note_answer()
+        for stamp_s, place, position_enu_m in self._ticks[at : at + 1]:
+            logger = self.flight.logger
+            logger.events[place:place] = (
+                logger.event(stamp_s, "fault", text, position_enu_m) for text in injection.news()
+            )
+
+
+class _StruckFlight(SharedFlight):
+    """The same flight once more, up to the last order at which a struck node is taken over."""
+
+    def __init__(
+        self,
+        branches: Mapping[int, Branch],
+        fork: Callable[[int], bool],
+        struck: Mapping[int, StruckNode],
+    ) -> None:
+        super().__init__(branches, fork)
+        self._requests.clear()
+        self._left = dict(struck)
+        self._injections |= struck
+        self.recorder = _Starts(self._take_over)
+
+    def _take_over(self, node: str, order: int) -> None:
+        """Fork the missions whose node is struck in this order.
+
+        Raises:
+            SystemExit: this is the shared flight, and no mission is left.
+        """
+        for number, injection in list(self._left.items()):
+            if (injection.node, injection.order) == (node, order):
+                del self._left[number]
+                if self.depart(number):
+                    self._left.clear()
+                    self.host["struck"] = injection.effect
+                    self.flight.isolate_late(node, injection.process)
+                    return
+                injection.close()
+        if self.config is None and not self._left:
+            raise SystemExit
+
+    def end(self) -> tuple[MissionConfig, RunFolder]:
+        """See `SharedFlight`. Missions that are left are flown alone."""
+        if self.config is None:
+            raise SystemExit
+        return self.config, self.folder
+
+
+class _Starts(Recorder):
+    """Counts the orders of each node, and reports them."""
+
+    def __init__(self, report: Callable[[str, int], None]) -> None:
+        super().__init__()
+        self._report, self._counts = report, Counter[str]()
+
+    def on_start(self, node: str, value: object, start_s: float) -> None:
+        """Report the start of an invocation by its node and number, from 1."""
+        self._counts[node] += 1
+        self._report(node, self._counts[node])
 
 
 class _ForkedInjection(SourceInjection):

@@ -260,14 +260,13 @@ class MissionConfig:
         None for a mission whose flight other processes or the wall clock affect.
         """
         alone = (
-            self.instruction is not None
-            or self.isolate
+            self.isolate
             or self.realtime
             or self.link is not None
             or self.companion is not None
             or self.autopilot != OWN_AUTOPILOT
         )
-        return None if alone else replace(self, fault=None)
+        return None if alone else replace(self, fault=None, instruction=None)
 
     @property
     def seed_of_world(self) -> int:

@@ -15,10 +15,15 @@ from mavfi_cli.campaigns.progress import Spectator
 from mavfi_cli.campaigns.run import MissionQueue, Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep, Stop
 from mavfi_cli.core.fork_server import WORKER
+from mavfi_cli.fi.tracer.linux import SUPPORTED
+from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
+traced = pytest.mark.skipif(
+    not SUPPORTED or check_tracing().verdict != OK, reason="nothing can be traced here"
+)
 GAD = DetectorConfig(name="gad")
 FAULTS = (
     FaultConfig(target="waypoint_position", at="time=1", together=True, field="exponent", seed=1),
@@ -46,11 +51,15 @@ def _fake_task_is_importable():
 
 
 def files_of(folder):
-    """Every file of a run folder; of the result, all but the host section."""
+    """Every file of a run folder, without the host section of the result and the time of a stop."""
     result = json.loads((folder / "result.json").read_text())
     host = result.pop("host")
-    others = {path.name: path.read_bytes() for path in folder.iterdir()}
-    return {**others, "result.json": result}, host
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    if "level" in (result["fault"] or {}) and result["fault"]["level"] == "instruction":
+        written = json.loads(files["fault.json"])
+        written["injection"].pop("stop_s", None)
+        files["fault.json"] = json.dumps(written)
+    return {**files, "result.json": json.dumps(result)}, host
 
 
 def rows_of(ledger):
@@ -80,6 +89,43 @@ def test_a_forked_mission_is_that_flown_alone(missions, tmp_path):
         assert row.injected is alone.injected
         forked += "forked_s" in host
     assert forked == len(missions) - 2  # one has another restart time; one is left for a job
+
+
+STRUCK = [  # node and seed; of `hardened`, by the effect in its flight without a detector
+    *(("octomap", 1), ("control", 2), ("planner", 2), ("collision_check", 1)),  # masked
+    *(("control", 1), ("planner", 3)),  # changed
+    *(("octomap", 2), ("control", 3), ("planner", 1)),  # ended
+]
+
+
+@pytest.mark.slow
+@traced
+@pytest.mark.parametrize("stack", ["hardened", "mavbench"])
+def test_a_struck_node_is_taken_over_as_if_it_had_flown(short_config, tmp_path, stack):
+    base = replace(short_config, stack=stack)
+    quick, guarded = replace(base, node_restart_s=0.1), replace(base, detector=GAD)
+    null = InstructionConfig(target="point_cloud", null=True)
+    configs = [
+        *(base, guarded, replace(quick, instruction=null), replace(guarded, instruction=null)),
+        *(
+            replace(unharmed, instruction=InstructionConfig(target=node, seed=seed))
+            for unharmed, faults in ((base, STRUCK), (guarded, STRUCK[4:]), (quick, STRUCK[6:7]))
+            for node, seed in faults
+        ),
+    ]
+    flown = {}
+    for whole in (False, True):
+        options = Options(jobs=2, keep=Keep.ALL, whole=whole)
+        missions = [PlannedMission(config=config) for config in configs]
+        with run_campaign(missions, tmp_path / str(whole), options) as ledger:
+            flown[whole] = list(ledger.results())
+    effects = set()
+    for row, alone in zip(flown[False], flown[True], strict=True):
+        files, host = files_of(row.path)
+        assert files == files_of(alone.path)[0], row.number
+        assert row.injected is alone.injected
+        effects.add(host.get("struck"))
+    assert effects >= {"masked", "changed", "ended"}
 
 
 class _KillsWorker(Spectator):
@@ -202,7 +248,6 @@ def test_a_stop_rule_admits_the_missions_of_a_flight():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"instruction": InstructionConfig(target="control")},
         {"isolate": ("control",)},
         {"realtime": True},
         {"link": "udpin:127.0.0.1:14550", "goal": (9.0, 0.0, 5.0)},

@@ -1,5 +1,6 @@
 """A flip in a planner's loop that makes its node hang: the watchdog ends it, every time alike."""
 
+import contextlib
 import json
 import os
 
@@ -8,17 +9,23 @@ from missions import POSTS
 from native_programs import register_corruption
 
 from mavfi_cli.attack.kernels.scope import kernel_scope
+from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.companion import node_process
+from mavfi_cli.companion.node_process import NodeLost
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.fault import InstructionFault, Role
 from mavfi_cli.fi.tracer.image import Image, Location
 from mavfi_cli.fi.tracer.linux import SUPPORTED
+from mavfi_cli.mission.instruction import rehearsal
+from mavfi_cli.mission.instruction.injection import GoldenOrders
+from mavfi_cli.mission.instruction.rehearsal import KernelInvocation, NodeEffect
+from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
-from mavfi_cli.mission.progress import Watcher
-from mavfi_cli.mission.run import fly_mission
+from mavfi_cli.mission.progress import Recorder, Watcher
+from mavfi_cli.mission.run import fly_golden, fly_mission
 from mavfi_cli.mission.run_folder import load_run
 from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
@@ -98,3 +105,27 @@ def test_a_flip_that_hangs_a_node_is_ended_by_the_watchdog(
     ends = result["nodes"]["planner"]
     assert (ends["crashes"], ends["hangs"], ends["restarts"]) == ([], 1, 1)
     assert result["kernels"]["planner"]["busy_s"] > config.node_watchdog_s
+
+
+@pytest.mark.slow
+def test_a_flip_hangs_a_rehearsed_node_in_the_same_way(
+    endless, world_to_search, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(rehearsal, "HANG_CPU_S", 1.0)
+    config, recorder = world_to_search[0].golden, Recorder()
+    fly_golden(config, tmp_path, recorder)
+    orders = GoldenOrders.of(recorder)
+    setup = Setup.of(config, orders.briefing, "planner")
+    invocation = KernelInvocation(number=1, of=1, order=world_to_search[1], entry=1, earlier=0)
+
+    def strike(_):
+        place = rehearsal.Rehearsal(setup, "planner", orders.of_process(["planner"]))
+        with contextlib.closing(place):
+            return place.strike(records.fault_of(endless), invocation, {})
+
+    struck = TracerThread(strike).result()
+    assert struck.effect is NodeEffect.HUNG
+    assert struck.record["injection"]["applied"]
+    with pytest.raises(NodeLost) as lost:
+        struck.process.take(struck.process.order("planner", None, 0.0))
+    assert (lost.value.hung, lost.value.how) == (True, "hung: killed by the watchdog")

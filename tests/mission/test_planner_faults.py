@@ -1,5 +1,6 @@
 """Faults in the planner node: one request is one invocation, straight or searched."""
 
+import contextlib
 import json
 from collections import Counter
 from dataclasses import replace
@@ -8,17 +9,13 @@ import numpy as np
 import pytest
 from missions import POSTS
 
-from mavfi_cli.attack.attacker import TracerThread
 from mavfi_cli.attack.profile import profile_run
-from mavfi_cli.companion.node_process import NodeProcess
+from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.core.archive import unpack
 from mavfi_cli.fi.tracer import record as records
 from mavfi_cli.fi.tracer.linux import SUPPORTED
-from mavfi_cli.mission.instruction.injection import (
-    GoldenOrders,
-    Rehearsal,
-    draw_invocation,
-)
+from mavfi_cli.mission.instruction.injection import GoldenOrders, draw_invocation
+from mavfi_cli.mission.instruction.rehearsal import KernelInvocation, Rehearsal
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.machine import OK, check_tracing
 from mavfi_cli.mission.progress import Watcher
@@ -89,25 +86,29 @@ def searching(tmp_path_factory):
     fly_mission(attacked, folder, Watcher())
     (kept,) = folder.glob(".profiles/*/orders.npz")
     golden = unpack(kept.read_bytes(), GoldenOrders)
-    return Setup.of(config, golden.briefing, "planner"), golden.planner[:2]
+    setup = Setup.of(config, golden.briefing, "planner")
+    return setup, "planner", golden.of_process(["planner"])
 
 
 @pytest.mark.slow
 @traced
 def test_the_instructions_of_a_search_stay_in_scope_and_windows_are_parts_of_the_request(searching):
-    place = Rehearsal(*searching)
-    try:
-        whole = TracerThread(lambda _: profile_run(place, np.random.default_rng(1))).result()
-        entry = place.scope_of_node.inner[1]
-    finally:
-        place.close()
+    second = KernelInvocation(number=2, of=2, order=2, entry=2, earlier=1)
+
+    def stepped(_):
+        with contextlib.closing(Rehearsal(*searching)) as place:
+            place.go_to(second)
+            whole = profile_run(place, np.random.default_rng(1))
+            sampled = place.profile(second, np.random.default_rng(1))
+            return whole, replace(sampled, image=whole.image), place.scope_of_node.inner[1]
+
+    whole, sampled, entry = TracerThread(stepped).result()
     trace = whole.strata[0].segments[0].trace
     assert whole.image.locate(int(trace[0])) == entry  # a test of the start comes first
     objects = Counter(whole.image.locate(int(address)).object for address in trace)
     assert set(objects) == {OMPL, SEGMENT, PIECES}
     assert objects[OMPL] > 1000
 
-    sampled = Rehearsal.profile_invocation(*searching, 2, 1, np.random.default_rng(1))
     assert not sampled.complete
     assert {stratum.marker.object for stratum in sampled.strata} == {OMPL, SEGMENT, PIECES}
     counts = Counter()
@@ -140,21 +141,3 @@ def test_every_entry_is_an_invocation_of_another_kernel():
         (1, 2, 0), (2, 2, 0), (3, 2, 0), (4, 3, 3), (5, 3, 3),
     }  # fmt: skip
     assert all(each.entry == each.number and each.of == 5 for each in drawn)
-
-
-def test_a_rehearsal_leaves_the_node_as_it_was():
-    told = []
-
-    def remember(value, _stamp_s):
-        told.append(value)
-        return list(told)
-
-    process = NodeProcess.fork({"node": remember})
-    try:
-        assert process.take(process.order("node", 1, 0.0))[0] == [1]
-        for _ in range(2):
-            assert process.rehearse() != process.pid
-            process.order("node", 2, 0.0)
-        assert process.take(process.order("node", 3, 0.0))[0] == [1, 3]
-    finally:
-        process.close()

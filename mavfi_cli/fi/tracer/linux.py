@@ -30,6 +30,7 @@ OPTION_EXITKILL = 1 << 20
 TRACE_OPTIONS = (
     1 | (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)
 )  # marked call stops, fork, vfork, clone, exec
+CALL_STOP = signal.SIGTRAP | 0x80  # of PTRACE_O_TRACESYSGOOD
 EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
 WALL = 0x4000_0000
 ADDR_NO_RANDOMIZE = 0x0040000

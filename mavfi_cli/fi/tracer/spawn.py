@@ -178,7 +178,6 @@ def _auxiliary(pid: int, key: int) -> int | None:
 
 # -- the system calls of one run
 
-_CALL_STOP = signal.SIGTRAP | 0x80  # PTRACE_O_TRACESYSGOOD
 _STARTS = {
     linux.EVENT_CLONE: "starts a thread",
     linux.EVENT_FORK: "starts a child process",
@@ -238,7 +237,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
                 call = _NAMES.get(tracee.registers.system_call or 0, "a system call")
                 observed.started = f"{_STARTS[status.event]} (system call {call})"
                 break
-            if status.signal == _CALL_STOP:
+            if status.signal == linux.CALL_STOP:
                 (_record_entry if entering else _record_exit)(tracee, observed)
                 entering = not entering
             elif status.event == 0:

@@ -1,8 +1,8 @@
 """One traced process: attach, stop exactly, step, resume, and report how it ended.
 
 Every thread and child of the process is traced, so that none outlives the tracer. The *target*
-thread is stopped and corrupted; the others keep running. There is no sleep and no polling: every
-step waits for the kernel's report. Call all methods from the thread that attached.
+thread is stopped and corrupted; the others keep running. Every step waits for the kernel's
+report. Call all methods from the thread that attached.
 
 Two mechanisms stop exactly before the k-th execution of an instruction. The better one is `PERF`:
 the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-th
@@ -22,6 +22,7 @@ import ctypes
 import os
 import signal
 import struct
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -35,7 +36,14 @@ from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS, Registers
 DETOUR_COST = 20  # counted hits from which a detour is faster; making one costs about 15 hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # distance of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
-_MMAP, _MUNMAP, _PERF_EVENT_OPEN = 9, 11, 298  # system calls
+# System calls.
+CLOSE, SENDTO = 3, 44
+_MMAP, _MUNMAP, _DUP2, _RECVMSG, _CLONE, _PERF_EVENT_OPEN = 9, 11, 33, 47, 56, 298
+_SCRATCH = 4096  # distance below the stack pointer of what a system call needs, bytes
+_MESSAGE = struct.Struct("=QQ QI4xQQQQi4x")  # iovec and msghdr
+_CONTROL = struct.Struct("=Qiii4x")  # cmsghdr with one descriptor
+_CLONE_PARENT = 0x8000
+_LOOK_S = 1e-3
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
 
@@ -156,6 +164,12 @@ class Ended:
     exit_code: int | None
     signal: int | None
 
+    def describe(self) -> str:
+        """Describe the end for a record."""
+        if self.signal is not None:
+            return f"killed by {signal.Signals(self.signal).name}"
+        return f"ended with code {self.exit_code}"
+
 
 @dataclass(slots=True)
 class Tracee:
@@ -163,7 +177,7 @@ class Tracee:
 
     pid: int
     tid: int
-    group: int  # argument of waitpid: -process group, or any child of this thread
+    group: int  # argument of waitpid: -process group, the process, or any child of this thread
     mechanism: Mechanism = Mechanism.PERF
     ended: Ended | None = None
     signals: list[int] = field(default_factory=list)  # signals delivered to the process, in order
@@ -177,13 +191,14 @@ class Tracee:
         self.registers, self.memory = Registers(self.tid), linux.Memory(self.pid)
 
     @classmethod
-    def attach(cls, pid: int, *, mechanism: Mechanism | None = None) -> Tracee:
+    def attach(cls, pid: int, *, mechanism: Mechanism | None = None, alone: bool = False) -> Tracee:
         """Attach to every thread of a running process and stop its main thread, the target.
 
         The attaching thread must have no other children that other code waits for.
 
         Args:
             mechanism: how executions are counted; by default the best that is allowed.
+            alone: the process has one thread, and the attaching thread may trace others.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -198,7 +213,8 @@ class Tracee:
                 seized.add(thread)
         if not seized:
             raise TargetError(f"process {pid}", "does not exist")
-        tracee = cls(pid, pid, _ANY_CHILD, mechanism or Mechanism.best())
+        group = pid if alone else _ANY_CHILD
+        tracee = cls(pid, pid, group, mechanism or Mechanism.best())
         tracee.interrupt()
         return tracee
 
@@ -273,6 +289,101 @@ class Tracee:
             except OSError:
                 self.mechanism = Mechanism.DEBUG
         return _DebugBreakpoint(self.tid, address)
+
+    def await_call(self) -> None:
+        """Let the stopped process run until it waits in a system call, and stop it there."""
+        while self.registers.system_call is None:
+            self.registers.forget()
+            linux.request(linux.CONT, self.tid)
+            time.sleep(_LOOK_S)
+            self.interrupt()
+
+    def fork(self) -> Tracee:
+        """Fork the stopped process, which must have been attached to `alone`.
+
+        The fork has the same registers and memory, and waits in the same system call. Its parent
+        is that of the process.
+
+        Raises:
+            OSError: there is no memory or no process left.
+        """
+        before, here = self.registers.general(), self.registers.ip
+        code = self.memory.read(here, len(_SYSTEM_CALL))
+        pid = self.system_call(_CLONE, _CLONE_PARENT | signal.SIGCHLD, 0, 0, 0, 0)
+        if pid >> 63:
+            code_of_error = (1 << 64) - pid
+            raise OSError(code_of_error, os.strerror(code_of_error))
+        linux.wait(pid)  # it has not executed anything
+        fork = Tracee(pid, pid, pid, self.mechanism)
+        fork.memory.write(here, code)
+        fork.registers.write_general(before)
+        return fork
+
+    def run_to_call(self, number: int, descriptor: int) -> list[tuple[int, ...]]:
+        """Run until a system call on a file descriptor begins, or until the process has ended.
+
+        Returns:
+            Number and arguments of each system call on the way, this one included.
+        """
+        calls, entering = list[tuple[int, ...]](), False
+        while self.ended is None:
+            self.registers.forget()
+            with contextlib.suppress(ProcessLookupError):  # killed at a stop
+                linux.request(linux.SYSCALL, self.tid, 0, self._take_signal())
+            status = self._wait()
+            if status.ended:
+                self._note_end(status)
+            elif status.event == 0 and status.signal == linux.CALL_STOP:
+                entering = not entering
+                if entering:
+                    call = self.registers.system_call or 0
+                    given = map(self.registers.read, CALL_ARGUMENTS)
+                    calls.append((call, *given))
+                    if calls[-1][:2] == (number, descriptor):
+                        break
+            elif status.event == 0:
+                self._pending_signal = status.signal
+        return calls
+
+    def undo_call(self) -> None:
+        """Stop in front of the system call that the stopped target has begun, as if it had not."""
+        registers = self.registers
+        before, number, here = registers.general(), registers.system_call, registers.ip
+        registers.write("orig_rax", (1 << 64) - 1)  # which makes the call nothing
+        linux.request(linux.SYSCALL, self.tid)
+        self._wait()
+        registers.write_general(before)
+        assert number is not None
+        again = {"rip": here - len(_SYSTEM_CALL), "rax": number, "orig_rax": (1 << 64) - 1}
+        registers.write_together(again)
+
+    def replace_socket(self, descriptor: int) -> None:
+        """Receive a descriptor (SCM_RIGHTS) on a socket of the stopped target, and use it instead.
+
+        Raises:
+            OSError: there is no room below the stack pointer.
+        """
+        place = self.registers.sp - _SCRATCH & ~15
+        text, control = place + _MESSAGE.size, place + _MESSAGE.size + 16
+        message = _MESSAGE.pack(text, 1, 0, 0, place, 1, control, _CONTROL.size, 0)
+        self.memory.write(place, message + bytes(16 + _CONTROL.size))
+        self.system_call(_RECVMSG, descriptor, place + 16, 0)
+        _, _, _, received = _CONTROL.unpack(self.memory.read(control, _CONTROL.size))
+        self.system_call(_DUP2, received, descriptor)
+        self.system_call(CLOSE, received)
+
+    def system_call(self, number: int, *arguments: int) -> int:
+        """Make the stopped target execute a system call and restore its state."""
+        before, here = self.registers.general(), self.registers.ip
+        code = self.memory.read(here, len(_SYSTEM_CALL))
+        self.memory.write(here, _SYSTEM_CALL)
+        names = ("rax", *CALL_ARGUMENTS[: len(arguments)])
+        self.registers.write_together(dict(zip(names, (number, *arguments), strict=True)))
+        self.step()
+        result = self.registers.read("rax")
+        self.memory.write(here, code)
+        self.registers.write_general(before)
+        return result
 
     def detach(self) -> None:
         """Let the process continue without a tracer; the target thread must be stopped."""
@@ -412,7 +523,7 @@ class Tracee:
         code = self.memory.read(address, detour.size)
         way = detour.code(code, address, pages, count)
         if way is None:
-            self._system_call(_MUNMAP, pages, _PAGES_BYTES)
+            self.system_call(_MUNMAP, pages, _PAGES_BYTES)
             return None
         replaced = {place: self.memory.read(place, len(jump)) for place, jump in way.jumps.items()}
         self._write({**way.pages, **way.jumps})
@@ -420,7 +531,7 @@ class Tracee:
             if self.registers.ip == way.stop:
                 self._write(replaced)
                 self.registers.write("rip", address)
-                self._system_call(_MUNMAP, pages, _PAGES_BYTES)
+                self.system_call(_MUNMAP, pages, _PAGES_BYTES)
                 return True
         return False
 
@@ -432,21 +543,8 @@ class Tracee:
         """Map pages within reach of a jump, where neither heap nor libraries are mapped later."""
         for distance in _DISTANCES:
             pages = (address - distance) & ~4095
-            if pages > 0 and self._system_call(
+            if pages > 0 and self.system_call(
                 _MMAP, pages, _PAGES_BYTES, _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE, 0
             ) == pages:  # fmt: skip
                 return pages
         return None
-
-    def _system_call(self, number: int, *arguments: int) -> int:
-        """Make the stopped target execute a system call and restore its state."""
-        before, here = self.registers.general(), self.registers.ip
-        code = self.memory.read(here, len(_SYSTEM_CALL))
-        self.memory.write(here, _SYSTEM_CALL)
-        names = ("rax", *CALL_ARGUMENTS[: len(arguments)])
-        self.registers.write_together(dict(zip(names, (number, *arguments), strict=True)))
-        self.step()
-        result = self.registers.read("rax")
-        self.memory.write(here, code)
-        self.registers.write_general(before)
-        return result

@@ -1,16 +1,19 @@
 """Plans one exact instruction-level fault of a mission, and injects it during the flight.
 
-A node is a function of its orders. A rehearsal replays the orders of the golden run to a separate
-node, without a flight and as fast as the machine allows. For the last order the node forks
-repeatedly: a fork works on the order and exits instead of replying. Orders, numbers of kernel
+A node is a function of its orders. A rehearsal gives the orders of the golden run to a separate
+node, without a flight and as fast as the machine allows. Orders, numbers of kernel
 entries and profiles are kept below the output folder, under a hash of everything that determines
 them. In the flight a tracer thread injects the fault.
+
+Nodes of missions that share a flight are struck in the rehearsal. A fault after which the node
+answers and remembers what it does without the fault needs no flight. Otherwise the flight takes
+over the struck node.
 """
 
 from __future__ import annotations
 
 import contextlib
-import signal
+import pickle
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,20 +23,21 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mavfi_cli.attack.attacker import EntryCounter, LiveAttack, TracerThread, attack_live
+from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
-from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.attack.served import ServedProcess
 from mavfi_cli.attack.strategy import mission_strategy
+from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
 from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.companion.executor import Executor
-from mavfi_cli.companion.injection import NoInjection
+from mavfi_cli.companion.injection import NoInjection, StruckNode
 from mavfi_cli.companion.kernels import ControlInput
 from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.archive import pack, unpack
-from mavfi_cli.core.errors import FaultError, RecordError, TargetError
+from mavfi_cli.core.errors import FaultError, MavfiError, RecordError
 from mavfi_cli.core.files import (
     own_folder,
     read_bounded,
@@ -41,29 +45,25 @@ from mavfi_cli.core.files import (
 )
 from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.core.seeds import Stream
-from mavfi_cli.core.types import Briefing, DepthFrame, PointCloud
-from mavfi_cli.fi.tracer import linux, record
-from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.core.types import KERNELS, Briefing, DepthFrame, PointCloud
+from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import InstructionFault
-from mavfi_cli.fi.tracer.image import Image, Scope
+from mavfi_cli.fi.tracer.image import Image
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
-from mavfi_cli.fi.tracer.sampling import WindowTooLong
-from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.instruction import PROGRAM, kept_in
+from mavfi_cli.mission.instruction.rehearsal import KernelInvocation, Order, Rehearsal, Struck
 from mavfi_cli.mission.instruction.server import Setup
 from mavfi_cli.mission.progress import Recorder
+from mavfi_cli.spec.fault import InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 T = TypeVar("T")
-_Order = tuple[T, float]  # input, start stamp
+_Given = tuple[T, float]  # input, start stamp
 FlyGolden = Callable[[MissionConfig, Path, Recorder], object]  # mission, folder of runs, recorder
 _CONTEXT = (
     "node", "kernel", "invocation", "invocations", "node_invocation", "stamp_s", "sampling",
     "windows", "profiled_instructions", "seed", "request",
 )  # fmt: skip
-_WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
-_WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
-_INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
 
 
 _LARGEST = 1 << 31  # bytes of a kept file
@@ -71,14 +71,35 @@ _LARGEST = 1 << 31  # bytes of a kept file
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GoldenOrders:
-    """The briefing of a golden run, and its orders by node."""
+    """The briefing of a golden run, and its orders by node.
+
+    Attributes:
+        sequence: nodes in the order of the starts of all orders.
+    """
 
     briefing: Briefing
-    point_cloud: tuple[_Order[DepthFrame], ...] = ()
-    octomap: tuple[_Order[PointCloud], ...] = ()
-    collision_check: tuple[_Order[CollisionInputs], ...] = ()
-    planner: tuple[_Order[tuple[PlanRequest, MapSnapshot]], ...] = ()
-    control: tuple[_Order[ControlInput], ...] = ()
+    sequence: tuple[str, ...] = ()
+    point_cloud: tuple[_Given[DepthFrame], ...] = ()
+    octomap: tuple[_Given[PointCloud], ...] = ()
+    collision_check: tuple[_Given[CollisionInputs], ...] = ()
+    planner: tuple[_Given[tuple[PlanRequest, MapSnapshot]], ...] = ()
+    control: tuple[_Given[ControlInput], ...] = ()
+
+    @classmethod
+    def of(cls, recorder: Recorder) -> GoldenOrders:
+        """Return what a recorder has seen of a flight."""
+        assert recorder.briefing is not None
+        orders = {name: tuple(given) for name, given in recorder.orders.items()}
+        return cls(briefing=recorder.briefing, sequence=tuple(recorder.sequence), **orders)
+
+    def __post_init__(self) -> None:
+        if any(len(getattr(self, name)) != self.sequence.count(name) for name in KERNELS):
+            raise ValueError("sequence must name the node of every order")
+
+    def of_process(self, nodes: Sequence[str]) -> list[Order]:
+        """Return the orders of nodes that share a process, in the order of their starts."""
+        left = {node: iter(getattr(self, node)) for node in nodes}
+        return [(node, *next(left[node])) for node in self.sequence if node in left]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,89 +113,183 @@ class _Entries:
             raise ValueError("counts must not decrease")
 
 
+def _golden_orders(
+    golden: MissionConfig, profiles: Path, fly: Callable[[Path], Recorder]
+) -> GoldenOrders:
+    """Return the kept orders of a golden mission; if there are none, `fly` it into a folder."""
+    folder = own_folder(kept_in(own_folder(profiles), golden))
+    return _kept(folder / "orders.npz", GoldenOrders, lambda: GoldenOrders.of(fly(folder)))
+
+
+def keep_orders(golden: MissionConfig, profiles: Path, fly_golden: FlyGolden) -> GoldenOrders:
+    """Return the kept orders of a golden mission; if there are none, fly it.
+
+    Args:
+        profiles: folder of golden flights and profiles.
+
+    Raises:
+        MavfiError: the mission cannot be flown.
+    """
+
+    def fly(folder: Path) -> Recorder:
+        recorder = Recorder()
+        fly_golden(golden, folder, recorder)
+        return recorder
+
+    return _golden_orders(golden, profiles, fly)
+
+
 def _plan_fault(
     config: MissionConfig, profiles: Path, fly_golden: FlyGolden
 ) -> tuple[InstructionFault, dict[str, Any]]:
     """Draw the fault of a mission, and the entries of _CONTEXT."""
-    request = config.instruction
+    request, golden = config.instruction, config.golden
     assert request is not None
-    strategy, node = mission_strategy(request), request.node()
-    kernel = kernel_of_node(node, config.planner)
-    golden = config.golden
-    folder = own_folder(kept_in(own_folder(profiles), golden))
+    orders = keep_orders(golden, profiles, fly_golden)
 
-    def fly() -> GoldenOrders:
-        recorder = Recorder()
-        fly_golden(golden, folder, recorder)
-        assert recorder.briefing is not None
-        orders = {name: tuple(given) for name, given in recorder.orders.items()}
-        return GoldenOrders(briefing=recorder.briefing, **orders)
+    def plan(_armed: Callable[[], None]) -> tuple[InstructionFault, dict[str, Any]]:
+        with contextlib.closing(_GoldenNode(golden, request.node(), profiles, orders)) as node:
+            return node.fault(request, *node.draw(request))
 
-    kept = _kept(folder / "orders.npz", GoldenOrders, fly)
-    setup = Setup.of(config, kept.briefing, node)
-    orders: tuple[_Order[Any], ...] = getattr(kept, node)
+    return TracerThread(plan).result()
 
-    def count() -> _Entries:
-        with contextlib.closing(Rehearsal(setup)) as place:
-            return _Entries(counts=tuple(place.count_entries(orders)))
 
-    entries = _kept(
-        folder / f"entries-{kernel}.npz",
-        _Entries,
-        count,
-        sound=lambda entries: len(entries.counts) == len(orders),
-    )
-    counts = entries.counts
-    if not counts or not counts[-1]:
-        raise FaultError(
-            f"the golden flight never enters {kernel}, so nothing in it can be struck: choose "
-            "another world, seed or node"
+class _GoldenNode:
+    """A node in a golden flight, from which faults are drawn. Use it in one thread."""
+
+    def __init__(
+        self, golden: MissionConfig, node: str, profiles: Path, kept: GoldenOrders
+    ) -> None:
+        self._golden, self.name = golden, node
+        self.kernel = kernel_of_node(node, golden.planner)
+        self._folder = kept_in(profiles, golden)
+        shared = (nodes for nodes in golden.loaded_stack().processes if node in nodes)
+        self.process = next(shared, (node,))
+        self._setup = Setup.of(golden, kept.briefing, node)
+        self._given: tuple[_Given[Any], ...] = getattr(kept, node)
+        self._orders = kept.of_process(self.process)
+        self._rehearsal: Rehearsal | None = None
+
+    @property
+    def rehearsal(self) -> Rehearsal:
+        """The node's rehearsal, which starts when it is first used."""
+        if self._rehearsal is None:
+            self._rehearsal = Rehearsal(self._setup, self.name, self._orders)
+        return self._rehearsal
+
+    def close(self) -> None:
+        """End the node."""
+        if self._rehearsal is not None:
+            self._rehearsal.close()
+
+    def draw(self, request: InstructionConfig) -> tuple[KernelInvocation, np.random.Generator]:
+        """Draw the invocation to strike. Return the generator of the rest of the draw, too.
+
+        Raises:
+            FaultError: the flight never enters the kernel.
+        """
+        entries = _kept(
+            self._folder / f"entries-{self.kernel}.npz",
+            _Entries,
+            lambda: _Entries(counts=tuple(self.rehearsal.count_entries())),
+            sound=lambda entries: len(entries.counts) == len(self._given),
         )
-    rng = Stream.FAULT.generator(request.seed, "instruction")
-    drawn = draw_invocation(node, counts, rng)
-    profiling = Stream.FAULT.generator(config.seed, "profile", kernel, drawn.number)
-    profile = _kept(
-        folder / f"profile-{kernel}-{drawn.number}.npz",
-        TargetProfile,
-        lambda: replace(
-            Rehearsal.profile_invocation(
-                setup, orders[: drawn.order], drawn.entry, drawn.earlier, profiling
-            ),
-            image=None,
-        ),
-        sound=_is_sound,
-    )
-    fault = profile.draw(replace(strategy, whole_process=False), rng)
-    context = {
-        "node": node,
-        "kernel": kernel,
-        "invocation": drawn.number,
-        "invocations": drawn.of,
-        "node_invocation": drawn.order,
-        "stamp_s": round(orders[drawn.order - 1][1], 9),
-        "sampling": request.sampling_name(),
-        "windows": profile.windows,
-        "profiled_instructions": profile.executed,
-        "seed": request.seed,
-        "request": asdict(request),
-    }
-    return replace(fault, corruption=None) if request.null else fault, context
+        counts = entries.counts
+        if not counts or not counts[-1]:
+            raise FaultError(
+                f"the golden flight never enters {self.kernel}, so nothing in it can be struck: "
+                "choose another world, seed or node"
+            )
+        rng = Stream.FAULT.generator(request.seed, "instruction")
+        return draw_invocation(self.name, counts, rng), rng
+
+    def fault(
+        self, request: InstructionConfig, drawn: KernelInvocation, rng: np.random.Generator
+    ) -> tuple[InstructionFault, dict[str, Any]]:
+        """Draw the fault in an invocation, and the entries of _CONTEXT."""
+        strategy = replace(mission_strategy(request), whole_process=False)
+        profiling = Stream.FAULT.generator(self._golden.seed, "profile", self.kernel, drawn.number)
+        profile = _kept(
+            self._folder / f"profile-{self.kernel}-{drawn.number}.npz",
+            TargetProfile,
+            lambda: replace(self.rehearsal.profile(drawn, profiling), image=None),
+            sound=_is_sound,
+        )
+        fault = profile.draw(strategy, rng)
+        context = {
+            "node": self.name,
+            "kernel": self.kernel,
+            "invocation": drawn.number,
+            "invocations": drawn.of,
+            "node_invocation": drawn.order,
+            "stamp_s": round(self._given[drawn.order - 1][1], 9),
+            "sampling": request.sampling_name(),
+            "windows": profile.windows,
+            "profiled_instructions": profile.executed,
+            "seed": request.seed,
+            "request": asdict(request),
+        }
+        return replace(fault, corruption=None) if request.null else fault, context
+
+    def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
+        """Return True if the process got the same orders in another flight, up to an invocation."""
+        mine, theirs = (
+            [pickle.dumps(order) for order in orders]
+            for orders in (self._orders, flown.of_process(self.process))
+        )
+        own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
+        until = own[drawn.order - 1] + 1
+        return mine[:until] == theirs[:until]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _KernelInvocation:
-    """One invocation of a kernel, and the entry with which it begins."""
+def struck_nodes(
+    flown: MissionConfig,
+    requests: Mapping[int, InstructionConfig],
+    recorder: Recorder,
+    *,
+    profiles: Path,
+) -> dict[int, StruckInjection]:
+    """Strike the faults of missions in a rehearsal.
 
-    number: int  # number of the kernel's invocation, from 1
-    of: int
-    order: int  # number of the node's order that contains it, from 1
-    entry: int  # number of the kernel's entry with which it begins, from 1
-    earlier: int  # entries in the earlier orders
+    A fault that cannot be planned there or compared is left out.
+
+    Args:
+        flown: the missions without their faults.
+        requests: their faults, by number.
+        recorder: has recorded the flight of `flown`. Orders of a golden mission with another
+            protection are kept already.
+    """
+    golden, seen = flown.golden, GoldenOrders.of(recorder)
+    orders = _golden_orders(golden, profiles, lambda _: recorder)
+    by_node: dict[str, list[int]] = {}
+    for number, request in requests.items():
+        by_node.setdefault(request.node(), []).append(number)
+    injections = dict[int, StruckInjection]()
+
+    def strike(node: _GoldenNode, numbers: Sequence[int]) -> None:
+        drawn = {number: node.draw(requests[number]) for number in numbers}
+        for number in sorted(drawn, key=lambda number: drawn[number][0].order):
+            invocation, rng = drawn[number]
+            if flown != golden and not node.received_alike(seen, invocation):
+                continue
+            with contextlib.suppress(MavfiError, OSError):
+                fault, context = node.fault(requests[number], invocation, rng)
+                struck = node.rehearsal.strike(fault, invocation, context)
+                injections[number] = StruckInjection(struck, node.name, invocation.order)
+
+    def work(_armed: Callable[[], None]) -> None:
+        for name, numbers in by_node.items():
+            with (
+                contextlib.suppress(MavfiError, OSError),
+                contextlib.closing(_GoldenNode(golden, name, profiles, orders)) as node,
+            ):
+                strike(node, numbers)
+
+    TracerThread(work).result()
+    return injections
 
 
-def draw_invocation(
-    node: str, counts: Sequence[int], rng: np.random.Generator
-) -> _KernelInvocation:
+def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
     """Draw one invocation of a kernel uniformly from the entries up to each order.
 
     Every entry is an invocation, except for a planner node: it is entered whenever it builds an
@@ -192,7 +307,7 @@ def draw_invocation(
         which, of = int(rng.integers(len(orders))), len(orders)
         order, number = int(orders[which]), which + 1
         entry = int(before[order]) + 1
-    return _KernelInvocation(
+    return KernelInvocation(
         number=number, of=of, order=order + 1, entry=entry, earlier=int(before[order])
     )
 
@@ -224,125 +339,6 @@ def _kept(
     data = pack(make())
     write_atomically(path, lambda file: file.write(data))
     return unpack(data, kind)
-
-
-# Rehearsal ----------------------------------------------------------------------------------------
-
-
-class Rehearsal:
-    """The `AttackPlace` in which one invocation of a node's kernel runs.
-
-    Args:
-        orders: inputs and start stamps up to the order that contains the invocation.
-        entry: number, from 1, of the kernel entry in that order that begins the invocation.
-    """
-
-    kind = "node"
-
-    def __init__(self, setup: Setup, orders: Sequence[_Order[Any]] = (), entry: int = 1) -> None:
-        self._setup, self._entry = setup, entry
-        self._last = orders[-1:]
-        self._spawned = ServedProcess.of(PROGRAM)
-        with contextlib.ExitStack() as undo:
-            undo.callback(self.close)
-            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {setup.node}")
-            self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
-            for order in orders[:-1]:
-                self._work(order)
-            self._image = Image(self._spawned.pid, self.scope_of_node.regions)
-            undo.pop_all()
-
-    def _work(self, order: _Order[Any]) -> None:
-        self._process.take(self._process.order(self._setup.node, *order))
-
-    def count_entries(self, orders: Sequence[_Order[Any]]) -> list[int]:
-        """Count the kernel's entries up to the end of each order.
-
-        Raises:
-            TracingForbidden: the operating system allows neither counting nor tracing.
-        """
-        counts, address = [], self._image.address(self.scope_of_node.entry)
-        with contextlib.closing(EntryCounter(self._spawned.pid, address)) as counter:
-            for order in orders:
-                self._work(order)
-                counts.append(counter.read())
-        return counts
-
-    @property
-    def name(self) -> str:
-        """Name of the kernel."""
-        return self.scope_of_node.kernel
-
-    def start(self) -> Tracee:
-        """Start a fork of the node, stopped where it begins the invocation."""
-        tracee = Tracee.attach(self._process.rehearse())
-        self._process.order(self._setup.node, *self._last[0])
-        if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
-            raise TargetError(f"node {self._setup.node}", "does not begin its invocation again")
-        return tracee
-
-    def image(self, _: Tracee) -> Image:
-        """The memory image of the node and of each fork."""
-        return self._image
-
-    def scope(self, image: Image) -> Scope:
-        """The code in scope."""
-        return image.scope(self.scope_of_node.objects)
-
-    def profile(self, rng: np.random.Generator) -> TargetProfile:
-        """Step the invocation, or a sample of it.
-
-        Stepping runs on the node's processor, because switching between two doubles the time.
-        """
-        linux.share_processor(self._spawned.pid)
-        node, inner = self._setup.node, self.scope_of_node.inner
-        if node in _INNER_CALLS:
-            return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
-        if node != "planner":
-            return profile_call(self, limit=_WHOLE_LIMIT)
-        # No native function encloses a request: Python calls several compiled functions, with or
-        # without a search, which begins with the first of `inner`. So the request ends with the
-        # run. It is stepped whole if it needs no search.
-        tracee = self.start()
-        try:
-            searches = tracee.count_to_end(self._image.address(inner[0])) > 0
-        finally:
-            tracee.kill()
-        if not searches:
-            with contextlib.suppress(WindowTooLong):  # smoothing repeats its attempts
-                return profile_run(self, rng, limit=_WHOLE_LIMIT)
-        several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
-        return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
-
-    @classmethod
-    def profile_invocation(
-        cls,
-        setup: Setup,
-        orders: Sequence[_Order[Any]],
-        entry: int,
-        earlier: int,
-        rng: np.random.Generator,
-    ) -> TargetProfile:
-        """Profile one invocation of a node's kernel in the last of the orders.
-
-        Args:
-            orders: the orders up to the one that contains the invocation.
-            entry: number of the kernel entry that begins the invocation, from 1.
-            earlier: number of kernel entries in the earlier orders.
-            rng: draws the sample, if only a sample is stepped.
-
-        Raises:
-            TracingForbidden: the operating system refuses.
-            WindowTooLong: the invocation is too long to be stepped.
-            TargetError: nothing in scope executes.
-        """
-        with contextlib.closing(cls(setup, orders, entry - earlier)) as place:
-            profile = TracerThread(lambda _armed: place.profile(rng)).result()
-        return profile.after(CountedStop(place.scope_of_node.entry, entry))
-
-    def close(self) -> None:
-        """End the node."""
-        self._spawned.kill()
 
 
 # Flight -------------------------------------------------------------------------------------------
@@ -461,11 +457,7 @@ class InstructionInjection(NoInjection):
     def _ending(self) -> str | None:
         """Return how the node ended, if the tracer noticed it."""
         ended = None if self._tracer is None else self._tracer.result().ended
-        if ended is None:
-            return None
-        if ended.signal is not None:
-            return f"killed by {signal.Signals(ended.signal).name}"
-        return f"ended with code {ended.exit_code}"
+        return None if ended is None else ended.describe()
 
     def _note_strike(self) -> None:
         """Check for a strike between two inputs, so that its tick does not depend on speed.
@@ -486,19 +478,40 @@ class InstructionInjection(NoInjection):
     def finish(self) -> dict[str, Any]:
         """Return the record at the end of the mission, which is the same in every repetition."""
         assert self._tracer is not None
-        written = self._tracer.result().record
-        injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
-        reason = written.get("not_injected_reason", "")
-        state = "applied" if injection["applied"] else "not_injected"
-        if written["corruption"] is None and not reason:
-            state = "null"
-        ending = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
-        return {**written, **ending}
+        return _repeatable(self._tracer.result().record)
 
     def close(self) -> None:
         """End the node's process if no executor owns it."""
         if self._tracer is None:
             self._spawned.kill()
+
+
+class StruckInjection(StruckNode):
+    """A fault that has struck its node in a rehearsal."""
+
+    def __init__(self, struck: Struck, node: str, order: int) -> None:
+        written = self._written = struck.record
+        text = "" if written["corruption"] is None else _attack_text(written)
+        super().__init__(node, order, struck.effect.value, struck.process, text)
+
+    def begin(self, path: Path) -> None:
+        """Write the record."""
+        record.write(path, self._written)
+
+    def finish(self) -> dict[str, Any]:
+        """Return the record, as `InstructionInjection` does."""
+        return _repeatable(self._written)
+
+
+def _repeatable(written: FaultRecord) -> dict[str, Any]:
+    """Return a completed record without measured times."""
+    injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
+    reason = written.get("not_injected_reason", "")
+    state = "applied" if injection["applied"] else "not_injected"
+    if written["corruption"] is None and not reason:
+        state = "null"
+    ending = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
+    return {**written, **ending}
 
 
 def _attack_text(written: FaultRecord) -> str:

@@ -1,0 +1,320 @@
+"""Rehearses a node: it works through the orders of a golden flight, without the flight.
+
+Before an order the node is stopped and forked, as often as needed. A fork is the node in front of
+this invocation, with the same memory. One fork after the other receives the order, because all
+share the socket of the node: forks that are stepped for a profile, one with a fault, and
+two without it, with which the struck one is compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.kernels.scope import KernelScope
+from mavfi_cli.attack.profile import TargetProfile, profile_call, profile_calls, profile_run
+from mavfi_cli.attack.served import CHANNEL, ServedProcess
+from mavfi_cli.attack.tracer_thread import EntryCounter
+from mavfi_cli.companion.node_process import (
+    HANG_CPU_S,
+    HANG_WALL_S,
+    HUNG,
+    LostNode,
+    NodeLost,
+    NodeProcess,
+)
+from mavfi_cli.core.errors import TargetError
+from mavfi_cli.core.processes import value_of
+from mavfi_cli.fi.tracer import linux, record
+from mavfi_cli.fi.tracer.counted import CountedStop
+from mavfi_cli.fi.tracer.fault import InstructionFault
+from mavfi_cli.fi.tracer.image import Image, Scope
+from mavfi_cli.fi.tracer.inject import reach, strike
+from mavfi_cli.fi.tracer.linux import ProcessTimer
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.fi.tracer.sampling import WindowTooLong
+from mavfi_cli.fi.tracer.state import StoppedFork, remembers_the_same
+from mavfi_cli.fi.tracer.tracee import CLOSE, SENDTO, Tracee
+from mavfi_cli.mission.instruction import PROGRAM
+
+Order = tuple[str, Any, float]  # node, input, start stamp
+_WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
+_WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
+_INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelInvocation:
+    """One invocation of a kernel, and the entry with which it begins."""
+
+    number: int  # number of the kernel's invocation, from 1
+    of: int
+    order: int  # number of the node's order that contains it, from 1
+    entry: int  # number of the kernel's entry with which it begins, from 1
+    earlier: int  # entries in the earlier orders
+
+
+class NodeEffect(Enum):
+    """What a fault did to a node until its answer."""
+
+    MASKED = "masked"  # it answers, and remembers, what it does without the fault
+    CHANGED = "changed"
+    ENDED = "ended"
+    HUNG = "hung"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Struck:
+    """A struck node.
+
+    Attributes:
+        record: as of a fault in a flight.
+        process: the node from this order on; None if the fault is masked.
+    """
+
+    record: FaultRecord
+    effect: NodeEffect
+    process: NodeProcess | None
+
+
+class Rehearsal:
+    """The `AttackPlace` in which one invocation of a node's kernel runs.
+
+    Use it in one thread.
+
+    Args:
+        setup: the first message to the node's program.
+        orders: those of all nodes of its process, in the order of their starts.
+    """
+
+    kind = "node"
+
+    def __init__(self, setup: object, node: str, orders: Sequence[Order]) -> None:
+        self._node, self._orders = node, orders
+        self._done, self._entry = 0, 1  # finished orders; entry of the awaited invocation in its
+        self._stopped: Tracee | None = None  # the node, in front of an order
+        self._sender = threading.Thread()
+        self._sender.start()
+        self._spawned = ServedProcess.of(PROGRAM)
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.close)
+            self.scope_of_node: KernelScope = self._spawned.begin(setup, f"node {node}")
+            self._process = NodeProcess(self._spawned.connection, self._spawned.pid)
+            self._image = Image(self._spawned.pid, self.scope_of_node.regions)
+            undo.pop_all()
+
+    def close(self) -> None:
+        """End the node."""
+        self._spawned.kill()
+
+    @property
+    def name(self) -> str:
+        """Name of the kernel."""
+        return self.scope_of_node.kernel
+
+    # Orders
+
+    def count_entries(self) -> list[int]:
+        """Count the kernel's entries up to the end of each order of the node, in a fork.
+
+        Raises:
+            TracingForbidden: the operating system allows neither counting nor tracing.
+        """
+        counts, address = [], self._image.address(self.scope_of_node.entry)
+        fork = self._stop().fork()
+        fork.detach()
+        process = NodeProcess(self._spawned.connection, fork.pid)
+        try:
+            with contextlib.closing(EntryCounter(fork.pid, address)) as counter:
+                for node, value, start_s in self._orders:
+                    if node == self._node:
+                        process.take(process.order(node, value, start_s))
+                        counts.append(counter.read())
+        finally:
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(fork.pid, signal.SIGKILL)
+                os.waitpid(fork.pid, 0)
+        return counts
+
+    def go_to(self, invocation: KernelInvocation) -> None:
+        """Work up to the order that contains an invocation, which is not before this one."""
+        self._entry = invocation.entry - invocation.earlier
+        own = [at for at, (node, *_) in enumerate(self._orders) if node == self._node]
+        self._sender.join()
+        while self._done < own[invocation.order - 1]:
+            if self._stopped is not None:
+                self._stopped.detach()
+                self._stopped = None
+            self._process.take(self._process.order(*self._orders[self._done]))
+            self._done += 1
+
+    def _stop(self) -> Tracee:
+        """Stop the node where it waits for an order."""
+        if self._stopped is None:
+            self._stopped = Tracee.attach(self._spawned.pid, alone=True)
+            self._stopped.await_call()
+        return self._stopped
+
+    def _fork(self) -> Tracee:
+        """Fork the node, and give the fork the next order."""
+        self._sender.join()
+        fork, order = self._stop().fork(), self._orders[self._done]
+        # A long message needs a reader: the fork, which runs later.
+        self._sender = threading.Thread(target=self._process.rehearse, args=order, daemon=True)
+        self._sender.start()
+        return fork
+
+    # Profile
+
+    def start(self) -> Tracee:
+        """Start a fork, stopped where it begins the invocation; it ends without an answer."""
+        tracee = self._fork()
+        if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
+            raise TargetError(f"node {self._node}", "does not begin its invocation again")
+        tracee.system_call(CLOSE, CHANNEL)
+        return tracee
+
+    def image(self, _: Tracee) -> Image:
+        """The memory image of the node and of each fork."""
+        return self._image
+
+    def scope(self, image: Image) -> Scope:
+        """The code in scope."""
+        return image.scope(self.scope_of_node.objects)
+
+    def profile(self, invocation: KernelInvocation, rng: np.random.Generator) -> TargetProfile:
+        """Step an invocation, or a sample of it.
+
+        Stepping runs on the node's processor, because switching between two doubles the time.
+
+        Args:
+            rng: draws the sample, if only a sample is stepped.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            WindowTooLong: the invocation is too long to be stepped.
+            TargetError: nothing in scope executes.
+        """
+        self.go_to(invocation)
+        linux.share_processor(self._spawned.pid)
+        return self._stepped(rng).after(CountedStop(self.scope_of_node.entry, invocation.entry))
+
+    def _stepped(self, rng: np.random.Generator) -> TargetProfile:
+        node, inner = self._node, self.scope_of_node.inner
+        if node in _INNER_CALLS:
+            return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
+        if node != "planner":
+            return profile_call(self, limit=_WHOLE_LIMIT)
+        # No native function encloses a request: Python calls several compiled functions, with or
+        # without a search, which begins with the first of `inner`. So the request ends with the
+        # run. It is stepped whole if it needs no search.
+        tracee = self.start()
+        try:
+            searches = tracee.count_to_end(self._image.address(inner[0])) > 0
+        finally:
+            tracee.kill()
+        if not searches:
+            with contextlib.suppress(WindowTooLong):  # smoothing repeats its attempts
+                return profile_run(self, rng, limit=_WHOLE_LIMIT)
+        several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
+        return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
+
+    # Strike
+
+    def strike(
+        self, fault: InstructionFault, invocation: KernelInvocation, context: Mapping[str, Any]
+    ) -> Struck:
+        """Strike an invocation in a fork, and compare the fork with two unstruck ones.
+
+        Args:
+            context: further entries of the record.
+
+        Raises:
+            TracingForbidden: the operating system refuses.
+            OSError: no fork can be made, or its memory cannot be read.
+            FaultError: the location holds another instruction.
+        """
+        self.go_to(invocation)
+        objects = list(self.scope_of_node.objects)
+        planned = record.planned(fault, self._image, scope=objects, **context)
+        first, *others = fault.trigger
+        here = replace(fault, trigger=(replace(first, count=self._entry), *others))
+        with contextlib.ExitStack() as undo:
+
+            def reached() -> tuple[Tracee, str]:
+                tracee = self._fork()
+                undo.callback(lambda: tracee.kill() if tracee.pid != freed else None)
+                return tracee, reach(tracee, self._image, here)
+
+            freed = 0
+            tracee, reason = reached()
+            if reason:
+                raise TargetError(f"node {self._node}", reason)
+            with _limited(tracee) as alarm:
+                injection, followed = strike(tracee, here, window=64)
+            if alarm.fired:
+                raise TargetError(f"node {self._node}", "hangs before it is struck")
+            reason = "" if injection is None else injection.reason
+            done = record.completed(planned, injection, followed, not_injected_reason=reason)
+            struck, process = _run_to_answer(tracee), None
+            if not isinstance(struck, StoppedFork):
+                effect = NodeEffect.HUNG if struck.hung else NodeEffect.ENDED
+                return Struck(record=done, effect=effect, process=LostNode(struck))
+            runs = (_run_to_answer(reached()[0]) for _ in range(2))
+            unstruck = [fork for fork in runs if isinstance(fork, StoppedFork)]
+            if len(unstruck) < 2:
+                raise TargetError(f"node {self._node}", "does not answer again")
+            if remembers_the_same(struck, unstruck):
+                return Struck(record=done, effect=NodeEffect.MASKED, process=None)
+            process = self._free(tracee)
+            freed = tracee.pid
+            return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
+
+    def _free(self, tracee: Tracee) -> NodeProcess:
+        """Give a fork that answers a socket of its own, and let it continue without a tracer."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with theirs:
+            socket.send_fds(self._spawned.connection, [b"!"], [theirs.fileno()])
+            tracee.undo_call()
+            tracee.replace_socket(CHANNEL)
+        tracee.detach()
+        process = NodeProcess(ours, tracee.pid)
+        process.work_ahead(self._done + 1)
+        return process
+
+
+def _run_to_answer(tracee: Tracee) -> StoppedFork | NodeLost:
+    """Run a fork until it begins to send an answer, or until it has ended or hung."""
+    calls: Sequence[tuple[int, ...]] = ()
+    if tracee.ended is None:
+        with _limited(tracee) as alarm:
+            calls = tracee.run_to_call(SENDTO, CHANNEL)
+        if alarm.fired:
+            return NodeLost(hung=True, how=HUNG)
+    if (ended := tracee.ended) is not None:
+        return NodeLost(hung=False, how=ended.describe())
+    _, _, address, size, *_ = calls[-1]
+    return StoppedFork(tracee=tracee, calls=calls, clock=_time_of(tracee.memory, address, size))
+
+
+def _limited(tracee: Tracee) -> ProcessTimer:
+    """Return a timer that kills a node that hangs."""
+    return ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=HANG_CPU_S, wall_s=HANG_WALL_S)
+
+
+def _time_of(memory: linux.Memory, address: int, size: int) -> bytes:
+    """Return the host time in an answer as its pickle has it; nothing if it is corrupted."""
+    try:
+        return struct.pack(">d", value_of(memory.read(address, size)).host_s)
+    except Exception:  # a corrupted pickle can raise any error
+        return b""
