@@ -47,17 +47,12 @@ def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
 
 def send(connection: socket.socket, value: Any) -> None:
     """Send one value."""
-    connection.sendall(message_of(value))
-
-
-def message_of(value: Any) -> bytes:
-    """Return the bytes with which `send` sends a value."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
-    return len(data).to_bytes(_LENGTH, "little") + data
+    connection.sendall(len(data).to_bytes(_LENGTH, "little") + data)
 
 
 def value_of(message: bytes) -> Any:
-    """Return the value of a whole message. Raises as `receive`."""
+    """Return the value in the bytes that `send` has sent. Raises as `receive`."""
     return _Values(io.BytesIO(message[_LENGTH:])).load()
 
 
