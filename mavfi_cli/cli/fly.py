@@ -154,8 +154,8 @@ _detector, _output = section("Detector"), section("Output")
 @_instruction("--role", "roles", multiple=True, type=types.ROLE,
               help="Role of the operand: source or destination  [both].")  # fmt: skip
 @_instruction("--compat", type=types.COMPAT, metavar="INJECTOR",
-              help="Choose operands and bits as another injector: pinfi, pinfi-bugs, rosfi-2021. "
-                   "rosfi-2021 also draws the moment by processor time.")  # fmt: skip
+              help="Choose operands and bits as another injector: pinfi, pinfi-bugs, "
+                   "rosfi-2021.")  # fmt: skip
 @_detector("--detector", type=types.DETECTOR, metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
