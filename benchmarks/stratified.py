@@ -88,7 +88,7 @@ def show(name: str, cells: Cells, missions: int, repetitions: int) -> None:
         values = np.array([share.share for share in shares])
         width = np.mean([share.high - share.low for share in shares])
         covered = np.mean([share.low <= truth <= share.high for share in shares])
-        effective = np.mean([share.effective or share.total for share in shares])
+        effective = np.mean([share.effective for share in shares])
         error = values.std(ddof=1) / np.sqrt(repetitions)
         print(
             f"  {kind:10} mean {100 * values.mean():.2f} +- {100 * error:.2f} %, "

@@ -179,8 +179,7 @@ def _settings_table(ledger: Ledger) -> PaperTable:
         success = PaperCell.of_share(share)
         means = [PaperCell.of_interval(group.mean(name), k) for name, k in _MEANS.values()]
         if ledger.stratified:
-            effective = share.total if share.effective is None else share.effective
-            means.insert(0, PaperCell(value=float(effective), count=share.total))
+            means.insert(0, PaperCell(value=float(share.effective), count=share.total))
         labels = tuple(settings.cells(group.labels, group.name))
         rows.append(PaperRow(labels=labels, cells=(success, *means)))
     about = "success: golden missions and faults that struck; means: the successful of them"

@@ -163,8 +163,7 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
 
 
 def _weighted_cells(share: Share) -> list[str]:
-    effective = share.total if share.effective is None else share.effective
-    return [percent(share.share), str(effective)]
+    return [percent(share.share), str(share.effective)]
 
 
 def _sure(confidence: float) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ class McNemar:
         both, neither: pairs in which both or neither succeeded.
         only_first, only_second: pairs in which only one succeeded.
         p_value: two-sided, exact.
-        weighted: the difference by the weights of a stratified sample; None in a uniform one.
     """
 
     both: int
@@ -44,11 +43,9 @@ class McNemar:
     only_second: int
     neither: int
     p_value: float
-    weighted: float | None = None
 
-    @classmethod
+    @staticmethod
     def of(
-        cls,
         first: Sequence[bool] | BoolArray,
         second: Sequence[bool] | BoolArray,
         *,
@@ -68,18 +65,19 @@ class McNemar:
         neither, only_second, only_first, both = np.bincount(ends, minlength=4).tolist()
         differing = only_first + only_second
         p_value = float(binomtest(only_first, differing).pvalue) if differing else 1.0
-        weighted = None
-        if weights is not None:
-            changes = weights * (np.asarray(second, np.int64) - np.asarray(first, np.int64))
-            weighted = float(changes.sum() / weights.sum()) if len(changes) else math.nan
-            p_value = sign_flips(changes.tolist())
-        return cls(
+        test = McNemar(
             both=both,
             only_first=only_first,
             only_second=only_second,
             neither=neither,
             p_value=p_value,
-            weighted=weighted,
+        )
+        if weights is None:
+            return test
+        changes = weights * (np.asarray(second, np.int64) - np.asarray(first, np.int64))
+        return WeightedMcNemar(
+            **{**asdict(test), "p_value": sign_flips(changes.tolist())},
+            difference=float(changes.sum() / weights.sum()) if len(changes) else math.nan,
         )
 
     @property
@@ -90,9 +88,14 @@ class McNemar:
     @property
     def difference(self) -> float:
         """Success rate of the second minus that of the first; NaN without pairs."""
-        if self.weighted is not None:
-            return self.weighted
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeightedMcNemar(McNemar):
+    """Counts of pairs, and a difference by the weights of a stratified sample."""
+
+    difference: float = field()
 
 
 def sign_flips(differences: Sequence[float]) -> float:

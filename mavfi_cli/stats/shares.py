@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mavfi_cli.core.errors import ConfigError
@@ -42,19 +42,18 @@ NO_INTERVAL = Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Share:
-    """A proportion with its interval.
-
-    Attributes:
-        effective: of a stratified sample, the number of uniformly drawn observations with as narrow
-            an interval; None for a uniform sample.
-    """
+    """A proportion with its interval."""
 
     count: int
     total: int
     share: float
     low: float
     high: float
-    effective: int | None = None
+
+    @property
+    def effective(self) -> int:
+        """Number of uniformly drawn observations with as narrow an interval."""
+        return self.total
 
     @property
     def counts(self) -> str:
@@ -91,6 +90,13 @@ class Share:
         if not upsets_per_hour >= 0.0:
             raise ConfigError(f"must be at least 0, got {upsets_per_hour:g}", key="upsets_per_hour")
         return upsets_per_hour * self.share, upsets_per_hour * self.low, upsets_per_hour * self.high
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StratifiedShare(Share):
+    """A proportion of a stratified sample, estimated by weight."""
+
+    effective: int = field()
 
 
 def wilson(

@@ -10,11 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
-from mavfi_cli.stats.shares import Share, missions_for_margin, score_interval, wilson, z_of
+from mavfi_cli.stats.shares import (
+    Share,
+    StratifiedShare,
+    missions_for_margin,
+    score_interval,
+    wilson,
+    z_of,
+)
 
 DEFENCE = 0.25  # share of the missions that is allocated by size alone, which bounds weights by 4
 _UNIT = 1 << 40  # of a cell in `rounded`, so that sums are exact
@@ -154,7 +161,7 @@ def weighted_share(
     if not _LEAST_MARGIN <= margin < 0.5:
         return estimate
     effective = missions_for_margin(margin, expected=share, confidence=confidence)
-    return replace(estimate, effective=effective)
+    return StratifiedShare(**asdict(estimate), effective=effective)
 
 
 def kish(weights: Sequence[float]) -> float:

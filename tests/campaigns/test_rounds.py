@@ -126,7 +126,7 @@ def test_detectors_fly_the_same_faults(whole):
         assert replace(watched, detector=None) == bare
         assert draws[number][1:4] == draws[number + 1][1:4]
         assert bare.seed == configs[number - 1].seed
-    assert (comparison.success.pairs, comparison.success.weighted) == (50, 0.0)
+    assert (comparison.success.pairs, comparison.success.difference) == (50, 0.0)
 
 
 def test_status_says_so_and_gives_an_effective_number(whole):
@@ -139,7 +139,7 @@ def test_status_says_so_and_gives_an_effective_number(whole):
     assert "stratified sample" in "\n".join(report.lines())
     assert "stratified sample" in "\n".join(table.notes)
     golden, struck, _ = report.summary.cells
-    assert golden.success.effective is None
+    assert golden.success.effective == golden.success.total
     assert struck.success.total == 50
     assert 30 < struck.success.effective < 100  # small strata doubt what they hold
     assert struck.every.share == pytest.approx(1.0 - 11 / 128, abs=0.05)
