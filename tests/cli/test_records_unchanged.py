@@ -91,8 +91,9 @@ COMMANDS = {
     # Renewed when an export got the costs of detection and recovery, and when kernels became code
     # of x86-64-v3 on every processor, so that a fault in an instruction strikes the same one, and
     # when `struck_bits` became a list.
+    # Renewed when summaries got `sampling`, and exports `stratum` and `weight`; all else is equal.
     "campaign": (
-        "27e9b1da03e0f467",
+        "398cc62f8888bf8c",
         ["campaign", "run", "hashed.toml", "--quiet", "--out", "c", "--json"],
         ["campaign", "status", "c", "--quality", "--failures", "--json"],
         ["campaign", "export", "c", "-"],
@@ -102,7 +103,9 @@ COMMANDS = {
     # Renewed when operands became the bits that are read or written, and when the settings got the
     # memory of a run, and with the code of x86-64-v3.
     # Renewed when the summary got the null runs; all else is equal.
-    "kernels": ("7d1fc4ea7f2c0829", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
+    # Renewed when control's parameters, which its inputs contain, got `slice_period_s`: only
+    # `inputs_sha256` differs.
+    "kernels": ("42f19572d5433429", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
         "eac34e35e3c1cd54",
         [
