@@ -66,7 +66,9 @@ def repeat(attacked, tmp_path):
 
 
 @traced
-@pytest.mark.parametrize("node", ["control", "collision_check"])
+@pytest.mark.parametrize(
+    "node", ["control", pytest.param("collision_check", marks=pytest.mark.slow)]
+)
 def test_a_null_injection_changes_nothing(fly_short, short_flight, node):
     folder = fly_short(instruction=InstructionConfig(target=node, seed=3, null=True))
     assert flown(folder, without=OF_THE_FAULT) == flown(short_flight, without=OF_THE_FAULT)
@@ -271,6 +273,7 @@ def test_the_nodes_of_a_pair_get_the_same_bytes(short_config):
     assert pickle.loads(messages[0]).config == replace(short_config, goal_tolerance_m=own_m)
 
 
+@pytest.mark.slow
 def test_a_node_that_has_filled_a_cache_is_started_again(short_config):
     """A program that compiles its modules has another memory than one that finds bytecode."""
     briefing = replace(short_config, goal=(20.0, 0.0, 5.0)).briefing(np.zeros(3))

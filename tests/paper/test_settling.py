@@ -45,6 +45,7 @@ def settled(plan, spectator, hours):
         return settle(plan, ledger, TASK, spectator, hours)
 
 
+@pytest.mark.slow
 def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
     """No made-up fault does harm, which contradicts that fields of a number differ in harm."""
     monkeypatch.setattr(settling, "BATCH", 150)
