@@ -58,10 +58,10 @@ def test_the_server_flies_on_until_the_gate_withholds_what_no_longer_changes(
 
     unguarded = fly()
     assert unguarded.record.outcome == "timeout"  # nobody has noticed
-    assert not any("ailsafe" in event["text"] for event in unguarded.record.events)
+    assert not any("ailsafe" in event.text for event in unguarded.record.events)
     guarded = fly(detector=detector)
     assert guarded.record.outcome == "crash"
-    texts = [event["text"] for event in guarded.record.events]
+    texts = [event.text for event in guarded.record.events]
     assert "the program script is gone: its setpoints are withheld" in texts
     assert "a failsafe has taken over" in texts
-    assert guarded.record.detection["responses"]["stale"] >= 1
+    assert guarded.record.detection.responses["stale"] >= 1

@@ -188,7 +188,7 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
     assert run.record.outcome == outcome
     assert run.record.state_fault.state == "applied"
     assert any(line in text for text in summary_lines(run.record))
-    assert any(event["kind"] == "fault" for event in run.record.events)
+    assert any(event.kind == "fault" for event in run.record.events)
 
 
 def test_a_message_needs_a_users_companion(tmp_path):
