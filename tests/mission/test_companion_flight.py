@@ -8,6 +8,7 @@ import pytest
 
 from mavfi_cli import library
 from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, UnknownName
+from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.run import fly_again
 from mavfi_cli.report.summary import summary_lines
@@ -43,9 +44,9 @@ def test_a_flight_leaves_a_record_as_any_other(fly):
     run = fly("lands", program='ready_line = "ready"')
     record, quality = run.record, run.record.quality_of_flight
     assert (record.outcome, record.reason) == ("success", "landed")
-    assert record.programs == {"hop": {"starts": 1, "codes": []}}
-    assert 8.0 < quality["distance_m"] < 16.0
-    assert quality["min_clearance_m"] > 0.0
+    assert record.programs == {"hop": ProgramEnds(starts=1)}
+    assert 8.0 < quality.distance_m < 16.0
+    assert quality.min_clearance_m > 0.0
     assert record.config["companion"].endswith("hop.toml")
     assert list(record.files.values()) != [""]
     assert (run.folder.programs / "hop" / "stdout").read_text() == "ready\n"
