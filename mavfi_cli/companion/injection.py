@@ -236,11 +236,6 @@ class StruckNode(NoInjection):
         news, self._news = self._news, []
         return news
 
-    def close(self) -> None:
-        """End the node."""
-        if self.process is not None:
-            self.process.close(kill=True)
-
 
 def _strike_text(strike: Strike) -> str:
     if not strike.changes:

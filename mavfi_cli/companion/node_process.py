@@ -18,7 +18,6 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -34,7 +33,6 @@ HANG_CPU_S = 5.0
 HANG_WALL_S = 120.0
 HUNG = "hung: killed by the watchdog"
 _LOOK_S = 0.25
-_EXIT_FIELD = 52  # proc_pid_stat(5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +91,6 @@ class NodeProcess:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in mid-message
         self._answers: dict[int, _Answer] = {}
         self._count = 0
-        self._ahead = False
         self._gone = False  # True after it was reaped, as its id may then be reused
 
     @classmethod
@@ -115,17 +112,10 @@ class NodeProcess:
         If the process has already ended, `take` reports it.
         """
         self._count += 1
-        if self._ahead:
-            self._ahead = False
-            return self._count
         order = _Order(number=self._count, node=node, input=value, start_s=start_s)
         with contextlib.suppress(OSError):
             send(self._socket, order)
         return order.number
-
-    def work_ahead(self, number: int) -> None:
-        """Note that the process has got the next order, which has this number, already."""
-        self._count, self._ahead = number - 1, True
 
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
         """Send an input to a fork that shares the connection; it has the next order's number."""
@@ -180,16 +170,12 @@ class NodeProcess:
         self._gone = True
         if ending is not None:
             return ending
-        status: int | None
-        try:
+        with contextlib.suppress(ChildProcessError):
             _, status = os.waitpid(self.pid, 0)
-        except ChildProcessError:
-            status = _status_of(self.pid)
-        if status is None:
-            return "ended"
-        if os.WIFSIGNALED(status):
-            return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
-        return f"ended with code {os.waitstatus_to_exitcode(status)}"
+            if os.WIFSIGNALED(status):
+                return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+            return f"ended with code {os.waitstatus_to_exitcode(status)}"
+        return "ended"
 
     def close(self, *, kill: bool = False) -> None:
         """End the process, which exits by itself when the connection closes unless it is stuck."""
@@ -229,19 +215,6 @@ class NodeProcess:
             os._exit(0)
         finally:
             os._exit(1)
-
-
-def _status_of(pid: int) -> int | None:
-    """Return the wait status of a process whose parent is another; None if that has reaped it."""
-    with contextlib.suppress(OSError):
-        process = os.pidfd_open(pid)
-        try:
-            select.select([process], [], [])
-            stat = Path(f"/proc/{pid}/stat").read_text()
-            return int(stat.rpartition(")")[2].split()[_EXIT_FIELD - 3])
-        finally:
-            os.close(process)
-    return None
 
 
 class LostNode(NodeProcess):

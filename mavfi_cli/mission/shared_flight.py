@@ -108,7 +108,7 @@ class SharedFlight(NoInjection):
             if config.instruction is not None
         }
         self.recorder = Recorder() if self._requests else None
-        self._struck: dict[int, StruckNode] = {}  # nodes that a further flight takes over
+        self._struck: dict[int, StruckNode] = {}  # nodes that are lost in a further flight
         self._ticks: list[tuple[float, int, FloatArray]] = []  # stamp, number of events, position
         self._injections = {
             number: NoInjection()
@@ -187,7 +187,7 @@ class SharedFlight(NoInjection):
         return self.config, self.folder
 
     def further(self) -> SharedFlight | None:
-        """Return the flight of the missions whose nodes are not what they are without the faults.
+        """Return the flight of the missions whose nodes end or hang.
 
         None in a fork, or if there are none.
         """
@@ -224,7 +224,7 @@ class SharedFlight(NoInjection):
 
 
 class _StruckFlight(SharedFlight):
-    """The same flight once more, up to the last order at which a struck node is taken over."""
+    """The same flight once more, up to the last order over which a node is lost."""
 
     def __init__(
         self,
@@ -236,10 +236,10 @@ class _StruckFlight(SharedFlight):
         self._requests.clear()
         self._left = dict(struck)
         self._injections |= struck
-        self.recorder = _Starts(self._take_over)
+        self.recorder = _Starts(self._lose)
 
-    def _take_over(self, node: str, order: int) -> None:
-        """Fork the missions whose node is struck in this order.
+    def _lose(self, node: str, order: int) -> None:
+        """Fork the missions whose node is lost over this order.
 
         Raises:
             SystemExit: this is the shared flight, and no mission is left.
@@ -252,7 +252,6 @@ class _StruckFlight(SharedFlight):
                     self.host["struck"] = injection.effect
                     self.flight.isolate_late(node, injection.process)
                     return
-                injection.close()
         if self.config is None and not self._left:
             raise SystemExit
 

@@ -101,7 +101,7 @@ STRUCK = [  # node and seed; of `hardened`, by the effect in its flight without 
 @pytest.mark.slow
 @traced
 @pytest.mark.parametrize("stack", ["hardened", "mavbench"])
-def test_a_struck_node_is_taken_over_as_if_it_had_flown(short_config, tmp_path, stack):
+def test_a_node_struck_in_a_rehearsal_flies_as_if_struck_in_flight(short_config, tmp_path, stack):
     base = replace(short_config, stack=stack)
     quick, guarded = replace(base, node_restart_s=0.1), replace(base, detector=GAD)
     null = InstructionConfig(target="point_cloud", null=True)

@@ -38,10 +38,7 @@ _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # distance of a detour's pages from th
 _PAGES_BYTES = 8192
 # System calls.
 CLOSE, SENDTO = 3, 44
-_MMAP, _MUNMAP, _DUP2, _RECVMSG, _CLONE, _PERF_EVENT_OPEN = 9, 11, 33, 47, 56, 298
-_SCRATCH = 4096  # distance below the stack pointer of what a system call needs, bytes
-_MESSAGE = struct.Struct("=QQ QI4xQQQQi4x")  # iovec and msghdr
-_CONTROL = struct.Struct("=Qiii4x")  # cmsghdr with one descriptor
+_MMAP, _MUNMAP, _CLONE, _PERF_EVENT_OPEN = 9, 11, 56, 298
 _CLONE_PARENT = 0x8000
 _LOOK_S = 1e-3
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
@@ -344,33 +341,6 @@ class Tracee:
             elif status.event == 0:
                 self._pending_signal = status.signal
         return calls
-
-    def undo_call(self) -> None:
-        """Stop in front of the system call that the stopped target has begun, as if it had not."""
-        registers = self.registers
-        before, number, here = registers.general(), registers.system_call, registers.ip
-        registers.write("orig_rax", (1 << 64) - 1)  # which makes the call nothing
-        linux.request(linux.SYSCALL, self.tid)
-        self._wait()
-        registers.write_general(before)
-        assert number is not None
-        again = {"rip": here - len(_SYSTEM_CALL), "rax": number, "orig_rax": (1 << 64) - 1}
-        registers.write_together(again)
-
-    def replace_socket(self, descriptor: int) -> None:
-        """Receive a descriptor (SCM_RIGHTS) on a socket of the stopped target, and use it instead.
-
-        Raises:
-            OSError: there is no room below the stack pointer.
-        """
-        place = self.registers.sp - _SCRATCH & ~15
-        text, control = place + _MESSAGE.size, place + _MESSAGE.size + 16
-        message = _MESSAGE.pack(text, 1, 0, 0, place, 1, control, _CONTROL.size, 0)
-        self.memory.write(place, message + bytes(16 + _CONTROL.size))
-        self.system_call(_RECVMSG, descriptor, place + 16, 0)
-        _, _, _, received = _CONTROL.unpack(self.memory.read(control, _CONTROL.size))
-        self.system_call(_DUP2, received, descriptor)
-        self.system_call(CLOSE, received)
 
     def system_call(self, number: int, *arguments: int) -> int:
         """Make the stopped target execute a system call and restore its state."""

@@ -35,7 +35,7 @@ from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection, StruckNode
 from mavfi_cli.companion.kernels import ControlInput
-from mavfi_cli.companion.node_process import NodeProcess
+from mavfi_cli.companion.node_process import LostNode, NodeProcess
 from mavfi_cli.core.archive import pack, unpack
 from mavfi_cli.core.errors import FaultError, MavfiError, RecordError
 from mavfi_cli.core.files import (
@@ -257,7 +257,8 @@ def struck_nodes(
 ) -> dict[int, StruckInjection]:
     """Strike the faults of missions in a rehearsal.
 
-    A fault that cannot be planned there or compared is left out.
+    A fault that cannot be planned there or compared is left out, and so is one that changes its
+    node.
 
     Args:
         flown: the missions without their faults.
@@ -281,10 +282,7 @@ def struck_nodes(
             with contextlib.suppress(MavfiError, OSError):
                 fault, context = node.fault(requests[number], invocation, rng)
                 struck = node.rehearsal.strike(fault, invocation, context)
-                if struck.effect is NodeEffect.CHANGED and struck.process is not None:
-                    # One such mission of a test on `mavbench` flew unlike the one flown alone, for
-                    # an unknown reason. So these missions are flown alone.
-                    struck.process.close(kill=True)
+                if struck.effect is NodeEffect.CHANGED:  # only a flight shows what follows
                     continue
                 injections[number] = StruckInjection(struck, node.name, invocation.order)
 
@@ -503,7 +501,8 @@ class StruckInjection(StruckNode):
     def __init__(self, struck: Struck, node: str, order: int) -> None:
         written = self._written = struck.record
         text = "" if written["corruption"] is None else _attack_text(written)
-        super().__init__(node, order, struck.effect.value, struck.process, text)
+        lost = None if struck.loss is None else LostNode(struck.loss)
+        super().__init__(node, order, struck.effect.value, lost, text)
 
     def begin(self, path: Path) -> None:
         """Write the record."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import struct
 import threading
 from collections.abc import Mapping, Sequence
@@ -29,7 +28,6 @@ from mavfi_cli.companion.node_process import (
     HANG_CPU_S,
     HANG_WALL_S,
     HUNG,
-    LostNode,
     NodeLost,
     NodeProcess,
 )
@@ -79,12 +77,12 @@ class Struck:
 
     Attributes:
         record: as of a fault in a flight.
-        process: the node from this order on; None if the fault is masked.
+        loss: how the node ended or hung; None if it answers.
     """
 
     record: FaultRecord
     effect: NodeEffect
-    process: NodeProcess | None
+    loss: NodeLost | None = None
 
 
 class Rehearsal:
@@ -253,10 +251,9 @@ class Rehearsal:
 
             def reached() -> tuple[Tracee, str]:
                 tracee = self._fork()
-                undo.callback(lambda: tracee.kill() if tracee.pid != freed else None)
+                undo.callback(tracee.kill)
                 return tracee, reach(tracee, self._image, here)
 
-            freed = 0
             tracee, reason = reached()
             if reason:
                 raise TargetError(f"node {self._node}", reason)
@@ -266,31 +263,17 @@ class Rehearsal:
                 raise TargetError(f"node {self._node}", "hangs before it is struck")
             reason = "" if injection is None else injection.reason
             done = record.completed(planned, injection, followed, not_injected_reason=reason)
-            struck, process = _run_to_answer(tracee), None
+            struck = _run_to_answer(tracee)
             if not isinstance(struck, StoppedFork):
                 effect = NodeEffect.HUNG if struck.hung else NodeEffect.ENDED
-                return Struck(record=done, effect=effect, process=LostNode(struck))
+                return Struck(record=done, effect=effect, loss=struck)
             runs = (_run_to_answer(reached()[0]) for _ in range(2))
             unstruck = [fork for fork in runs if isinstance(fork, StoppedFork)]
             if len(unstruck) < 2:
                 raise TargetError(f"node {self._node}", "does not answer again")
-            if remembers_the_same(struck, unstruck):
-                return Struck(record=done, effect=NodeEffect.MASKED, process=None)
-            process = self._free(tracee)
-            freed = tracee.pid
-            return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
-
-    def _free(self, tracee: Tracee) -> NodeProcess:
-        """Give a fork that answers a socket of its own, and let it continue without a tracer."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        with theirs:
-            socket.send_fds(self._spawned.connection, [b"!"], [theirs.fileno()])
-            tracee.undo_call()
-            tracee.replace_socket(CHANNEL)
-        tracee.detach()
-        process = NodeProcess(ours, tracee.pid)
-        process.work_ahead(self._done + 1)
-        return process
+            same = remembers_the_same(struck, unstruck)
+            effect = NodeEffect.MASKED if same else NodeEffect.CHANGED
+            return Struck(record=done, effect=effect)
 
 
 def _run_to_answer(tracee: Tracee) -> StoppedFork | NodeLost:
