@@ -23,16 +23,16 @@ from mavfi_cli.paper.status import shown
 from mavfi_cli.report.campaign import CampaignReport
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
-SPEC = parse_spec(
-    """
-name = "fragile"
-repetitions = 50
-sampling = "stratified"
-[mission]
-world = "fragile"
-[[setting]]
-name = "golden"
-[[setting]]
+
+def stratified(name, settings):
+    head = f'name = "{name}"\nrepetitions = 50\nsampling = "stratified"\n'
+    head += '[mission]\nworld = "fragile"\n[[setting]]\nname = "golden"\n'
+    return parse_spec(head + settings, Path(f"{name}.toml"))
+
+
+SPEC = stratified(
+    "fragile",
+    """[[setting]]
 name = "FI"
 site = "waypoint_x"
 [[setting]]
@@ -40,23 +40,14 @@ name = "D&R"
 site = "waypoint_x"
 detector = "aad"
 """,
-    Path("fragile.toml"),
 )
-NATIVE = parse_spec(
-    """
-name = "native"
-repetitions = 50
-sampling = "stratified"
-[mission]
-world = "fragile"
-[[setting]]
-name = "golden"
-[[setting]]
+NATIVE = stratified(
+    "native",
+    """[[setting]]
 name = "FI"
 level = "instruction"
 stage = "planning"
 """,
-    Path("native.toml"),
 )
 
 

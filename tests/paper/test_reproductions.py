@@ -20,17 +20,9 @@ from mavfi_cli.paper.items import FlightsPlan, items_named
 from mavfi_cli.paper.status import shown
 from mavfi_cli.spec.mission import MissionConfig
 
+pytestmark = pytest.mark.usefixtures("no_vehicle")
 TASK = Options(jobs=2, task="fake_task")
 SCALE = 0.02  # two of each hundred
-
-
-@pytest.fixture(autouse=True)
-def no_vehicle(monkeypatch):
-    """Let nothing start a vehicle, and let the workers find the task that flies nothing."""
-    monkeypatch.setattr(flying, "check_kinds", lambda missions: None)
-    folder = os.path.join(os.path.dirname(__file__), os.pardir, "campaigns")
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("PYTHONPATH", folder)
 
 
 def plan(out, *names, scale=SCALE, stack="mavbench"):

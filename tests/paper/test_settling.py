@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 
 import pyarrow.parquet as pq
 import pytest
@@ -19,17 +18,9 @@ from mavfi_cli.paper.settling import require_settleable, settle
 from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.paper.verdicts import SettledClaim, Settling, Verdict
 
+pytestmark = pytest.mark.usefixtures("no_vehicle")
 TASK = Options(jobs=2, task="fake_task")
 SCALE = 0.05
-
-
-@pytest.fixture(autouse=True)
-def no_vehicle(monkeypatch):
-    """Let nothing start a vehicle, and let the workers find the task that flies nothing."""
-    monkeypatch.setattr(flying, "check_kinds", lambda missions: None)
-    folder = os.path.join(os.path.dirname(__file__), os.pardir, "campaigns")
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("PYTHONPATH", folder)
 
 
 class Notes(Spectator):
