@@ -35,8 +35,9 @@ def test_one_stack_is_explained_key_by_key_with_sources(command_line, name):
 
 def test_what_a_variant_changes_is_not_the_releases(command_line):
     out = command_line("stacks", "mavbench:guards_tracking=true")[1]
-    assert "  guards_tracking             true   this variant's name\n" in out
-    assert "  stretches_clock             true   release, common/common.cpp" in out
+    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert lines["guards_tracking"].endswith("this variant's name")
+    assert "release, common/common.cpp" in lines["stretches_clock"]
 
 
 def test_stacks_are_compared_side_by_side(command_line):

@@ -8,7 +8,9 @@ list of mappings and the state of signals are compared as well.
 
 Three things do not count: what lies below the stack pointer and its red zone, the vector registers,
 which no function keeps for its caller (System V ABI, section 3.2.1), and readings of a clock. A
-clock leaves numbers that differ between unstruck forks, too.
+clock leaves numbers that differ between unstruck forks, too. All forks have to run on one
+processor, because the operating system writes its number into their memory (struct rseq, the area
+of restartable sequences that the C library registers for each thread).
 """
 
 from __future__ import annotations

@@ -145,7 +145,12 @@ class Rehearsal:
         return counts
 
     def go_to(self, invocation: KernelInvocation) -> None:
-        """Work up to the order that contains an invocation, which is not before this one."""
+        """Work up to the order that contains an invocation, which is not before this one.
+
+        The node and its forks stay on one processor: switching between two doubles the time of
+        stepping, and the C library keeps the processor's number in the memory of each thread.
+        """
+        linux.share_processor(self._spawned.pid)
         self._entry = invocation.entry - invocation.earlier
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self._node]
         self._sender.join()
@@ -193,8 +198,6 @@ class Rehearsal:
     def profile(self, invocation: KernelInvocation, rng: np.random.Generator) -> TargetProfile:
         """Step an invocation, or a sample of it.
 
-        Stepping runs on the node's processor, because switching between two doubles the time.
-
         Args:
             rng: draws the sample, if only a sample is stepped.
 
@@ -204,7 +207,6 @@ class Rehearsal:
             TargetError: nothing in scope executes.
         """
         self.go_to(invocation)
-        linux.share_processor(self._spawned.pid)
         return self._stepped(rng).after(CountedStop(self.scope_of_node.entry, invocation.entry))
 
     def _stepped(self, rng: np.random.Generator) -> TargetProfile:

@@ -9,7 +9,7 @@ import pytest
 
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.core.processes import fork
-from mavfi_cli.fi.tracer.linux import SUPPORTED
+from mavfi_cli.fi.tracer.linux import SUPPORTED, share_processor
 from mavfi_cli.fi.tracer.state import StoppedFork, remembers_the_same
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.mission.machine import OK, check_tracing
@@ -49,6 +49,7 @@ def compared(process, change):
     pid, connection, descriptor, switch = process
 
     def work(_):
+        share_processor(pid)
         node, forks = Tracee.attach(pid, alone=True), []
         node.await_call()
         for struck in (True, False, False):
