@@ -320,11 +320,11 @@ class Rounds:
             for mission, config in missions
             if config in wanted  # without a detector
         ]
-        found: dict[MissionConfig, int] = {}
+        requests: dict[MissionConfig, int] = {}
         for result in self._ledger.results(numbers):
             planner = result.flight.kernels.get(_PLANNER)
-            found[result.mission.config] = 0 if planner is None else planner.invocations
-        return found
+            requests[result.mission.config] = 0 if planner is None else planner.invocations
+        return requests
 
     def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
         """Spread of the losses in each stratum, without a detector if such missions are flown."""

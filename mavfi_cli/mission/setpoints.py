@@ -82,8 +82,8 @@ def command_of(
     stamp_s = 0.0 if state is None else state.stamp_s
     if setpoint.get_msgId() == _ATTITUDE:
         roll, pitch, yaw = _euler(setpoint.q)
-        asked = np.array([roll, pitch, setpoint.thrust])
-        return Command(stamp_s=stamp_s, velocity_enu_mps=asked, yaw_rad=yaw)
+        attitude = np.array([roll, pitch, setpoint.thrust])
+        return Command(stamp_s=stamp_s, velocity_enu_mps=attitude, yaw_rad=yaw)
     mask, body = setpoint.type_mask, setpoint.coordinate_frame in _BODY
     move = [0.0, 0.0, 0.0]  # north, east, down; of a body frame: forward, right, down
     targets = _position_errors(setpoint, state, global_position)
@@ -101,8 +101,8 @@ def command_of(
         cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
         forward, right = cosine * forward - sine * right, sine * forward + cosine * right
     if not mask & _NO_YAW:
-        asked_rad = yaw_rad - setpoint.yaw if body else 0.5 * math.pi - setpoint.yaw
-        yaw_rad = math.remainder(asked_rad, math.tau) if math.isfinite(asked_rad) else asked_rad
+        new_rad = yaw_rad - setpoint.yaw if body else 0.5 * math.pi - setpoint.yaw
+        yaw_rad = math.remainder(new_rad, math.tau) if math.isfinite(new_rad) else new_rad
     elif not mask & _NO_YAW_RATE:
         yaw_rad -= setpoint.yaw_rate
     return Command(

@@ -5,12 +5,14 @@ import io
 import json
 
 import pytest
-from test_reproductions import TASK, flown, no_vehicle, plan  # noqa: F401
+from test_reproductions import TASK, flown, plan
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.run import run_campaign
 from mavfi_cli.campaigns.specification_file import load_spec
 from mavfi_cli.paper.flying import Forecast
+
+pytestmark = pytest.mark.usefixtures("no_vehicle")
 
 
 @pytest.fixture
