@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -207,8 +208,8 @@ class Boot:
     heading_deg: float
 
 
-_OUTPUT = "output.txt"
 _TAIL_LINES, _TAIL_BYTES = 5, 8192  # of its output that an error shows
+_CHUNK = 65_536
 _DEATH_S = 1.0
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # of a terminal
 
@@ -234,17 +235,19 @@ class FirmwareProcess:
     ) -> None:
         self._binary, self._scratch, folder = binary, scratch, scratch.path
         try:
-            with (folder / _OUTPUT).open("wb") as output:
-                self._process = subprocess.Popen(
-                    [str(binary), *arguments], cwd=folder, env={**os.environ, **environment},
-                    stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                    start_new_session=True, preexec_fn=functools.partial(die_with, os.getpid()),
-                )  # fmt: skip
+            self._process = subprocess.Popen(
+                [str(binary), *arguments], cwd=folder, env={**os.environ, **environment},
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                start_new_session=True, preexec_fn=functools.partial(die_with, os.getpid()),
+            )  # fmt: skip
         except OSError as error:
             self._scratch.close()
             raise VehicleProcessError(
                 f"cannot run the firmware {binary}: {error.strerror}"
             ) from None
+        self._tail = bytearray()
+        self._reader = threading.Thread(target=self._keep_tail, daemon=True)
+        self._reader.start()
 
     @staticmethod
     def program(path: Path) -> Path:
@@ -272,15 +275,21 @@ class FirmwareProcess:
     def _state(self) -> str:
         """Describe in a line whether it runs or how it ended, with the last lines of its output."""
         code = self._process.poll()
+        if code is not None:
+            self._reader.join(_DEATH_S)  # not for ever, because a child may hold the pipe
         how = "is running" if code is None else f"ended with code {code}"
         if code is not None and code < 0:
             how = f"was killed by signal {-code}"
-        with (self._scratch.path / _OUTPUT).open("rb") as output:
-            output.seek(max(0, output.seek(0, os.SEEK_END) - _TAIL_BYTES))
-            text = output.read().decode(errors="replace")
+        text = bytes(self._tail).decode(errors="replace")
         lines = [line for raw in text.split("\n") if (line := _plain(raw))]
         last = f": {' | '.join(lines[-_TAIL_LINES:])}" if lines else ""
         return f"the firmware {self._binary} {how}{last}"
+
+    def _keep_tail(self) -> None:
+        """Read its output until the end, and keep the last bytes."""
+        with self._process.stdout as output:  # type: ignore[union-attr]
+            while data := os.read(output.fileno(), _CHUNK):
+                self._tail[:] = (self._tail + data)[-_TAIL_BYTES:]
 
     def end(self) -> None:
         """Kill it with all of its children and remove its folder. May be called repeatedly."""

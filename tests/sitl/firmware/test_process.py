@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from live_processes import gone
+from live_processes import LONG_S, gone
 
 from mavfi_cli.core.errors import LinkError, VehicleProcessError
 from mavfi_cli.core.files import ScratchFolder
-from sitl.firmware import px4
+from sitl.firmware import autopilot, px4
 from sitl.firmware.autopilot import FirmwareProcess
 from sitl.firmware.px4 import Px4Link
 from sitl.firmware.sensors import Sensors
@@ -100,12 +100,28 @@ def test_the_last_words_of_px4_are_in_the_error(tmp_path: Path) -> None:
         firmware.close()
 
 
+def test_a_flood_of_output_takes_no_disk_and_keeps_the_last_words(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(autopilot, "_DEATH_S", LONG_S)
+    scratch = ScratchFolder("test")
+    script = "print('junk ' * 400_000, flush=True); print('no sensors'); raise SystemExit(3)"
+    process = FirmwareProcess(Path(sys.executable), ["-c", script], scratch, {})
+    assert str(process.explain("it closed its link")).endswith("no sensors")
+    assert [path.name for path in scratch.path.iterdir()] == [".mavfi-scratch"]
+    process.end()
+
+
 def test_the_end_takes_children_and_folder_along() -> None:
     scratch = ScratchFolder("test")
     folder = scratch.path
-    script = "import os, time; os.fork(); print(os.getpid(), flush=True); time.sleep(600)"
+    output = folder / "pids.txt"
+    output.touch()
+    script = (
+        "import os, time; os.fork();"
+        " print(os.getpid(), file=open('pids.txt', 'a'), flush=True); time.sleep(600)"
+    )
     process = FirmwareProcess(Path(sys.executable), ["-c", script], scratch, {})
-    output = folder / "output.txt"
     while len(output.read_text().split()) < 2:
         process.require_running()
     pids = [int(word) for word in output.read_text().split()]
