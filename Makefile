@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+JOBS   ?= 4
 SOURCES := mavfi_cli sitl tests benchmarks examples
 SPHINX  := PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-going -E
 
@@ -12,11 +13,11 @@ fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
 
 test: install-dev lint
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 	@echo "Left out: tests marked slow. 'make test-all' runs them too, and so does CI."
 
 test-all: install-dev lint
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 docs: install-dev
 	$(SPHINX) -b html docs build/docs

@@ -204,12 +204,13 @@ def fly(
     from mavfi_cli.report.summary import folder_lines, outcome_line, summary_lines
     from mavfi_cli.report.top_view import draw_top_view
     from mavfi_cli.report.view.entries import ViewedFlight
-    from mavfi_cli.studies.spread import fly_spread
 
     mission = _mission_of(config)
     if golden is not None:
         if mission.companion is None:
             raise click.UsageError("--golden needs --companion; other flights repeat exactly")
+        from mavfi_cli.studies.spread import fly_spread
+
         with progress_view(mission, quiet=quiet) as view:
             spread = fly_spread(mission, golden, out, view)
         text = json.dumps(spread.as_dict(), indent=2)

@@ -114,6 +114,7 @@ def guarded(fly_short):
     return fly_short(detector=DetectorConfig(name="gad"))
 
 
+@pytest.mark.slow
 def test_a_real_record_has_what_it_takes(guarded):
     result = json.loads(guarded.result.read_text())
     found = ComputeOverhead.of([FlightRecord.of(result)])["gad"]

@@ -72,6 +72,7 @@ def test_code_that_callgrind_cannot_name_is_refused_with_the_reason(place, monke
         profiles.profile_counted(where, np.random.default_rng(1), unnamed, begun=0.0)
 
 
+@pytest.mark.slow
 def test_a_long_program_is_attacked_whole(native_program):
     command = Program.of([str(native_program("counting")), "300000"])
     target = ProgramTarget(command=command, comparison=OutputComparison())

@@ -298,6 +298,7 @@ def compiled_nodes():
     place.close()
 
 
+@pytest.mark.slow
 def test_a_kernel_without_a_file_is_a_region(library, compiled_nodes, tmp_path):
     found = profile_call(compiled_nodes)
     assert len(found.strata[0].segments[0].trace) > 6

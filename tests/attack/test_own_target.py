@@ -38,6 +38,7 @@ def test_a_target_of_ones_own_gets_the_faults_that_a_program_gets(own):
     assert {theirs for theirs, mine in ends if theirs != mine} <= {"sdc"}  # in the last digit
 
 
+@pytest.mark.slow
 def test_workers_and_folders_serve_it_as_well(own, tmp_path):
     alone = records(own)
     together = records(own, jobs=2, folder=tmp_path / "folder")

@@ -156,6 +156,7 @@ def test_a_null_injection_changes_nothing(target):
     assert {entry["output_sha256"] for entry in campaign.records} == {golden}
 
 
+@pytest.mark.slow
 def test_workers_draw_disjoint_streams_and_do_not_change_the_result(target):
     program = target("counting", "30")
     alone, together = (attacked(program, jobs=jobs, runs=24, seed=4) for jobs in (1, 2))
@@ -309,6 +310,7 @@ def replayed(native_program, tmp_path):
     return folder, replay
 
 
+@pytest.mark.slow
 def test_the_runs_of_a_program_are_repeated_bit_by_bit(replayed):
     folder, replay = replayed
     assert replay().output == "12 of 12 replays identical\n"
@@ -325,6 +327,7 @@ def test_the_runs_of_a_program_are_repeated_bit_by_bit(replayed):
     )
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_repeated_are_refused(replayed):
     _, replay = replayed
     assert "holds runs of a program, not of octomap" in str(replay("--kernel", "octomap").exception)

@@ -143,6 +143,7 @@ def test_calls_of_a_function_that_calls_itself_are_whole_calls(recursive):
     assert [segment.start[0].count for segment in stratum.segments] == list(range(1, 16))
 
 
+@pytest.mark.slow
 def test_a_sample_estimates_the_run(known_length):
     """Over many seeds: on the average the true length, and in the interval as often as it says."""
     where, markers = known_length

@@ -58,6 +58,7 @@ def test_a_rest_to_rest_segment_is_the_textbook_profile():
     assert rows[-1, :3] == pytest.approx([9.0, 0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_steep_directions_have_lower_speeds():
     rows = flown([[0, 0, 0], [0, 0, 5], [0, 4, 2]])
     assert speeds_of(rows[rows[:, 1] < 1e-6]).max() == pytest.approx(1.0)

@@ -82,6 +82,7 @@ def test_a_campaign_that_was_begun_searches_no_more(begun, campaign):
     assert not (campaign.folder / SEARCH).exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_goes_on(begun, campaign):
     begun(spec_of())
     (campaign.folder / "ledger.sqlite").unlink()
@@ -101,6 +102,7 @@ def test_another_rule_is_another_campaign(begun):
         begun(other, append=True)
 
 
+@pytest.mark.slow
 def test_a_world_in_which_none_fits_is_an_error_unless_it_is_named_or_left_out(begun, campaign):
     everywhere = SPEC.replace('worlds = ["rising"]\n', "")
     told = r"^fixed_world: no world seed of flat up to 9 is the first .* they replan 0 to 0 times; "

@@ -86,6 +86,7 @@ def whole(tmp_path_factory):
         return folder, *flown(SPEC, folder, Options(jobs=2, keep=Keep.NONE, task="fake_task"))
 
 
+@pytest.mark.slow
 def test_draws_depend_on_neither_workers_nor_a_kill(whole, campaign):
     _, draws, fates = whole
     one = replace(campaign.options, jobs=1)
@@ -156,6 +157,7 @@ def test_an_export_keeps_the_weights_and_one_without_them_is_refused(whole, tmp_
             pass
 
 
+@pytest.mark.slow
 def test_a_rule_stops_settings_by_the_interval_of_weights(campaign):
     spec = replace(SPEC, repetitions=60, stop=Stop(margin=0.12, batch=20))
     flown(spec, campaign.folder, campaign.options)
@@ -168,6 +170,7 @@ def test_a_rule_stops_settings_by_the_interval_of_weights(campaign):
     assert 20 < success.total < 60
 
 
+@pytest.mark.slow
 def test_later_requests_of_a_plan_are_a_stratum_of_their_own(campaign):
     draws, fates = flown(NATIVE, campaign.folder, campaign.options)
     lost = {number for number, (outcome, _) in fates.items() if outcome == "collision"}

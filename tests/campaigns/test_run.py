@@ -116,6 +116,7 @@ def test_profiles_go_after_the_last_mission_with_their_golden_run(campaign):
     assert not (campaign.folder / PROFILES).exists()
 
 
+@pytest.mark.slow
 def test_profiles_go_after_the_last_mission_that_is_planned(campaign):
     """`mavfi reproduce table4` flies some of the missions of its folder, in several parts."""
     attacks = [InstructionConfig(target="control", seed=seed) for seed in range(3)]
@@ -179,6 +180,7 @@ def test_a_defect_is_an_error_with_its_traceback(campaign):
     assert result.reason.endswith("ZeroDivisionError: a defect")
 
 
+@pytest.mark.slow
 def test_errors_are_flown_again_when_asked_for(campaign):
     missions = planned("blocked", "fly")
     campaign.run(missions).close()
@@ -264,6 +266,7 @@ def test_append_adds_what_is_new(campaign):
         assert ledger.planned() == 2
 
 
+@pytest.mark.slow
 def test_a_file_that_missions_name_must_not_change_between_them(campaign, tmp_path):
     mine, other = tmp_path / "mine.toml", tmp_path / "other.toml"
     mine.write_text("scale = 1.2")

@@ -28,6 +28,7 @@ def test_it_writes_one_page(command_line, tmp_path):
     assert page.read_text(encoding="utf-8").rstrip().endswith("</html>")
 
 
+@pytest.mark.slow
 def test_a_script_gets_the_verdicts(command_line, tmp_path):
     page, place = tmp_path / "page.html", RESULTS / "instruction.parquet"
     left, out, err = command_line("report", place, "-o", page, "--json")
@@ -41,6 +42,7 @@ def test_a_script_gets_the_verdicts(command_line, tmp_path):
     assert sum(told["verdicts"]["mavbench"].values()) > 0
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_on_stderr_and_in_the_page(command_line, tmp_path):
     (tmp_path / "empty").mkdir()
     page = tmp_path / "page.html"

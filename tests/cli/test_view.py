@@ -31,6 +31,7 @@ def struck(mavfi, tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_fly_keeps_the_whole_flight(struck, mavfi, tmp_path):
     """And changes nothing else of its record."""
     told = {topic.partition("/")[2].partition("/")[0] for topic in topics(struck / "flight.mcap")}

@@ -98,6 +98,7 @@ def _files(folder, rows):
     assert "spark: ratios, model and flight" in words
 
 
+@pytest.mark.slow
 def test_what_cannot_be_lifted_is_a_row(command_line, tmp_path, lawn):
     """Three boards by the model, two by the simulator, which needs thrust to steer."""
     (tmp_path / "board.toml").write_text(

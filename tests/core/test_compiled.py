@@ -24,6 +24,7 @@ CALLER = (
 )
 
 
+@pytest.mark.slow
 def test_an_edited_callee_is_compiled_anew(tmp_path, monkeypatch):
     (tmp_path / "caller_module.py").write_text(CALLER)
     monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
@@ -61,6 +62,7 @@ def test_kernels_have_the_same_instructions_on_every_processor():
     assert "zmm" not in code
 
 
+@pytest.mark.slow
 def test_damaged_machine_code_is_compiled_anew(tmp_path, monkeypatch):
     (tmp_path / "caller_module.py").write_text(CALLER)
     (tmp_path / "callee_module.py").write_text(CALLEE.format(1.0))

@@ -169,6 +169,7 @@ def test_components_of_a_vector_share_their_scale(dataset):
     assert fitted.arrays["scale"].tolist() == [1, 2, 1, 1, 1, 1, 1, 1, 1, 4, 4, 4, 1]
 
 
+@pytest.mark.slow
 def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
     first, second = fit.fit("aad", dataset, seed=4), fit.fit("aad", dataset, seed=4)
     for name, array in first.arrays.items():

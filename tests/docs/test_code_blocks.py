@@ -18,7 +18,7 @@ from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
-COMMENT = re.compile(r"<!-- (not run|slow|run with|file)(?:: (.+?))? -->", re.DOTALL)
+COMMENT = re.compile(r"<!-- (not run|run with|file)(?:: (.+?))? -->", re.DOTALL)
 COMMAND = re.compile(r"^(mavfi (?:[^#\n\\]|\\\n)*)", re.MULTILINE)
 LONGEST_S = 900.0
 WIDEST = 100  # characters; docs/static/tables.css has room for them in a window of 1280 pixels
@@ -116,14 +116,7 @@ def commands(text):
 def sessions():
     """For each page with blocks that run: those blocks, as parameters of a test."""
     pages = {page: [block for block in blocks(page) if block.is_run] for page in PAGES}
-    return [
-        pytest.param(
-            run,
-            id=str(page.relative_to(ROOT)),
-            marks=[pytest.mark.slow] if any("slow" in block.notes for block in run) else [],
-        )
-        for page, run in pages.items() if run
-    ]  # fmt: skip
+    return [pytest.param(run, id=str(page.relative_to(ROOT))) for page, run in pages.items() if run]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -148,6 +141,7 @@ def test_no_line_of_a_block_scrolls():
     assert wide == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", sessions())
 def test_the_blocks_of_a_page_run(run, tmp_path):
     session = Session(tmp_path)

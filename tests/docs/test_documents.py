@@ -88,16 +88,24 @@ def named_commands(document):
             yield shlex.split(" ".join(line.split()), comments=True)[1:]
 
 
+@pytest.fixture(scope="module")
+def told_help():
+    """The help of each command, asked for once."""
+    return {}
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_named_option_exists(document, mavfi):
+def test_every_named_option_exists(document, mavfi, told_help):
     if document.name == "CHANGELOG.md":
         pytest.skip("it also names options that are gone")
     wrong = []
     for words in named_commands(document):
         options = {word.partition("=")[0] for word in words if re.match("--?[a-z]", word)}
         if options and words[0].islower():
-            names = 2 if words[0] in ("campaign", "detect", "world") else 1
-            told = mavfi(*words[:names], "--help").stdout
+            names = tuple(words[: 2 if words[0] in ("campaign", "detect", "world") else 1])
+            if names not in told_help:
+                told_help[names] = mavfi(*names, "--help").stdout
+            told = told_help[names]
             wrong += [(words, each) for each in options if not re.search(rf"{each}\b", told)]
     assert wrong == []
 

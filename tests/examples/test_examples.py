@@ -36,6 +36,7 @@ def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SAYS)
 def test_an_example_runs(name, run):
     assert SAYS[name] in run(EXAMPLES / f"{name}.py")

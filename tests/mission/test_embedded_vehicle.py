@@ -18,6 +18,7 @@ FAULT = FaultConfig(target="command_velocity", at="time=1", together=True, field
 FILES = ("flight.tlog", "trace.parquet", "plans.parquet", "kernels.parquet")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

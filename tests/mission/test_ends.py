@@ -47,6 +47,7 @@ def test_interrupted_by_ctrl_c_the_record_is_whole(fly_short, at_event, text):
     assert watcher.events[-1].text == "interrupted"
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_command_line_exits_with_130(flying):
     mission = flying()
     mission.await_line("flies a plan")

@@ -223,6 +223,7 @@ def test_a_given_origin_holds(autopilot_on_udp, fly_short):
     assert run.trace["x_m"][0].as_py() == pytest.approx(9.0, abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_foreign_flight_into_a_box_is_a_collision(autopilot_on_udp, fly_short, tmp_path):
     """Nothing stops a scripted autopilot at a wall that is not in its world but in the camera's."""
     world = tmp_path / "wall.toml"

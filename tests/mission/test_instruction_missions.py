@@ -168,6 +168,7 @@ def test_the_node_waits_for_a_debugger_with_the_fault_in_place(repeat):
     assert load_run(folder.path).result["fault"]["state"] == "applied"
 
 
+@pytest.mark.slow
 @traced
 def test_a_replay_under_a_debugger_is_compared_without_what_it_cannot_follow(
     fly_short, tmp_path, monkeypatch

@@ -25,6 +25,7 @@ def inputs(config):
     return record_inputs(config)
 
 
+@pytest.mark.slow
 def test_every_kernel_has_five_inputs_that_differ(inputs):
     assert len(inputs) == 5
     assert len({each.frame.stamp_s for each in inputs}) == 5
@@ -54,6 +55,7 @@ def test_some_trajectories_are_free_and_some_are_not_if_the_flight_had_both(inpu
     assert sum(map(math.isinf, times_s)) >= 3
 
 
+@pytest.mark.slow
 def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
     (target,) = kernel_targets(["control"], config, tmp_path)
     assert target.inputs_sha256 == save_inputs(tmp_path / "again.npz", inputs)

@@ -53,6 +53,7 @@ def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed)
     assert f"{fault['object']}+{fault['offset']:#x}" in event["text"]
 
 
+@pytest.mark.slow
 @traced
 def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(fly_short, tmp_path):
     first = fly_short(instruction=InstructionConfig(target="planner", seed=1))

@@ -47,12 +47,14 @@ def again(golden, short_config, tmp_path):
     return fly
 
 
+@pytest.mark.slow
 def test_twice_and_on_a_busy_machine_byte_for_byte(golden, again):
     assert record(again()) == golden[1]
     with both_cores_loaded():
         assert record(again()) == golden[1]
 
 
+@pytest.mark.slow
 def test_nodes_in_processes_of_their_own_change_nothing(golden, again):
     folder = again(isolate=("octomap", "planner"))
     assert record(folder) == golden[1]

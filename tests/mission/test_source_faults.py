@@ -108,6 +108,7 @@ def test_a_flip_in_a_flown_plan_causes_no_check_by_itself(struck):
     assert run.result["response_time_s"] == golden.result["response_time_s"]
 
 
+@pytest.mark.slow
 def test_a_phase_between_two_reports_is_not_missed(evaded):
     """In this flight every report comes before the pilot is evading, or after it."""
     evading = next(

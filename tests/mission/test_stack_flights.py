@@ -25,6 +25,7 @@ def golden(tmp_path_factory):
     return fly(tmp_path_factory.mktemp("golden"))
 
 
+@pytest.mark.slow
 def test_the_paper_s_stack_turns_round_stops_and_plans_from_the_hover(golden):
     result = golden.result
     assert result["outcome"] == "success"
@@ -43,6 +44,7 @@ def test_the_paper_s_stack_turns_round_stops_and_plans_from_the_hover(golden):
     assert max(speeds[n] for n in departures) <= 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "key",
     ["refuses_far_waypoints=true", "control_owns_queue=false", "stretches_clock=false",
@@ -55,6 +57,7 @@ def test_a_protection_changes_nothing_without_a_fault(key, golden, tmp_path):
         assert (variant.folder.path / name).read_bytes() == (golden.folder.path / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_flight_of_the_paper_s_stack_repeats_with_its_nodes_apart(golden, tmp_path):
     again = fly(tmp_path, isolate=("octomap", "control"))
     assert record_digest(again.folder.path) == record_digest(golden.folder.path)

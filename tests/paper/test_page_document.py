@@ -88,6 +88,7 @@ def test_missions_unlike_the_papers_judge_no_claim():
     assert told.map_csv.splitlines()[1].endswith(",1,1,1")
 
 
+@pytest.mark.slow
 def test_the_picture_of_faults_in_states_has_the_flights_of_its_data():
     rows = [row(seed=1), row("planning", seed=1)]
     rows += [row("planning", seed=1, detector=name) for name in ("aad", "range")]
@@ -164,6 +165,7 @@ def test_another_stack_is_compared_in_the_same_scenes():
     assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10, not 10 of 10")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lost", "advice"),
     [(8, "Against a wrong value in a state, this helps: Gaussian detector."),

@@ -42,6 +42,7 @@ def over(asked):
         return ledger.over()
 
 
+@pytest.mark.slow
 def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
     asked = plan(tmp_path, "fig9")
     assert flown(asked).missions == len(asked.missions()) == 8
@@ -57,6 +58,7 @@ def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
     assert over(asked) == 14
 
 
+@pytest.mark.slow
 def test_the_forecast_comes_from_missions_that_count(tmp_path):
     asked = plan(tmp_path, "fig16")
     notes = []
@@ -112,6 +114,7 @@ def test_few_missions_are_not_measured(tmp_path):
     assert first.disk_bytes > 0.0
 
 
+@pytest.mark.slow
 def test_run_folders_are_kept_for_the_pictures(tmp_path):
     asked = plan(tmp_path, "fig11", "fig13", "fig9")
     flown(asked)
@@ -134,6 +137,7 @@ def _die(asked):
     flown(asked, spectator=_Killer())
 
 
+@pytest.mark.slow
 def test_a_killed_reproduction_resumes(tmp_path):
     asked = plan(tmp_path, "fig16")
     child = multiprocessing.get_context("fork").Process(target=_die, args=(asked,))

@@ -72,6 +72,7 @@ def test_missions_are_flown_until_the_claim_is_decided(tmp_path, monkeypatch):
     assert "missions were added for it" in judgement.history
 
 
+@pytest.mark.slow
 def test_time_that_is_too_short_flies_nothing_and_says_what_it_cannot_tell(tmp_path):
     plan = FlightsPlan(items=items_named(["fig9"]), stack="mavbench", scale=SCALE, out=tmp_path)
     flying.reproduce(plan, TASK, Spectator(), lambda _: None)

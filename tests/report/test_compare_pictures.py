@@ -28,6 +28,7 @@ def bars(axes, colour=None):
     return [p for p in found if wanted is None or p.get_facecolor() == wanted]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", PICTURES.values())
 def test_equal_comparisons_give_equal_bytes_whatever_the_settings(whole, tmp_path, draw):
     write_figure(draw(whole), tmp_path / "a.svg")

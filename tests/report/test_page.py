@@ -13,6 +13,8 @@ from mavfi_cli.paper.claims import CLAIMS
 from mavfi_cli.report.page import FILTERS, render
 from mavfi_cli.stats.shares import Interval, wilson
 
+pytestmark = pytest.mark.slow  # the page of all committed flights takes its time
+
 PHONE, DESKTOP = 390, 1280
 MARKS = {"✓ reproduced", "✗ contradicted", "≈ undecided", "· not decidable"}
 
@@ -53,7 +55,6 @@ def test_the_file_is_alone(page):
     assert "<script" not in text
 
 
-@pytest.mark.slow
 def test_equal_flights_give_equal_pages(page):
     assert render(everything()) == page.read_text(encoding="utf-8")
 

@@ -116,6 +116,7 @@ def test_silent_companion_is_an_error_in_one_line(companion):
     assert errors == "error: the companion did not answer the tick at 0 ms within 0.3 s\n"
 
 
+@pytest.mark.slow
 def test_garbage_between_frames_changes_nothing(companion):
     def fly(noise):
         vehicle = companion()

@@ -90,6 +90,7 @@ def interrupt(process):
     assert process.stderr.read() == ""
 
 
+@pytest.mark.slow
 def test_several_clients_each_with_own_streams_and_answers(serve, dial):
     tcp, udp = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
     process = serve("--link", f"tcpin:127.0.0.1:{tcp}", "--link", f"udpin:127.0.0.1:{udp}")

@@ -48,6 +48,7 @@ def sampled_runs(strata, rng, runs=500, windows=16):
     return known, hits, clusters
 
 
+@pytest.mark.slow
 def test_intervals_of_share_and_size_contain_the_error_of_the_weights():
     rng = np.random.default_rng(8)
     strata = population(rng)

@@ -98,6 +98,7 @@ def test_a_net_share_counts_what_is_undone_and_what_is_caused():
     assert math.isnan(net_share(undone, before, range(1000)).low)
 
 
+@pytest.mark.slow
 def test_a_net_share_covers_the_truth():
     rng = np.random.default_rng(5)
     inside = 0

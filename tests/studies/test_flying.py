@@ -25,6 +25,7 @@ def _fake_task_is_importable(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
 
 
+@pytest.mark.slow
 def test_a_smaller_plan_flies_no_mission_that_a_larger_one_has_left(tmp_path):
     missions = [
         PlannedMission(config=MissionConfig(world=world, seed=seed), labels={"n": seed})
@@ -47,6 +48,7 @@ def test_a_smaller_plan_flies_no_mission_that_a_larger_one_has_left(tmp_path):
     assert more["number"].to_pylist() == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_a_campaign_continues_the_list_of_a_study(tmp_path):
     missions = [
         PlannedMission(config=MissionConfig(world="fly", seed=seed), labels={"n": seed}, pair="p")

@@ -162,6 +162,7 @@ def test_a_run_that_is_given_up_disturbs_no_other(known):
         assert golden_run(place).output == golden.output
 
 
+@pytest.mark.slow
 def test_a_kernel_of_ones_own_is_attacked_by_the_name_of_its_file(known_target, tmp_path):
     target = known_target(BODIES[RunOutcome.SDC])
     plan = Plan(runs=12, seed=3)
@@ -172,6 +173,7 @@ def test_a_kernel_of_ones_own_is_attacked_by_the_name_of_its_file(known_target, 
     assert {entry["object"] for entry in alone.records} == {"libvictim.so"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory_mb", "enough"), [(128, False), (512, True)])
 def test_a_run_may_take_what_its_kernel_allows(tmp_path, kernel_inputs, memory_mb, enough):
     kernel = tmp_path / "taking.py"

@@ -64,12 +64,14 @@ def test_a_fault_depends_on_its_number_only(attack, control_campaign):
     assert untimed(few) == untimed(many)[:5]
 
 
+@pytest.mark.slow
 def test_other_seeds_draw_other_faults(attack, control_campaign):
     _, (many,) = control_campaign
     _, (other,) = attack("control", runs=5, seed=6)
     assert [e["corruption"] for e in other.records] != [e["corruption"] for e in many.records[:5]]
 
 
+@pytest.mark.slow
 def test_a_campaign_that_was_cut_off_goes_on(attack, control_campaign, control_copy):
     _, (first,) = control_campaign
     lines = (control_copy / "runs.jsonl").read_text().splitlines(keepends=True)
@@ -108,6 +110,7 @@ def test_more_runs_and_kernels_go_on_from_fewer(attack, control_campaign, contro
     assert (len(control.records), len(cloud.records)) == (31, 31)
 
 
+@pytest.mark.slow
 def test_recorded_runs_repeat(control_copy):
     replays = list(replay_runs(control_copy, ("control",)))
     assert [replay.differs for replay in replays] == [()] * 30

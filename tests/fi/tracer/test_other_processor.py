@@ -18,6 +18,7 @@ def elsewhere(code):
     )
 
 
+@pytest.mark.slow
 def test_missions_and_source_level_faults_need_no_tracer():
     done = elsewhere(
         "import mavfi_cli.mission.run, mavfi_cli.fi.tracer.sampling, mavfi_cli.attack.campaign\n"

@@ -115,6 +115,7 @@ def test_a_counted_capture_ends_by_itself() -> None:
     assert not capturing(camera)
 
 
+@pytest.mark.slow
 def test_a_frame_on_the_wire_is_the_rendered_image() -> None:
     mount = (0.2, -0.1, 0.3)
     camera = Camera(BOXES, columns=70, rows=31, mount_offset_flu_m=mount)
