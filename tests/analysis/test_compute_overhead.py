@@ -127,6 +127,7 @@ def measured(path, platform=None):
     return recorded_overheads(path, ("gad", "aad"), platform)["gad"]
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_run_folder(guarded, tmp_path):
     found = measured(guarded.path)
     assert found.describe("here").startswith("measured in 1 flight of here on x86: checks ")

@@ -137,6 +137,7 @@ def test_the_time_left_follows_from_the_native_time(tmp_path, monkeypatch):
     assert count.update().endswith("; about 25 s left")
 
 
+@pytest.mark.slow
 def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
     where = place("counting", "60000")
     true_counts = callgrind._read_counts

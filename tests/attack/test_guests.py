@@ -106,6 +106,7 @@ def test_a_program_for_another_processor(attack, native_program, tmp_path):
     assert "is not a program for x86-64" in refused(attack(program=path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", ["30", "30000"])
 def test_a_statically_linked_program_works(attack, native_program, length):
     try:

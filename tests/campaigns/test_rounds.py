@@ -97,6 +97,7 @@ def test_draws_depend_on_neither_workers_nor_a_kill(whole, campaign):
     assert flown(SPEC, campaign.folder, one) == (draws, fates)
 
 
+@pytest.mark.slow
 def test_the_weights_of_a_round_add_up_and_harm_gets_more_missions(whole):
     _, draws, _ = whole
     bare = [draw for number, draw in draws.items() if number % 3 == 1]

@@ -258,6 +258,7 @@ def test_another_list_is_refused_and_its_first_difference_shown(campaign):
     assert "--append" not in str(told.value)
 
 
+@pytest.mark.slow
 def test_append_adds_what_is_new(campaign):
     campaign.run(planned("fly")).close()
     with campaign.run(planned("fly", "end:crash"), append=True) as ledger:
@@ -326,6 +327,7 @@ class Interrupting(Spectator):
         self.lines.append(text)
 
 
+@pytest.mark.slow
 def test_ctrl_c_once_lets_missions_finish(campaign):
     campaign.notes = notes = Interrupting(1)
     missions = planned("sleep:1.5", "sleep:1.5", "fly")

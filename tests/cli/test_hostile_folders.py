@@ -156,6 +156,7 @@ def test_the_firmware_of_a_record_flies_only_if_the_user_names_it(hostile, comma
     assert "the firmware" in err
 
 
+@pytest.mark.slow
 def test_the_companion_of_a_campaign_flies_only_if_the_user_names_it(
     faulty_flight, precious, tmp_path, command_line
 ):

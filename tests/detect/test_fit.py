@@ -184,6 +184,7 @@ def test_training_is_deterministic_and_tells_what_it_did(dataset, quick):
     assert sum(len(part) for part in told["split"].values()) == told["flights"] == 20
 
 
+@pytest.mark.slow
 def test_trained_weights_reconstruct_better_than_the_first_ones(dataset, quick):
     told = fit.fit("aad", dataset).provenance
     assert told["validation_error"] < told["loss_curve"]["rows"][0][2]

@@ -119,6 +119,7 @@ def test_a_wild_jump_kills_the_node_and_the_mission_goes_on(repeat):
     assert {"success", "collision", "timeout", "no_path"} >= {result["outcome"]}
 
 
+@pytest.mark.slow
 @traced
 def test_a_trigger_that_comes_in_another_invocation_than_planned_is_told_when_it_comes(
     attacked, repeat
@@ -154,6 +155,7 @@ def test_a_record_of_another_build_is_refused(repeat):
         repeat(other)
 
 
+@pytest.mark.slow
 @traced
 def test_the_node_waits_for_a_debugger_with_the_fault_in_place(repeat):
     states = []

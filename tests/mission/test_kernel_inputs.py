@@ -36,6 +36,7 @@ def test_every_kernel_has_five_inputs_that_differ(inputs):
     assert len(problems) == 5
 
 
+@pytest.mark.slow
 def test_a_straight_line_answers_none_of_the_planning_problems(inputs):
     for task in (each.task for each in inputs):
         posed = PlanningProblem.pose(
@@ -64,6 +65,7 @@ def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
         kernel_targets([], MissionConfig(world="farm"), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_flight_without_a_detour_has_no_planning_problems(monkeypatch):
     monkeypatch.setattr("mavfi_cli.mission.kernel_inputs._FLIGHTS", 2)
     with pytest.raises(TargetError, match="too few plans around obstacles"):

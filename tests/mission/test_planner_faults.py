@@ -68,6 +68,7 @@ def test_a_node_gets_the_same_message_in_a_flight_and_in_its_replay(short_config
     assert Setup.of(asked, None, "planner") == Setup.of(recorded, None, "planner")
 
 
+@pytest.mark.slow
 @traced
 def test_a_null_injection_in_a_straight_request_changes_nothing(fly_short, short_flight):
     folder = fly_short(instruction=InstructionConfig(target="planner", seed=1, null=True))

@@ -121,6 +121,7 @@ def test_a_supervisor_or_a_standby_keeps_the_reports_of_a_check_that_dies(golden
     assert len(covered.result["nodes"]["planner"]["crashes"]) == 1
 
 
+@pytest.mark.slow
 def test_a_record_of_before_there_were_stacks_replays_as_hardened(golden, tmp_path):
     folder = tmp_path / "older"
     folder.mkdir()

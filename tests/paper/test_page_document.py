@@ -22,6 +22,8 @@ from mavfi_cli.paper.sources import CampaignSource, Evidence
 from mavfi_cli.paper.verdicts import ISOLATED, JudgedClaim, Judgement, Verdict
 from mavfi_cli.stats.shares import Interval
 
+pytestmark = pytest.mark.slow  # each page draws its pictures
+
 LOST = {"outcome": "timeout"}
 
 
@@ -88,7 +90,6 @@ def test_missions_unlike_the_papers_judge_no_claim():
     assert told.map_csv.splitlines()[1].endswith(",1,1,1")
 
 
-@pytest.mark.slow
 def test_the_picture_of_faults_in_states_has_the_flights_of_its_data():
     rows = [row(seed=1), row("planning", seed=1)]
     rows += [row("planning", seed=1, detector=name) for name in ("aad", "range")]
@@ -165,7 +166,6 @@ def test_another_stack_is_compared_in_the_same_scenes():
     assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10, not 10 of 10")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lost", "advice"),
     [(8, "Against a wrong value in a state, this helps: Gaussian detector."),
@@ -291,7 +291,6 @@ def test_a_reason_stands_only_beside_the_effect_that_it_explains(
     assert bool(reason_of(contradicted, stack)) is explained
 
 
-@pytest.mark.slow
 def test_every_contradiction_of_the_published_missions_has_its_reason():
     results = Path(__file__).parents[2] / "docs" / "results"
     found = Evidence.gather([results / "paper-mavbench.parquet", results / "kernels.json"])

@@ -98,6 +98,7 @@ def test_unknown_items_are_usage_errors(mavfi, tmp_path):
     assert "did you mean 'mavbench'" in run.stderr
 
 
+@pytest.mark.slow
 def test_report_prints_a_table_and_draws_its_figure(folder, mavfi, tmp_path):
     text = mavfi("campaign", "report", folder, "--item", "fig9").stdout
     assert text.startswith("Fig. 9: ")

@@ -155,6 +155,7 @@ def test_a_killed_reproduction_resumes(tmp_path):
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 def test_a_folder_grows_to_a_larger_scale_and_never_shrinks(tmp_path):
     small = plan(tmp_path, "fig9")
     flown(small)

@@ -220,6 +220,7 @@ def test_a_mission_that_could_not_begin_does_not_hide_its_flight(export):
     assert len(found.flights()) == len(found.flights("mavbench")) == 2
 
 
+@pytest.mark.slow
 def test_flights_of_an_items_kind_serve_it_whatever_their_campaign(export):
     rows = []
     for seed in (7, 8):

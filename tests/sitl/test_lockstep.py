@@ -82,6 +82,7 @@ def test_camera_frames_come_only_when_asked_for(companion, order):
     assert len(vehicle.take("CAMERA_IMAGE_CAPTURED")) == count
 
 
+@pytest.mark.slow
 def test_collision_is_told_and_stops_the_motors(companion, take_off, tmp_path):
     scene = tmp_path / "wall.toml"
     scene.write_text(WALL)

@@ -142,6 +142,7 @@ def test_what_one_client_tells_people_goes_to_all_others_as_it_is(serve, dial):
     interrupt(process)
 
 
+@pytest.mark.slow
 def test_hostile_bytes_do_not_stop_it(serve, dial):
     tcp, udp = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
     process = serve("--link", f"tcpin:127.0.0.1:{tcp}", "--link", f"udpin:127.0.0.1:{udp}")
