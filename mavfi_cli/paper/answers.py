@@ -1,4 +1,4 @@
-"""The answers on the first screen: whether the paper is reproduced, where not, and what helps."""
+"""The answers on the first screen: is the paper reproduced, where is it not, and what helps."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
 
 
 def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) -> str:
-    """How many reproduced claims and lost missions depend on dead nodes; empty without a fault."""
+    """Describe how reproduced claims and lost missions depend on dead nodes; "" without faults."""
     parts = []
     pairs = [
         (of_all, silent)
@@ -117,7 +117,7 @@ def crash_sentence(claims: Sequence[JudgedClaim], stack: str, flights: Flights) 
 
 
 def _count_verdicts(claims: Sequence[JudgedClaim], stack: str) -> Counter[Verdict]:
-    """How many claims have which verdict on a stack and for isolated kernels."""
+    """Count the claims by verdict, for a stack or for isolated kernels."""
     judgements = (judgement_of(judged, stack) for judged in claims)
     return Counter(judgement.verdict for judgement in judgements if judgement)
 
@@ -152,7 +152,7 @@ class Disagreement:
 
 
 def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
-    """The contradicted claims by their reason, in the order of the claims."""
+    """The contradicted claims, grouped by reason, in the order of the claims."""
     by_reason: dict[str, list[JudgedClaim]] = {}
     for judged in claims:
         judgement = judgement_of(judged, stack)
@@ -165,7 +165,7 @@ def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreemen
 
 
 def reason_of(judged: JudgedClaim, stack: str) -> str:
-    """Why a claim is contradicted on a stack; empty if it is not, or if no reason is known.
+    """The reason why a stack contradicts a claim; empty if it does not, or if none is known.
 
     A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
     for an effect that lies in the interval of the explained effect.
@@ -196,7 +196,7 @@ REASONS = _read_reasons()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorBalance:
-    """What a detector undoes and what it causes on the same faults.
+    """The harm that a detector undoes and the harm that it causes, on the same faults.
 
     Attributes:
         level: `source` or `instruction`.
@@ -234,11 +234,11 @@ class DetectorBalance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Against:
-    """What a protection does against a kind of fault.
+    """The effect of a protection against a kind of fault.
 
     Attributes:
         effect: `helps`, `harms`, `no proven effect` or `nothing to undo`, by a test at LEVEL.
-        counts: what it rests on.
+        counts: the numbers behind the effect, in words.
     """
 
     effect: str
@@ -246,7 +246,7 @@ class _Against:
 
     @classmethod
     def of_pairs(cls, balance: Balance) -> _Against | None:
-        """On the same faults, by McNemar's test; None without pairs."""
+        """Judge it on the same faults by McNemar's test; None without pairs."""
         if not balance.pairs:
             return None
         before, caused, pairs = balance.before, balance.caused, balance.pairs
@@ -259,7 +259,7 @@ class _Against:
 
     @classmethod
     def of_shares(cls, before: Share, after: Share) -> _Against | None:
-        """In the same scenes, by the interval of the difference; None if one is empty."""
+        """Judge it in the same scenes by the interval of the difference; None if one is empty."""
         if not (before.total and after.total):
             return None
         change = after.minus(before)
@@ -378,7 +378,7 @@ class Delays:
 
 
 def delay_sentence(parts: Sequence[Delays]) -> str:
-    """How many flights take a second longer with a detector than without; empty without one."""
+    """Describe how many flights are late by over 1 s, without and with detectors; "" if none."""
     sentences = []
     for part in parts:
         longer = {name: int((added > 1.0).sum()) for name, added in part.added_s.items()}

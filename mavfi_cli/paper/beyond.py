@@ -88,9 +88,9 @@ def _flow(
 
 
 def _fate_of(flight: Row, own: Row) -> str:
-    """What a kernel did after an instruction-level fault struck it.
+    """The fate of a kernel that an instruction-level fault struck.
 
-    Missions repeat to the byte, so a flight that differs from its golden one does so by the fault.
+    Missions repeat to the byte, so only the fault can make a flight differ from its golden one.
     """
     ended = set((flight["node_ended"] or "").split(";")) - {""}
     if ended:
@@ -158,7 +158,7 @@ class HourlyFailures:
     """Failures per flight hour of one kind of fault in one world, by detector; empty means none.
 
     Attributes:
-        where: what a fault strikes, and where it flies.
+        where: the struck site, the kind of corruption, the world, and the computer.
         lost: share of faults that lose a mission whose golden flight succeeds.
         per_hour: rate, low and high.
     """
@@ -186,7 +186,7 @@ _COMPONENTS = Counter(state.group for state in BY_NAME.values())
 
 
 def _kind(flight: Row) -> str:
-    """What is struck, how unless it is one bit of any field, and where it flies."""
+    """Describe the struck site, the corruption unless it is one bit of any field, and the world."""
     level = "instruction" if flight["level"] == "instruction" else "state"
     components = _COMPONENTS[str(flight["fault_target"]).rpartition(".")[2]]
     how = [

@@ -106,7 +106,7 @@ def _judge(
 
 
 def excludes(size: float | None, bounds: Interval | None) -> bool:
-    """Return True if an effect lies within less than a size of 0, by its bounds."""
+    """Return True if the bounds of an effect lie less than `size` from 0."""
     return size is not None and bounds is not None and -size < bounds.low and bounds.high < size
 
 
@@ -136,7 +136,7 @@ def _read(path: Path) -> Iterator[Claim]:
 
 
 def _range(entry: dict[str, Any]) -> tuple[float, float, str]:
-    """The ends of a claim's range, and its rule in words; takes them out of its entry."""
+    """Remove the range from a claim's entry; return its ends, and its rule in words."""
     whole = entry.get("unit", "points") in _WHOLE
     if "size" in entry:
         size = entry.pop("size")
@@ -181,7 +181,7 @@ def _in_the_paper(words: str, counts: Sequence[Count]) -> str:
 
 
 def _spread(counts: Sequence[Count]) -> Interval:
-    """A rate, difference of two, recovered share of three, difference of two losses of four."""
+    """A rate, or the difference of two, the recovered share of three, or two losses compared."""
     if len(counts) == 3:
         return recovered_share(*counts)
     first, *others = (wilson(*count) for count in counts)
@@ -192,7 +192,7 @@ def _spread(counts: Sequence[Count]) -> Interval:
 
 
 def _arguments(given: Mapping[str, Any], sets: Mapping[str, Any]) -> dict[str, Any]:
-    """What a measure is given: named flights become the columns that choose them."""
+    """The arguments of a measure; named flights are replaced by the columns that choose them."""
     arguments: dict[str, Any] = {}
     for name, value in given.items():
         if name == "flights":

@@ -87,10 +87,10 @@ class _StateMatrix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ItemPart:
-    """What one stack, the isolated kernels or the model show of an item.
+    """The part of an item that comes from one stack, the isolated kernels or the model.
 
     Attributes:
-        picture: None if it needs run folders that are not there.
+        picture: None if it needs run folders that do not exist.
     """
 
     place: str
@@ -100,7 +100,7 @@ class _ItemPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ShownItem:
-    """An item of the paper with its parts, and the places that show nothing of it."""
+    """An item of the paper with its parts, and the places without a part of it."""
 
     item: Item
     parts: Sequence[_ItemPart]
@@ -109,12 +109,12 @@ class _ShownItem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ListedMission:
-    """A mission that is worth a look.
+    """A mission that deserves a closer look.
 
     Attributes:
         ratio: flight time over the golden one's; None if it is lost.
         command: repeats the flight.
-        picture: its view from above as a data URL; empty if it was not kept.
+        picture: its top view as a data URL; empty if it was not kept.
     """
 
     number: int
@@ -176,7 +176,7 @@ class Document:
         return self.stacks[0]
 
     def reason(self, judged: JudgedClaim) -> str:
-        """Why a claim is contradicted; empty if it is not, or if no reason is known."""
+        """The reason why a claim is contradicted; empty if it is not, or if none is known."""
         return reason_of(judged, self.stack)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
@@ -250,7 +250,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
 
 
 def _advice(guards: Sequence[Safeguard]) -> str:
-    """What a designer should do: a sentence for each kind of fault that did harm."""
+    """Advice for a designer: a sentence for each kind of fault that did harm."""
     sentences = []
     for kind in guards[0].against if guards else ():
         effects = {guard.name: cell.effect for guard in guards if (cell := guard.against[kind])}
@@ -267,7 +267,7 @@ def _extent(
     kernels: Mapping[str, IsolatedKernel],
     claims: Sequence[JudgedClaim],
 ) -> str:
-    """How many claims are judged, and by what."""
+    """State how many claims are judged, and by how many missions and runs."""
     missions = sum(map(len, flights.values()))
     runs = sum(kernel.runs for kernel in kernels.values())
     attacked = f" and {runs:,} runs of isolated kernels" if runs else ""
@@ -337,7 +337,7 @@ def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
 
 
 def _spread(stack: str, flights: Flights) -> Picture | None:
-    """Every flight with a fault in a state over its own golden one, by world and detector."""
+    """Flight time with a fault in a state over that of the golden flight, by world and detector."""
     seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
     hit = flights.comparable.timed.chosen(**seen)
     groups = hit.by("world", "detector")
@@ -426,7 +426,7 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
 
 
 def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> _ListedMission:
-    """A mission of a campaign; the command names an export by its path as given, if relative."""
+    """Describe a mission; its command names an export by the given path if that is relative."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
     kept = _is_kept(flight["path"])
@@ -445,7 +445,7 @@ def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> 
 
 
 def _flight_picture(run: Path) -> str:
-    """The view from above of a kept run; a browser runs no script of a picture."""
+    """The top view of a kept run as an image, in which a browser runs no script."""
     path = RunFolder(run).picture
     if path.is_symlink() or not path.is_file() or path.stat().st_size > _LARGEST_PICTURE:
         return ""

@@ -45,7 +45,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
         columns: width, `one` or `two`.
 
     Raises:
-        RecordError: nothing was flown that it could show, or these folders do not exist.
+        RecordError: no flight belongs in the figure, or these folders do not exist.
     """
     if not table.rows or (flights is not None and not len(flights)):
         raise RecordError(_NOTHING)
@@ -55,7 +55,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
 
 
 def panel(rows: Iterable[_Row]) -> list[Strip]:
-    """Draw distributions of flight times over those of the golden flights."""
+    """Draw distributions of flight times relative to those of the golden flights."""
     return [
         Strip(label=label, values=flights.increases, style=_STYLES[detector], paper=paper)
         for label, detector, flights, paper in rows
@@ -113,7 +113,7 @@ def _fig12(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _fig14(flights: Flights) -> dict[str, list[_Row]]:
-    """The paper gives shares of the worst increase that are recovered, which give what is left."""
+    """The paper prints recovered shares of the worst increase; this computes what remains of it."""
     panels: dict[str, list[_Row]] = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
@@ -150,7 +150,7 @@ def _fig11(flights: Flights, columns: str) -> Figure:
 
 
 def _fig13(flights: Flights, columns: str) -> Figure:
-    """The pair of missions that a fault prolongs most, from above."""
+    """Top view of the pair whose flight time grows most."""
     kept = [Path(path) for path in flights["path"] if path]
     if not kept:
         raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")

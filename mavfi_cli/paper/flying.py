@@ -112,7 +112,7 @@ def reproduce(
 
 
 class _Ahead(Spectator):
-    """Passes everything on; the time left includes what follows the missions."""
+    """Passes all events on, and adds the work that follows the missions to the time left."""
 
     def __init__(self, spectator: Spectator, beyond_s: float) -> None:
         self._spectator, self._beyond_s = spectator, beyond_s
@@ -173,9 +173,9 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """The missions that a forecast uses. It flies a few of each kind of which few are over.
+    """Fly a few missions of each kind with few finished ones; return those that a forecast uses.
 
-    The first ones also fly the golden flights of others, so the forecast uses those after them.
+    The first missions also fly the golden flights of others, so the forecast uses later ones.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
@@ -201,7 +201,7 @@ def _measured(
 
 
 def _kind(instruction: object, fault: object) -> str:
-    """The kind of a mission with these faults or none, by which its wall time differs most."""
+    """The kind of a mission: its level of faults or `golden`, which affects wall time most."""
     return "instruction" if instruction else "source" if fault else "golden"
 
 
@@ -259,7 +259,7 @@ def _with_flights(
 
 
 def _mean_size(parent: Path, unknown: float) -> float:
-    """Return the mean size of the newest folders of a parent, bytes; `unknown` without any."""
+    """Return the mean size of the newest folders of a parent, bytes; `unknown` if it has none."""
     folders = [path for path in parent.glob("*") if path.is_dir()][-20:]
     files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files) / len(folders) if folders else unknown
@@ -270,7 +270,7 @@ def _require_room(out: Path, forecast: Forecast) -> None:
     free = shutil.disk_usage(place).free
     if forecast.disk_bytes > free:
         raise RecordError(
-            f"{out}: needs about {forecast.disk_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
+            f"{out}: needs about {forecast.disk_bytes / 1e9:.1f} GB, but only {free / 1e9:.1f} GB "
             "are free"
         )
 
@@ -302,7 +302,7 @@ class _KernelRuns:
 
     @property
     def folder(self) -> Path:
-        """The folder of the runs, as of `mavfi kernels --out`."""
+        """The folder of the runs, as for `mavfi kernels --out`."""
         return self.out / KERNELS_FOLDER
 
     def missing(self) -> int:

@@ -122,8 +122,8 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
     """The items of these names, in the order of ITEMS; no names mean all.
 
     Raises:
-        UnknownName: there is no such item. Suggests the nearest.
-        ConfigError: the paper has it, but it is not an experiment. The message says what it is.
+        UnknownName: there is no such item. The message suggests the nearest.
+        ConfigError: the item of the paper is not an experiment. The message describes it.
     """
     for name in names:
         if name in LEFT_OUT:

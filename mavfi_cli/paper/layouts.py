@@ -69,7 +69,7 @@ _ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part 
 
 
 def _unpaired(flights: Flights) -> list[str]:
-    """Why flights with a fault show no effect of it."""
+    """Report the flights with a fault whose effect is unknown, with the reason."""
     struck = flights.where(level is not None for level in flights["level"])
     alone = list(struck["own_lost"]).count(None)
     if not alone:
@@ -179,7 +179,7 @@ def _fig12(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[PaperCell]:
-    """What each detector recovers of the worst flight, beside the paper's numbers in this unit."""
+    """The part of the worst flight that each detector recovers, beside the paper's numbers."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
     for name in DETECTOR_TITLES:
         yield _recovery(flights.faulty(name), measure, printed(item, unit, name, place))
@@ -216,7 +216,7 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _unknown_costs(flights: Flights) -> list[str]:
-    """Why watched flights have no costs."""
+    """Give the reason why flights with a detector have no costs."""
     watched = any(flights["detector"])
     if not watched or len(flights.known("check_share")):
         return []
@@ -273,7 +273,7 @@ def _fig11(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _span(values: FloatArray, share: float) -> float:
-    """The range of the middle share of the values; NaN without any."""
+    """The range of the middle share of the values; NaN without values."""
     if not len(values):
         return math.nan
     low, high = np.quantile(values, (0.5 - share / 2.0, 0.5 + share / 2.0))
@@ -285,7 +285,7 @@ def _reduction(values: float, deltas: float) -> float:
 
 
 def _fig13(flights: Flights) -> Iterator[PaperRow]:
-    """The flight that a fault prolongs most, of each stage, and the same with the autoencoder."""
+    """For each stage, the flight that a fault prolongs most, and the same with the autoencoder."""
     for (stage,), struck in flights.faulty().by("fault_target").items():
         yield _row(stage, cells=[
             _maximum(struck.increases, printed("fig13", "increase_percent", stage)),
@@ -295,7 +295,7 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _with(struck: Flights, protected: Flights) -> FloatArray:
-    """Increase of the flight with the fault that prolongs most, protected, (1,) or (0,)."""
+    """Increase of the protected flight with the fault that prolongs most, (1,) or (0,)."""
     if not len(struck.ratios):
         return np.zeros(0)
     pair, fault = struck.faults[int(np.nanargmax(struck.numbers("over_own")))]
@@ -333,7 +333,7 @@ def _joined(
     between: str = "; ",
     rows: Callable[[PaperTable], Sequence[PaperRow]] = attrgetter("rows"),
 ) -> Callable[[PaperTable], str]:
-    """A part for each of some rows.
+    """Return a function that joins a formatted part of each selected row.
 
     Args:
         form: format of a part: the row's labels, its numbers `c` in per cent, `s` in seconds and
@@ -425,8 +425,8 @@ def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> Paper
 def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     """The part of the worst case that a protection recovers, in per cent or in points.
 
-    The worst case is that of the faults that were flown with the protection, too: of more flights
-    the longest is longer.
+    The worst case covers only the faults that were also flown with the protection, because the
+    longest of more flights is longer.
 
     Args:
         measure: attribute of `WorstCase`.

@@ -88,7 +88,7 @@ def _delta_range(flights: Flights, state: str, why: str) -> Finding:
 
     Args:
         state: column of the trace.
-        why: what is said if no run folder is there.
+        why: the reason to give if there is no run folder.
     """
     won = flights.golden.chosen(lost=False)
     reduced = []
@@ -144,7 +144,7 @@ def _loss_difference(
     """Share of lost missions in one group of faults minus that in another.
 
     Args:
-        counts: a format of two texts.
+        counts: a format string for the counts of both groups.
     """
     shares = [_clustered(flights.struck(**where, **chosen)) for chosen in (first, second)]
     return _difference(shares, f"lost: {counts.format(*(share.counts for share in shares))}")
@@ -184,7 +184,7 @@ def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: 
 
 
 def _single_flight(flights: Flights, why: str, **where: Any) -> Finding:
-    """No effect: one longest flight decides nothing. Names ours."""
+    """Report our longest flight without an effect, because one flight decides nothing."""
     ratios = flights.struck(**where).ratios
     if not len(ratios):
         return NOT_FLOWN
@@ -192,7 +192,7 @@ def _single_flight(flights: Flights, why: str, **where: Any) -> Finding:
 
 
 def _not_measured(_: Flights, why: str) -> Finding:
-    """No effect, whatever was flown."""
+    """Report no effect, whatever was flown."""
     return Finding(why=why)
 
 
@@ -200,7 +200,7 @@ def _not_measured(_: Flights, why: str) -> Finding:
 
 
 def _net(seen: Flights, column: str, what: str) -> Finding:
-    """Share of an ill that a detector undoes, less what it causes on the same faults."""
+    """Share of harm that a detector undoes, minus the share that it causes, on the same faults."""
     seen = seen.where(value is not None for value in seen[f"bare_{column}"])
     seen = seen.where(value is not None for value in seen[column])
     if not len(seen):
@@ -215,12 +215,12 @@ def _net(seen: Flights, column: str, what: str) -> Finding:
 
 
 def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of lost missions that a detector saves, less those that it loses."""
+    """Share of lost missions that a detector saves, minus those that it loses."""
     return _net(flights.protected(detector, **where), "lost", "lost")
 
 
 def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of longer flights that a detector brings back, less those that it lengthens."""
+    """Share of longer flights that a detector shortens again, minus those that it lengthens."""
     seen = flights.protected(detector, **where).chosen(bare_lost=False, lost=False)
     return _net(seen, "harmed", f"over {100 * (LONGER - 1):.0f} % longer")
 
@@ -359,7 +359,7 @@ def _benign(kernels: Kernels, kernel: str) -> Finding:
 def _ranking(flights: Flights, kernels: Kernels, **where: Any) -> Finding:
     """Spearman's correlation of silent corruption in isolation with harm in flight, over kernels.
 
-    The kernels are given, not drawn, so the interval is that of the shares: each is drawn from its
+    The kernels are fixed, not drawn, so the interval covers only the shares: each is drawn from its
     posterior distribution under Jeffreys' prior.
     """
     flown = {

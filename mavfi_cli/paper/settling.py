@@ -1,4 +1,4 @@
-"""Settles claims: flies missions where they are undecided, until each is decided or time is over.
+"""Settles claims: flies missions for undecided claims until all are decided or the time is over.
 
 Every look judges all claims anew, by tests that hold at any look (`stats.sequences`). The next
 missions are those of the claim that the fewest seconds would decide, if its effect stays as it is.
@@ -36,7 +36,7 @@ _SEARCHED = 100  # of them at once
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _OpenClaim:
-    """An undecided claim, and what would decide it.
+    """An undecided claim, and the missions that would decide it.
 
     Attributes:
         judgement: its judgement so far.
@@ -55,7 +55,7 @@ class _OpenClaim:
 
     @property
     def summary(self) -> str:
-        """What would decide the claim, in one line."""
+        """Describe the missions that would decide the claim, in one line."""
         if math.isinf(self.missions):
             return f"{self.claim.name}: no number of missions decides it, if the effect stays"
         return (
@@ -74,7 +74,7 @@ def require_settleable(plan: FlightsPlan) -> None:
         raise ConfigError("the list of an export is frozen: no mission can be added", path=plan.out)
     if not any(item.source is Source.FLIGHTS for item in plan.items):
         names = ", ".join(item.name for item in plan.items)
-        raise ConfigError(f"must be given an item that flies missions, got {names}", key="settle")
+        raise ConfigError(f"must have an item that flies missions, got {names}", key="settle")
 
 
 def settle(
@@ -92,7 +92,7 @@ def settle(
         hours: most wall time, h; None has no limit.
 
     Returns:
-        A line for each claim that was undecided: how it was decided, or what cannot be told.
+        A line for each claim that was undecided: how it was decided, or that it is still undecided.
 
     Raises:
         MavfiError: a mission cannot be flown.
@@ -244,7 +244,7 @@ def _counted_kinds(
 ) -> frozenset[str]:
     """The planned kinds of missions on which a claim's effect depends.
 
-    A kind counts if the effect is another one without its flights.
+    A kind counts if the effect changes without its flights.
     """
     kinds = [_kind(changes) for changes in flown["changes"]]
     whole = claim.find(flown, kernels)
@@ -280,7 +280,7 @@ def _fly(
 
 
 def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str]) -> int:
-    """The first repetition of which a mission has not flown."""
+    """The first repetition with a mission that has not flown."""
     item = BY_NAME[entry.claim.item]
     for first in range(0, _MOST, _SEARCHED):
         for mission, repetition in plan.numbered(item, first, first + _SEARCHED):
@@ -293,7 +293,7 @@ def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str])
 
 
 def _cost(still: Sequence[_OpenClaim], limit_s: float) -> list[str]:
-    """What deciding the open claims costs, if all effects stay as they are."""
+    """Describe the cost of deciding the open claims if all effects stay as they are."""
     if not still:
         return ["every claim that missions can decide is decided"]
     some = [entry for entry in still if not math.isinf(entry.seconds)]

@@ -121,12 +121,12 @@ class Evidence:
 
     @property
     def isolated(self) -> Mapping[str, IsolatedKernel]:
-        """The summary of each attacked kernel; if several sources have one, that of the last."""
+        """The summary of each attacked kernel, from the last source that has one."""
         return {kernel.name: kernel for source in self.kernels for kernel in source.kernels}
 
     @property
     def settled(self) -> Mapping[str, Settling]:
-        """By stack, what was flown to settle claims; if several sources have it, of the last."""
+        """The missions flown to settle claims, by stack, from the last source that has them."""
         return {
             stack: source.settling
             for source in self.campaigns
@@ -156,7 +156,7 @@ def _paths_in(place: Path) -> Iterator[Path]:
 
 
 def _inside_campaign(path: Path, place: Path) -> bool:
-    """Whether it belongs to a campaign's own folders: kept runs, the search for a world."""
+    """Whether a path is in a campaign's own folders: kept runs, the search for a world."""
     above = [folder for folder in path.parent.parents if folder.is_relative_to(place)]
     return any((folder / LEDGER).is_file() for folder in above)
 

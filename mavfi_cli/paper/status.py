@@ -46,7 +46,7 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
 
     Raises:
         UnknownName: the campaign flies no item of this name.
-        ConfigError: the paper has it, but it is not an experiment.
+        ConfigError: the item of the paper is not an experiment.
         RecordError: the kernels were not run, or an export contains no flight of the item.
     """
     item, plan = _item_of(ledger, name), FlightsPlan.stored(ledger)
@@ -69,7 +69,7 @@ def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
     parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
     flown = [part for part in parts if len(part)]
     if len(flown) > 1:
-        raise RecordError(f"{path}: holds {item.paper} on several stacks; export each by itself")
+        raise RecordError(f"{path}: holds {item.paper} on several stacks; export each one alone")
     if not flown:
         raise RecordError(f"{path}: holds no flight like those of {item.paper}")
     return flown[0]

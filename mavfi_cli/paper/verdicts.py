@@ -71,7 +71,7 @@ class Judgement:
         without_size: whether the bounds exclude an effect of the claim's size on either side of 0:
             two one-sided tests (D. J. Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15,
             1987).
-        history: of settled missions, what was flown for this claim, in words.
+        history: the settled missions that were flown for this claim, in words.
     """
 
     verdict: Verdict
@@ -221,7 +221,7 @@ def judge(
         findings: finding of each claim.
         ranges: low and high end of each claim's range, which belong to it.
         first: where missions were added, the first look at each claim, None if it had no effect;
-            None where none was added.
+            None if none were added.
     """
     z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
     tested = [place for place, value in enumerate(z) if not math.isnan(value)]
@@ -301,9 +301,8 @@ def margin(missions: int) -> float:
     """The smallest effect that counts, at the number of missions of each of the paper's groups.
 
     A result of 0 of that many missions rules it out in a family of four claims, so that a claim can
-    be
-    contradicted: the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to half a
-    point.
+    be contradicted. It is the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to
+    half a point.
     """
     high = wilson(0, missions, confidence=1.0 - LEVEL / _FAMILY).high
     return math.ceil(high / _STEP) * _STEP
