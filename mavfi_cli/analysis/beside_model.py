@@ -165,7 +165,7 @@ class MeasuredOverhead:
 
     @classmethod
     def of(cls, overhead: ComputeOverhead) -> MeasuredOverhead:
-        """The same overhead, in per cent."""
+        """Convert an overhead to per cent, beside the paper's."""
         return cls(
             detector=overhead.detector,
             flights=overhead.flights,

@@ -1,9 +1,9 @@
 """Evaluate detectors with and without faults: counts of pairs, each with its interval.
 
 Pairs are flights of one mission: golden, faulty, and faulty with a detector. Faults that were not
-injected or not read are counted separately and enter no other number, and so are those of missions
-whose golden flight fails, because nothing can harm these. The detectors fly all harmful faults, and
-the harmless ones of the `complete` missions. The effect of a fault is taken from the unprotected
+injected or not read are counted separately and enter no other number. The same holds for faults in
+missions whose golden flight fails, because nothing can harm these. Detectors fly all harmful faults
+and the harmless ones of `complete` missions. The effect of a fault is taken from the unprotected
 flight, because a detector may withhold the value before it is read.
 """
 
@@ -115,9 +115,9 @@ class _WorstFlight:
 
     Attributes:
         faulty, protected: the largest flight time over golden flight time, minus 1.
-        recovered: how much lower the second is, in parts of the golden flight time. Resampled
-            missions never hold a worse case than the worst that was seen, so the interval says how
-            much it hangs on single flights, not how bad it can become.
+        recovered: how much lower the second is, relative to the golden flight time. Resampled
+            missions never contain a worse case than the worst observed one, so the interval shows
+            how much it depends on single flights, not how bad it can become.
         recovered_share: recovered share of the increase; NaN if no flight took more than LONGER
             times as long.
     """
@@ -146,14 +146,14 @@ class FaultRow:
         detected_harmful: harmful faults with an alarm at or after the strike.
         detected_active: the same for all faults of complete missions.
         detected_inactive: the same for faults that struck but were not activated.
-        by_chance: flights of complete missions that have an alarm in that time without their fault
-            as well.
+        by_chance: flights of complete missions that have an alarm in that time even without their
+            fault.
         recovered: lost missions that succeed with the detector.
         undone: harmful faults that do no harm with the detector.
         added: harmless faults that do harm with the detector.
         unprotected: success rate of all missions with an active fault.
         protected: the same with the detector: `share`, `low` and `high` of harmful and harmless
-            faults, each with its own rate, weighted by how many there are.
+            faults, each with its own rate, weighted by their numbers.
         success: on complete missions, unprotected first.
         worst: worst case over the flown faults.
     """
@@ -221,7 +221,7 @@ class DetectorCurves(Curves):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluatedPlan:
-    """What an evaluation flew.
+    """The plan that an evaluation flew.
 
     Attributes:
         detectors: threshold and digest of the model, by name.
@@ -361,7 +361,7 @@ def _first_alarm(
 
 
 def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
-    """The columns of SCHEMA that a flight and its golden flight give, and the `harm`, or empty."""
+    """The columns of SCHEMA that follow from a flight and its golden flight, and the `harm`."""
     lost = pc.invert(flown["won"])
     over, harmed = against_golden(pc.invert(golden["won"]), golden["time_s"], lost, flown["time_s"])
     harm = pc.if_else(harmed, pc.if_else(lost, LOST, LATE), HARMLESS)
@@ -502,7 +502,7 @@ def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> Erro
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
-    """Over the flights that have a flight time; a mission that was cut off has none."""
+    """Alarms per hour of the flights with a flight time; a mission that was cut off has none."""
     alarms, hours = alarms[hours > 0.0], hours[hours > 0.0]
     total = float(hours.sum())
     if total > 0.0 and not alarms.any():

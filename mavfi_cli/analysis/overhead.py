@@ -73,7 +73,7 @@ class FlightOverhead:
         weighted: Sequence[tuple[DetectionCost, float]],
         confidence: float,
     ) -> Self:
-        """Average the costs of one detector over its flights, at least one, by weight."""
+        """Average the costs of one detector over its weighted flights, of which one must exist."""
         costs = [cost for cost, _ in weighted]
         weights = np.array([weight for _, weight in weighted])
 
@@ -225,7 +225,7 @@ def _platform_name(called: str) -> str:
 
 
 def _same(name: str, platform: str) -> bool:
-    """Whether it is this platform, or its variant that `mavfi vpm --fly` makes for a detector."""
+    """Whether a platform is this one, or the variant that `mavfi vpm --fly` makes of it."""
     base, times, factor = name.rpartition(TIMES)
     if name == platform or not times or base != platform:
         return name == platform

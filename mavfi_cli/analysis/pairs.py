@@ -60,7 +60,7 @@ _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
 
 class Fate(Enum):
-    """What a fault does to the node that it strikes."""
+    """The effect of a fault on the node that it strikes."""
 
     ALL = "all faults"
     SILENT = "silent"  # the node goes on, with or without a wrong value
@@ -69,7 +69,7 @@ class Fate(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Balance:
-    """What a detector undoes and what it causes on the same faults.
+    """The harm that a detector undoes and the harm that it causes, on the same faults.
 
     Attributes:
         pairs: faults that were flown without and with the detector.
@@ -102,8 +102,8 @@ class Flights:
     Of its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.
-        over_own: flight time over it; empty if one of the two is lost.
-        added_s: flight time beyond it; empty if one of the two is lost.
+        over_own: flight time divided by it; empty if one of the two is lost.
+        added_s: flight time minus it; empty if one of the two is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
     Of the flight with the same fault and no detector, empty without such a flight: bare_struck,
@@ -207,16 +207,16 @@ class Flights:
 
     @property
     def seeds(self) -> list[tuple[str, int]]:
-        """World and seed of each flight: flights of one seed depend on each other."""
+        """World and seed of each flight; flights of one seed are not independent."""
         return list(zip(self["world"], self["seed"], strict=True))
 
     def balance(
         self, detector: str, protect: str = EVERY_STAGE, column: str = "harmed", **values: object
     ) -> Balance:
-        """What a detector undoes and what it causes on the same faults.
+        """Count the harm that a detector undoes and causes, on the same faults.
 
         Args:
-            column: `harmed` or `lost`: what counts as harm.
+            column: the kind of harm, `harmed` or `lost`.
         """
         seen = self.protected(detector, protect, **values)
         pairs = zip(seen[f"bare_{column}"], seen[column], strict=True)
@@ -332,7 +332,7 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
 
 
 def _beside_golden(table: pa.Table) -> pa.Table:
-    """The table with what each flight is compared with."""
+    """Add the columns that compare each flight with its golden and its bare flight."""
     unprotected = pc.is_null(table["detector"])
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))

@@ -98,7 +98,7 @@ class PlatformSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedPlan:
-    """What a comparison flew."""
+    """The plan that a comparison flew."""
 
     platforms: tuple[PlatformSummary, ...]
     world: str
@@ -113,7 +113,7 @@ class ComparedPlan:
 
     @property
     def flip(self) -> str:
-        """What is flipped in each faulty flight; empty if no fault is flown."""
+        """The bits that each faulty flight flips, in words; empty if no fault is flown."""
         bits = "one bit" if self.field is None else f"one bit of the {self.field}"
         return f"{bits} in {', '.join(self.inject)}" if self.inject else ""
 
@@ -158,7 +158,7 @@ class _SuccessChange(McNemar):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatioRow:
-    """A platform over the reference platform, mission by mission."""
+    """The ratios of a platform to the reference platform, mission by mission."""
 
     platform: str
     setting: str
@@ -182,8 +182,8 @@ class _CostRatio:
     """Flight time over that of the golden flight.
 
     Attributes:
-        recovered_share: the part of the largest increase without detector that is gone; NaN if
-            there is none.
+        recovered_share: the part of the largest increase without detector that the detector
+            removes; NaN if there is none.
     """
 
     p95: Interval
@@ -445,7 +445,7 @@ class FaultCosts:
         Several faults of one mission are not independent, so the intervals resample missions.
 
         Args:
-            bare: the same without a detector on this platform, the reference of recovery.
+            bare: costs without a detector on this platform, the reference for recovery.
         """
         cost_s, over_own = (_by_mission(self.costs, name) for name in ("cost_s", "over_own"))
         worst, count = self._largest("over_own"), len(cost_s)

@@ -82,7 +82,7 @@ def scored(
         write_json(store, kept)
 
     def known(path: str | None, detector: str) -> float | None:
-        """The score of a flight; None where it has no trace. A score that is NaN is an alarm."""
+        """The score of a flight; None where it has no trace. A NaN score counts as an alarm."""
         if path is None or Path(path).name not in scores[detector]:
             return None
         score = scores[detector][Path(path).name]

@@ -119,8 +119,8 @@ class CampaignSummary:
         over, missing: number with a result, and without one.
         confidence: confidence level of all intervals.
         sampling: how faults were drawn, `uniform` or `stratified`.
-        faults: comparisons of settings with faults with the golden one.
-        protection: comparisons of protected settings with the unprotected one with the same faults.
+        faults: each setting with faults compared with the golden one.
+        protection: each protected setting compared with the unprotected one with the same faults.
     """
 
     name: str
@@ -239,9 +239,9 @@ class Group:
         return _interval(values[there], confidence, weights)
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
-        """Counted missions of equal pairs: row indices in this and in the other, (m,) each.
+        """Row indices of the counted missions with equal pairs, in this and the other, (m,) each.
 
-        The order is that of the other. Missions with faults match if the same faults strike them.
+        They follow the other's order. Missions with faults match if the same faults strike them.
         If a pair was flown several times, the first flights match, then the second ones, and so on.
         A golden flight matches every flight of its pair.
         """

@@ -117,7 +117,7 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
 
 
 def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> Reaction | None:
-    """The reaction whose duration is nearest the flight's median; the first of equals.
+    """The reaction whose duration is nearest the flight's median; the first if several are.
 
     Args:
         answers: stamps of setpoints; reactions that end in one of them are preferred.

@@ -359,13 +359,13 @@ def _sizes(sizes: Sequence[float]) -> dict[str, float | None]:
 
 
 def _population(runs: TargetRuns, number: int) -> str:
-    """How much of an input's run was profiled."""
+    """Describe how much of an input's run was profiled."""
     profile = runs.profiles[number]
     return "moments of one call" if profile is None else profile.describe()
 
 
 def _input(runs: TargetRuns, number: int) -> Json:
-    """An input of a kernel: how much of its run was profiled, and what became of its runs."""
+    """Plain values of an input: how much of its run was profiled, and the outcomes of its runs."""
     profile, golden = runs.profiles[number], runs.goldens[number]
     length = None if profile is None else profile.instructions
     return {

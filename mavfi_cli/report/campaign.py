@@ -202,7 +202,7 @@ def _comparison_lines(settings: SettingColumns, comparisons: Sequence[Comparison
 
 
 def _comparison_cells(row: Comparison) -> list[str]:
-    """Success, time, and worst cases; the one over the mean golden flight for protection only."""
+    """Success, time and worst cases; only protection has the one over the mean golden flight."""
     time = row.differences["flight_time_s"]
     return [
         f"{row.success.pairs}",

@@ -201,15 +201,15 @@ def draw_delays(
     figure.supxlabel(_GAPS[columns].join(words),
                      fontsize=SMALLEST + 0.5, color=INK)  # fmt: skip
     most = max(panels.values(), key=len)
-    shown = grid.flat[[*panels.values()].index(most)]
-    legend_above(figure, *shown.get_legend_handles_labels(), fontsize=SMALLEST)
+    axes = grid.flat[[*panels.values()].index(most)]
+    legend_above(figure, *axes.get_legend_handles_labels(), fontsize=SMALLEST)
     return figure
 
 
 def _per_cent_of(
     mean_s: float,
 ) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
-    """From seconds to per cent of a time, and back."""
+    """Functions that convert seconds to per cent of a mean time, and back."""
     return lambda added_s: 100.0 * added_s / mean_s, lambda rate: rate * mean_s / 100.0
 
 
@@ -241,7 +241,7 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 
 def draw_flows(flows: Mapping[str, Mapping[str, Share]]) -> Figure:
-    """Draw what struck kernels did: the share of each fate, by kernel."""
+    """Draw the share of each fate of struck kernels, by kernel."""
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)

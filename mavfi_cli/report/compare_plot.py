@@ -204,7 +204,7 @@ def _response(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, 
 
 
 def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
-    """Draw the paired ratios of each platform to the first: golden full, faulty open."""
+    """Draw the paired ratios of each platform to the first, golden filled and faulty hollow."""
     drawn = [row for row in comparison.ratios if row.setting in (_GOLDEN, _NONE)]
     titles = {row.platform: row.title for row in comparison.plan.platforms}
     first = comparison.plan.platforms[0].title

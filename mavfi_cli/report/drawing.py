@@ -56,7 +56,7 @@ KERNELS = {  # labels and colours
 
 
 def detector_colours(names: Sequence[str]) -> dict[str, str]:
-    """Return the colour of each detector, including `none`. Plug-ins cycle through theirs."""
+    """Return the colour of each detector, including `none`. Plug-ins share a cycle of colours."""
     known = {"none": NONE, **DETECTORS}
     others = [name for name in names if name not in known]
     return {
@@ -88,7 +88,7 @@ def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
 
 
 def scattered(count: int) -> FloatArray:
-    """Return offsets from -0.5 to 0.5 that spread dots evenly, the same at any time, (count,)."""
+    """Return offsets from -0.5 to 0.5 that spread dots evenly, the same in every call, (count,)."""
     import numpy as np  # the commands load this module
 
     return (0.5 + np.arange(count, dtype=np.float64) * _TURN) % 1.0 - 0.5

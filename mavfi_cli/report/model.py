@@ -339,7 +339,7 @@ def _reasons(own: FlownNumbers) -> list[str]:
 
 
 def _known(text: str, value: float, otherwise: str = "-") -> str:
-    """The text of a value, if it has one: without successful flights there is none."""
+    """The text of a value, or `otherwise` if it is NaN because no flight succeeded."""
     return otherwise if math.isnan(value) else text
 
 

@@ -53,7 +53,7 @@ def render(document: object) -> str:
 
 
 def _unbroken(value: Any) -> Any:
-    """A number stays in one line with its sign of per cent."""
+    """Keep a number and its per cent sign on one line."""
     plain_text = isinstance(value, str) and not hasattr(value, "__html__")
     return value.replace(" %", "\N{NARROW NO-BREAK SPACE}%") if plain_text else value
 

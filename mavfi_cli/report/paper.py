@@ -39,7 +39,7 @@ class PaperCell:
 
     Attributes:
         value, low, high: NaN if there are none; a maximum has no interval.
-        count: missions, pairs or runs that it is from.
+        count: number of missions, pairs or runs behind it.
         paper: None if the paper prints nothing.
     """
 
@@ -51,7 +51,7 @@ class PaperCell:
 
     @classmethod
     def of_share(cls, share: Share, paper: Printed = None) -> PaperCell:
-        """A share as per cent."""
+        """A share in per cent."""
         if not share.total:
             return cls(paper=paper)
         ends = {"value": share.share, "low": share.low, "high": share.high}
@@ -64,7 +64,7 @@ class PaperCell:
 
     @classmethod
     def of_interval(cls, mean: Interval, scale: float = 1.0) -> PaperCell:
-        """A number with its interval, in another unit."""
+        """A mean with its interval, both multiplied by `scale`."""
         ends = {"value": mean.value, "low": mean.low, "high": mean.high}
         return cls(**{k: scale * v for k, v in ends.items()}, count=mean.count)
 
@@ -126,9 +126,9 @@ class PaperTable:
 
     Attributes:
         name: name of the item, such as `table4`.
-        title: the paper's name of it, and what it shows.
+        title: the paper's name for it, and what it shows.
         labels: headings of the rows' labels.
-        notes: a line each.
+        notes: lines below the table.
         result: the item's result in one line.
     """
 
@@ -263,7 +263,7 @@ def _panels(
 
     Args:
         names: names of the rows.
-        panel_in, more_in: height of a panel, and of what the figure has beside panels.
+        panel_in, more_in: height of a panel, and of the rest of the figure.
     """
     panels = list(titles)
     across = min(len(panels), 4 if columns == "two" else 2)
@@ -289,7 +289,7 @@ def _dot(axes: Axes, y: int, cell: PaperCell) -> None:
 
 
 def _explain(figure: Figure, ours: list[Any], paper: str, side: str, **spaces: Any) -> None:
-    """A legend of our mark and of the paper's, if it has a label."""
+    """Add a legend with our mark, and the paper's mark if it has a label."""
     handles = ours + (figure.axes[0].plot([], [], label=paper, **_PAPER) if paper else [])
     look = {"loc": f"outside {side} center", "ncols": 2, "frameon": False, "fontsize": SMALLEST}
     figure.legend(handles=handles, **{**look, **spaces})

@@ -356,7 +356,7 @@ def difference_lines(run: Run, golden: Run) -> list[str]:
 
 
 def _no_effect(fault: StateFault | MissionInstructionFault) -> str:
-    """Return why a fault had no effect: not injected, not activated, or masked."""
+    """Return the reason why a fault had no effect: not injected, not activated, or masked."""
     if fault.state == "not_injected":
         return "none, not injected"
     activation = "" if fault.activation is None else fault.activation.activation

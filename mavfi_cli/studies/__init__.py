@@ -25,7 +25,7 @@ def fly(
 ) -> pa.Table:
     """Fly the missions that the folder lacks; return the table of all of them.
 
-    Others that an interrupted larger plan has left in the folder's list are not flown.
+    Missions that an interrupted larger plan has left in the folder's list are not flown.
 
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.

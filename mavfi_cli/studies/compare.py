@@ -1,7 +1,7 @@
 """`mavfi compare`: the same missions on several platforms, as in the preset fig16.
 
 The folder is a campaign's. Its folder `timeline` is a campaign of one golden flight per platform
-with the whole record.
+with its complete record.
 """
 
 from __future__ import annotations

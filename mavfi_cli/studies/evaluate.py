@@ -122,7 +122,7 @@ class EvaluationPlan:
 
     @property
     def seeds(self) -> range:
-        """Seeds of the missions, equal in each world; the first `flights` of them get faults."""
+        """Seeds of the missions, the same in each world; the first `flights` of them get faults."""
         return range(self.first_seed, self.first_seed + self.golden_flights)
 
     def complete(self, seed: int) -> bool:
@@ -153,7 +153,7 @@ class EvaluationPlan:
                 if seed.isdigit() and int(seed) in self.seeds:
                     raise ModelError(
                         f"{detector.name} was fitted to the flight {flight}: seeds "
-                        f"{self.seeds.start} to {self.seeds.stop - 1} are not held out, choose "
+                        f"{self.seeds.start} to {self.seeds.stop - 1} are not held out; choose "
                         "another --first-seed",
                         path=path,
                     )

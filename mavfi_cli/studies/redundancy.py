@@ -210,7 +210,7 @@ class RedundancyPlan:
         last = first + self.train * len(TRAINING_WORLDS) - 1
         if self.train and self.first_seed <= last and first < self.first_seed + self.missions:
             raise ConfigError(
-                f"seeds {first} to {last} are for training: choose another --first-seed",
+                f"seeds {first} to {last} are reserved for training: choose another --first-seed",
                 key="first seed",
             )
 

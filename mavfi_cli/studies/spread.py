@@ -28,8 +28,8 @@ class Spread:
         outcomes: Number of flights by outcome.
         succeeded: Share of success, and its 95 % interval (Wilson).
         flight_time_s: Smallest, median and largest time of a successful flight, s.
-        apart_m: Largest distance from the path of the first successful flight, of each later one:
-            the median and the largest, m.
+        apart_m: Median and maximum, over the later successful flights, of the largest distance
+            from the path of the first one, m.
     """
 
     outcomes: dict[str, int]

@@ -80,8 +80,8 @@ def train(
         set, because they did not reach the goal.
 
     Raises:
-        ModelError: too few flights, an unknown kind, or torch is missing; before anything is
-            flown, unless too many flights fail. Or no flight is error-free.
+        ModelError: too few flights, an unknown kind, or torch is missing, raised before anything
+            is flown; or too many flights fail, or none is error-free.
         ConfigError: n sigma is out of range, the folder has the flights of another plan, or nothing
             names the binary of a real autopilot.
         MavfiError: no mission can be flown in a world.

@@ -296,7 +296,7 @@ def _notes(
     inputs: ModelInputs,
     calibration: CalibratedNumber | None,
 ) -> list[str]:
-    """Name what did not change with the computer, although a user may think so."""
+    """List the values that did not change with the computer, although a user may expect it."""
     notes, board = [], inputs.board
     own_time = choices.platform is None and choices.response_s is None
     calibrated_time = calibration is not None and calibration.parameter == "response_s"
@@ -466,7 +466,7 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     The ratio falls as the free number grows, so bisection finds it.
 
     Args:
-        board: the board of the redundant computers; None: the calibration's own.
+        board: the board of the redundant computers; None takes the calibration's own.
 
     Raises:
         ConfigError: no value gives the ratio; the message names the ratios that can be reached.

@@ -193,7 +193,7 @@ def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
 
 
 def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
-    """Every map that a plan was made on, and in between one a second of those checked."""
+    """Every map on which a plan was made, and at most one checked map per second in between."""
     planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
     checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
     shown_s = -math.inf

@@ -200,7 +200,7 @@ def _schema(message: dict[str, Any]) -> bytes:
 
 
 def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
-    """What an MCAP file holds of an entry, each message with its topic."""
+    """The messages for an entry in an MCAP file, each with its topic."""
     topic, data, stamp = f"/{entry.path}", entry.data, _timestamp(entry)
     match entry.kind:
         case "boxes":

@@ -92,7 +92,7 @@ def _log_entries(
 
 
 def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """What rerun logs of an entry, with the path of each part."""
+    """The parts of an entry that rerun logs, each with its path."""
     data, colours = entry.data, [to_rgb(entry.colour)] if entry.colour else None
     archetype: Any
     match entry.kind:
@@ -139,7 +139,7 @@ def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
 
 
 def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
-    """Return the layout: world, cameras and events on the left, a tab of plots a stage beside."""
+    """Return the layout: world, cameras and events on the left, a tab of plots per stage."""
     names = [flight.name for flight in flights]
 
     def plots(groups: dict[str, Sequence[str]]) -> list[Any]:
@@ -169,7 +169,7 @@ def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
 
 
 def _eye(flight: ViewedFlight) -> Any:
-    """Look at the middle of the way from the south-west, from above; None without a way."""
+    """View the middle of the route from the south-west and above; None without a route."""
     record = flight.run.record
     start, goal = record.world.get("start"), record.goal_enu_m
     if start is None or goal is None:
