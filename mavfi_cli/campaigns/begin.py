@@ -115,7 +115,7 @@ def chosen_spec(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Unflown(Spec):
-    """What is left of the list of a study, which has no factors."""
+    """The missions that are left of a study's list, which has no factors."""
 
     left: list[PlannedMission]
 
@@ -124,7 +124,7 @@ class _Unflown(Spec):
         """Read the missions that the ledger lacks.
 
         Raises:
-            ConfigError: the ledger does not say which run folders to keep.
+            ConfigError: the ledger does not store which run folders to keep.
         """
         keep = ledger.meta("keep")
         if keep is None:
@@ -148,8 +148,8 @@ def _folder_of(what: str) -> Path:
     """Return the named folder, or the folder of the named campaign.
 
     Args:
-        what: a preset, a TOML file, or the folder of a campaign. A preset's name is the preset;
-            ./NAME is the folder. Where ./NAME holds a campaign, the name alone is refused.
+        what: a preset, a TOML file, or the folder of a campaign. A preset's name means the preset,
+            and ./NAME means the folder. If ./NAME holds a campaign, the name alone is refused.
 
     Raises:
         ConfigError: a file is not a specification, or a name has two meanings.
@@ -278,7 +278,9 @@ def begin(
     """
     begun = (folder / LEDGER).is_file()
     if append and spec.sampling is Sampling.STRATIFIED:
-        raise ConfigError("the rounds of a stratified campaign cannot grow", key="append")
+        raise ConfigError(
+            "missions cannot be added to the rounds of a stratified campaign", key="append"
+        )
     if missing_only and not begun:
         raise ConfigError("no campaign was begun there", path=folder)
     if begun:

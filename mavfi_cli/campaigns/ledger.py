@@ -295,7 +295,7 @@ class Ledger:
 
     @property
     def sampling(self) -> Sampling:
-        """How the faults of the campaign are drawn."""
+        """The way in which the faults of the campaign are drawn."""
         return Sampling.STRATIFIED if self.stratified else Sampling.UNIFORM
 
     def draw(self, rows: Iterable[Drawn]) -> None:
@@ -643,7 +643,7 @@ class ExportedLedger(Ledger):
         self.fill(name, cells, missions, (_ABSENT | row for row in known), draws)
 
     def results(self, numbers: Sequence[int] | None = None) -> Iterator[MissionResult]:
-        """An export has no records of flights.
+        """Refuse to read, because an export has no records of flights.
 
         Raises:
             RecordError: always.

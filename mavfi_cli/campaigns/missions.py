@@ -141,14 +141,14 @@ class MissingMission(NamedTuple):
 
 
 class Sampling(Enum):
-    """How the faults of a campaign are drawn."""
+    """The way in which the faults of a campaign are drawn."""
 
     UNIFORM = "uniform"  # each fault by itself, by the rule of its level
     STRATIFIED = "stratified"  # in rounds, more where outcomes have varied; missions have weights
 
 
 class ResultState(Enum):
-    """Whether a mission has a result."""
+    """The state of a mission with a result, or without one."""
 
     FLOWN = "flown"  # it ended with the given `outcome`
     ERROR = "error"  # it could not begin, so it has no result and is not counted
@@ -168,7 +168,7 @@ _BY_ACTIVATION = {
 
 
 class Injected(Enum):
-    """What happened to the fault of a flown mission."""
+    """The fate of the fault of a flown mission."""
 
     GOLDEN = "golden"  # the mission has no fault
     ACTIVE = "active"  # it struck, and what it struck was read afterwards

@@ -170,9 +170,9 @@ def store_plan(
     """Store the list, or compare it with the stored one.
 
     Args:
-        append: add missions that are not stored; stored ones stay in any case.
-        differing: descriptions of the differences for the error; empty for the first differing
-            missions.
+        append: add missions that are not stored; stored ones always stay.
+        differing: descriptions of the differences for the error; if empty, it names the first
+            differing missions.
         can_append: how to append new missions, for the error if no stored mission is missing.
 
     Raises:

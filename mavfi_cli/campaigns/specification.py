@@ -398,7 +398,7 @@ class Spec:
         return toml_text({**plain, **tables})
 
     def sampled(self, sampling: Sampling) -> Spec:
-        """Return the same campaign with other draws, under a name that says so."""
+        """Return the same campaign with another sampling of faults, which its name includes."""
         if sampling is self.sampling:
             return self
         return replace(self, name=f"{self.name}-{sampling.value}", sampling=sampling)

@@ -1,6 +1,6 @@
 """Draws the faults of a stratified campaign in rounds, more of them where outcomes have varied.
 
-A stratum is what a seed says about its fault before any flight: the field, its half and the state
+A stratum is what a seed fixes of its fault before any flight: the field, its half and the state
 of the highest bit, or the node, and the moment. Every repetition has a pool of seeds. The
 shares of the strata in the pools are those in the population, whatever the rule that draws a fault
 from its seed. A round gives each stratum a number of missions, and each mission a seed from a pool.
@@ -97,8 +97,8 @@ def coarsened(strata: Sequence[Stratum], least: float) -> frozenset[Stratum]:
     """Merge strata from the finest part on, so that each has a share of at least `least`.
 
     Returns:
-        The strata that remain. A seed belongs to the longest beginning of its own stratum among
-        them; the empty one has the rest.
+        The strata that remain. A seed belongs to the longest prefix of its own stratum among them;
+            the empty prefix takes the rest.
     """
     kept: set[Stratum] = {()}
     left = Counter(strata)
@@ -141,7 +141,7 @@ class _Strike:
 class Rounds:
     """The rounds of a stratified campaign.
 
-    Missions with equal faults and other detectors are given the same draw, as on the list.
+    Missions with equal faults but different detectors get the same draw, as on the list.
 
     Args:
         ledger: ledger of the campaign, open for writing; its list is stored.

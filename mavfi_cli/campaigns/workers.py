@@ -63,7 +63,7 @@ class AttemptResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptEnd:
-    """How one attempt at a mission ended.
+    """The end of one attempt at a mission.
 
     Attributes:
         exit: exit code of the mission's process; None if it was killed.
@@ -227,7 +227,7 @@ def _end_of_flight(message: Mapping[str, Any]) -> str:
 
 
 def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
-    """Receive a guard's next message; None if it has died or does not send one in time."""
+    """Receive a guard's next message; None if it has died or sends none in time."""
     with contextlib.suppress(OSError):
         if packet := channel.recv(PACKET):
             message: dict[str, Any] = json.loads(packet)
@@ -436,7 +436,7 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
     try:
         client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
-        raise CampaignStopped(f"{address}: no worker within {WORKERS_S:g} s") from None
+        raise CampaignStopped(f"{address}: no worker connected within {WORKERS_S:g} s") from None
     answers = client.run(_worker_versions, on_error="return")
     for worker, versions in sorted(answers.items()):
         if not isinstance(versions, dict):
@@ -463,7 +463,7 @@ def _fly(
     task: str,
     versions: Mapping[str, str],
 ) -> str | list[tuple[AttemptEnd, dict[str, bytes]]]:
-    """Fly missions, which share a flight if they are several.
+    """Fly one mission, or several that share a flight.
 
     Run folders that the campaign does not keep are sent without their traces.
 

@@ -235,7 +235,7 @@ class Executor:
         fresh: Mapping[str, Callable[[Any, float], Any]],
         process: NodeProcess | None = None,
     ) -> None:
-        """Run a node that has already worked in a separate process, as `isolate`.
+        """Move a node that has already worked to a separate process, as `isolate` does.
 
         Args:
             fresh: Unused kernels by node, from which the process is restarted.
@@ -268,7 +268,7 @@ class Executor:
         """Run a node at once, outside the queue and without using a core of the platform.
 
         Args:
-            again: Repeat the newest invocation; otherwise the node waits until its end.
+            again: Repeat the newest invocation, even before its end, when other calls are dropped.
 
         Returns:
             Output, and latency until it takes effect, s; None if the node is busy, down or lost.
@@ -386,7 +386,7 @@ class Executor:
     def kill(self, name: str) -> None:
         """Kill the process of a node as a signal would. Does nothing if the node is down.
 
-        Its present input is lost, as that of a node that crashes. Its successor takes the newest.
+        Its present input is lost, as in a crash. Its successor takes the newest input.
         """
         node = self.nodes[name]
         members = (node, *node.mates)

@@ -215,7 +215,7 @@ class StruckNode(NoInjection):
     Attributes:
         node, order: the node, and the number of the struck order, from 1.
         effect: what the fault did to the node, in one word.
-        process: the node from this order on; None if it is as without the fault.
+        process: the node from this order on; None if the fault left it unchanged.
     """
 
     def __init__(

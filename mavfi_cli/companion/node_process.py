@@ -118,7 +118,7 @@ class NodeProcess:
         return order.number
 
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
-        """Send an input to a fork that shares the connection; it has the next order's number."""
+        """Send an input, under the next order's number, to a fork that shares the connection."""
         self.order(node, value, start_s)
         self._count -= 1
 
@@ -218,7 +218,7 @@ class NodeProcess:
 
 
 class LostNode(NodeProcess):
-    """A process that has ended, or hung, over the order that it gets next."""
+    """A stand-in for a process that ends or hangs during the next order."""
 
     def __init__(self, loss: NodeLost) -> None:
         self._loss = loss

@@ -67,13 +67,13 @@ class LinkInjector(Injector):
 
     @property
     def missed(self) -> str:
-        """Why the fault never struck."""
+        """The reason why the fault never struck."""
         if self._locked:
             return "the frames are signed, and key_file names no key to sign them again"
         return super().missed
 
     def pass_between(self, message: Message, side: Side, moment: Moment) -> list[Message]:
-        """Return the messages that go on in place of a message."""
+        """Return the messages to pass on in place of a message."""
         if message.get_msgId() != self._number or self._only not in (None, side):
             return [message]
         self._count += 1
@@ -204,7 +204,7 @@ class CompanionInjection(SourceInjection):
             self._throttle = None
 
     def close(self) -> None:
-        """Let a stopped program go on, so that it can end."""
+        """Let a stopped program continue, so that it can end."""
         if self._throttle is not None:
             self._throttle.end()
 

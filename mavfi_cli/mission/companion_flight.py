@@ -536,7 +536,7 @@ class _Verdict:
         return ", ".join(filter(None, parts))
 
     def succeeded(self) -> bool:
-        """Return True if all conditions that are given hold. A corridor alone is no end."""
+        """Return True if all given conditions hold. A corridor alone does not end the flight."""
         success = self._success
         ends = (
             *([self._rests] if success.goal_m is not None else ()),

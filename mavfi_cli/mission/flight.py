@@ -211,7 +211,7 @@ class Flight:
         self.link.continue_in(tlog)
 
     def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor:
-        """Run a node that has already worked in its own process; it restarts with fresh state.
+        """Move a node that has already worked to its own process; it restarts with fresh state.
 
         Args:
             process: As for `Executor.isolate`.

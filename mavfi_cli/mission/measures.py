@@ -3,8 +3,8 @@
 Only this module reads a result.json. Every measure is a column of a table of flights. A mission
 that crashed or hung before it could write its record has few fields; measures of missing fields are
 None. If a source-level fault struck several components, the measures join their values by ";" in a
-common order, and `struck_bits` has a list of bits for every component. Of several strikes the
-measures describe the first.
+common order, and `struck_bits` has a list of bits for every component. If a fault strikes several
+times, the measures describe the first strike.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Starts the programs of a user's companion, and ends them in every case.
+"""Starts the programs of a user's companion, and always ends them.
 
 A worker of the fork server runs one program: it starts the program, stores its output, restarts it
 by its rule, and then keeps running, because the program's children may outlive it. Its guard kills
@@ -131,7 +131,7 @@ class RunningProgram:
         return True
 
     def terminate(self) -> None:
-        """Ask it to end; a stopped program continues for that."""
+        """Ask the program to end, and continue it first in case it is stopped."""
         for number in (signal.SIGCONT, signal.SIGTERM):
             self.signal(number, group=True)
 
@@ -174,7 +174,7 @@ def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
 
 
 class _Kept:
-    """The file of an output, up to a limit."""
+    """A file that keeps an output up to a limit."""
 
     def __init__(self, undo: contextlib.ExitStack, path: Path) -> None:
         self._file: BinaryIO = undo.enter_context(
@@ -194,13 +194,13 @@ class _Kept:
 
 
 class _Ready:
-    """Searches the lines of stdout for the one that tells readiness."""
+    """Searches the lines of stdout for the one that signals readiness."""
 
     def __init__(self, pattern: str | None) -> None:
         self._pattern = None if pattern is None else re.compile(pattern.encode())
         self._line = b""
 
-    def found_in(self, data: bytes) -> bool:
+    def appears_in(self, data: bytes) -> bool:
         if self._pattern is None:
             return False
         *lines, rest = (self._line + data).split(b"\n")
@@ -252,7 +252,7 @@ def _pump(
                 for pipe in [pipe for pipe in output.pipes if pipe in events]:
                     data = _read(pipe, output)
                     output.write(data)
-                    if ready is not None and name == "stdout" and ready.found_in(data):
+                    if ready is not None and name == "stdout" and ready.appears_in(data):
                         report(ready=True)
             if ended in events:
                 return

@@ -52,7 +52,7 @@ class Recorder:
     """Records the briefing, and the input and start stamp of every invocation, by node.
 
     Attributes:
-        sequence: Nodes in the order of all starts.
+        sequence: Node of every invocation, in the order of their starts.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """The gate between any companion and its autopilot: withholds anomalous setpoints.
 
 It judges every setpoint together with the vehicle's state. A setpoint that raises an alarm does not
-reach the autopilot, and the one that does in its place becomes the reference of the next. Every
+reach the autopilot, and the setpoint sent in its place is the reference for the next. Every
 other frame passes unchanged.
 """
 
@@ -33,7 +33,7 @@ _BRAKE = 0b1101_1100_0111  # type_mask of a setpoint with a velocity only
 
 @dataclass(slots=True)
 class _Counts:
-    """Withheld setpoints by what took their place."""
+    """Numbers of withheld setpoints, by what was sent in their place."""
 
     hold: int = 0  # the last accepted setpoint
     brake: int = 0  # a standstill
@@ -79,7 +79,7 @@ class SetpointGate:
         self._yaw_rad = 0.0  # of the last accepted setpoint; a standstill keeps it
         self._in_a_row = self._checks = 0
         self._counts = _Counts()
-        self._said_s = self._handed_s = self._heartbeat_s = -math.inf
+        self._noted_s = self._handed_s = self._heartbeat_s = -math.inf
         self._same: tuple[Any, ...] = ()
         self._same_since_s = -math.inf
         self._failed = False
@@ -98,7 +98,7 @@ class SetpointGate:
             gate.judge_tick(trajectory, 0, still)
 
     def pass_between(self, message: Message, side: Side, now_s: float) -> list[Message]:
-        """Return the messages that go on in place of a message: usually itself."""
+        """Return the messages to pass on in place of a message: usually the message itself."""
         number = message.get_msgId()
         if side is Side.COMPANION and number not in SETPOINTS:
             if number == dialect.MAVLINK_MSG_ID_HEARTBEAT:
@@ -150,7 +150,7 @@ class SetpointGate:
         return self._standstill(message)
 
     def _staleness(self, message: Message, now_s: float) -> str:
-        """Return who is gone if a setpoint no longer changes; empty otherwise."""
+        """Describe what is gone if the setpoints no longer change; empty otherwise."""
         content = tuple(
             getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
         )
@@ -175,7 +175,7 @@ class SetpointGate:
         return [] if valid is None else [valid]
 
     def _standstill(self, message: Message) -> list[Message]:
-        """Return a setpoint of no velocity. It becomes the reference of the next."""
+        """Return a setpoint with zero velocity. It becomes the reference for the next."""
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=self._yaw_rad)
         trajectory, index, _ = self._view.sample(message)
         if self._gate.judge_tick(trajectory, index, still) is not None:
@@ -220,9 +220,9 @@ class SetpointGate:
 
     def _say(self, text: str, now_s: float) -> None:
         """Note an event, and send it as STATUSTEXT; both at most once a second."""
-        if now_s - self._said_s < _TEXT_EVERY_S:
+        if now_s - self._noted_s < _TEXT_EVERY_S:
             return
-        self._said_s = now_s if math.isfinite(now_s) else self._said_s
+        self._noted_s = now_s if math.isfinite(now_s) else self._noted_s
         self._note(text)
         self._codec.system = self._view.telemetry.system or 1
         data = f"mavfi gate: {text}".encode("ascii", "replace")

@@ -2,7 +2,7 @@
 
 A detector has 13 inputs (`detect.preprocess`). The 7 of the waypoint take the vehicle's state: its
 position, yaw and velocity. The 4 of the command take the setpoint: its yaw, and the displacement
-that it asks for within 1 s,
+that it requests within 1 s,
 
     d = (p_target - p) + v_target * 1 s + a_target / 2 * (1 s)^2,
 
@@ -40,7 +40,7 @@ _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 
 
 class SetpointView:
-    """The newest state of the autopilot, with which setpoints are read."""
+    """The newest state of the autopilot, which setpoints refer to."""
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()
@@ -72,7 +72,7 @@ class SetpointView:
 def command_of(
     setpoint: Message, state: VehicleState | None, global_position: Message | None = None
 ) -> Command:
-    """Return what a setpoint asks for within 1 s, ENU; see the module.
+    """Return the displacement and yaw that a setpoint requests for 1 s, ENU; see the module.
 
     Args:
         state: Newest state of the vehicle.

@@ -10,7 +10,7 @@ its mission is forked from the end of the flight, too. If it has changed the nod
 same flight is flown once more, as far as the last of these faults. The mission is forked when its
 node begins the struck invocation, and takes over the struck node.
 
-Every record is that of the mission flown alone, except its host section.
+Every record equals that of the mission flown alone, except in its host section.
 """
 
 from __future__ import annotations

@@ -257,8 +257,8 @@ def struck_nodes(
 ) -> dict[int, StruckInjection]:
     """Strike the faults of missions in a rehearsal.
 
-    A fault that cannot be planned there or compared is left out, and so is one that changes its
-    node.
+    Faults that cannot be planned or compared there, and faults that change their node, are left
+    out.
 
     Args:
         flown: the missions without their faults.
@@ -423,7 +423,7 @@ class InstructionInjection(NoInjection):
         """Move the attacked node into its own process and arm the fault there.
 
         Raises:
-            BuildMismatch: the repeated record is of another build.
+            BuildMismatch: the repeated record comes from another build.
             TracingForbidden: the operating system refuses.
         """
         scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")

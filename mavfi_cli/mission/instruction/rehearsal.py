@@ -1,6 +1,6 @@
 """Rehearses a node: it works through the orders of a golden flight, without the flight.
 
-Before an order the node is stopped and forked, as often as needed. A fork is the node in front of
+Before an order the node is stopped and forked, as often as needed. A fork is the node just before
 this invocation, with the same memory. One fork after the other receives the order, because all
 share the socket of the node: forks that are stepped for a profile, one with a fault, and
 two without it, with which the struck one is compared.
@@ -63,7 +63,7 @@ class KernelInvocation:
 
 
 class NodeEffect(Enum):
-    """What a fault did to a node until its answer."""
+    """The effect of a fault on a node until its answer."""
 
     MASKED = "masked"  # it answers, and remembers, what it does without the fault
     CHANGED = "changed"
@@ -145,7 +145,7 @@ class Rehearsal:
         return counts
 
     def go_to(self, invocation: KernelInvocation) -> None:
-        """Work up to the order that contains an invocation, which is not before this one.
+        """Work through the orders up to an invocation, which must not precede the present one.
 
         The node and its forks stay on one processor: switching between two doubles the time of
         stepping, and the C library keeps the processor's number in the memory of each thread.
