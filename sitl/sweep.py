@@ -10,7 +10,7 @@ one axis at a constant rate. No point of the body then moves further than
     travel = |p1 - p0| + angle * half-diagonal
 
 so a clearance d excludes contact for the fraction d / travel of the motion (conservative
-advancement; B. Mirtich, 1996). No step can cross a wall of any thickness. The same bound from both
+advancement; B. Mirtich, 1996). No step can cross a wall, however thin. The same bound from both
 ends of an interval gives the nearest approach (S. Piyavskii, 1972).
 """
 

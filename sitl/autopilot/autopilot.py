@@ -192,9 +192,9 @@ _Sender = tuple[Link, int, int]  # link, system, component
 class _Authority:
     """Decides whose commands and whose setpoints count.
 
-    Commands of every trusted system count, of all if none is named. Setpoints of one sender count
-    at a time: of the first that sends them, until it has been silent for as long as OFFBOARD
-    tolerates. `queue_text` takes the warnings.
+    Commands of every trusted system count, or of all systems if none is named. Setpoints of only
+    one sender count at a time: the first that sends them, until it has been silent for as long as
+    OFFBOARD tolerates. `queue_text` takes the warnings.
     """
 
     def __init__(self, trusted: Sequence[int], queue_text: Callable[[Severity, str], None]) -> None:

@@ -176,7 +176,7 @@ def _return() -> Guidance:
 
 
 def _return_height_m(now: Snapshot) -> float:
-    """Return the height above home, m: within a cone round it if near, else RTL_RETURN_ALT."""
+    """Return the height above home, m: within a cone around it if near, else RTL_RETURN_ALT."""
     value = now.parameters.effective
     away = now.truth.position_ned_m - now.home_ned_m
     distance, above = math.hypot(away[0], away[1]), -float(away[2])
@@ -232,7 +232,7 @@ def _go_vertical(now: Snapshot, out: Setpoint, delta_m: float) -> None:
 
 
 def begin(mode: FlightMode, now: Snapshot) -> Guidance:
-    """Return the guidance of a mode at its entry. A LOITER uses up the position to hold."""
+    """Return the guidance of a mode at its entry. A LOITER consumes the position to hold."""
     if mode is FlightMode.OFFBOARD:
         return _follow_companion
     if mode is FlightMode.POSCTL:

@@ -181,7 +181,7 @@ def _request_message(autopilot: Autopilot, message: Any, link: Link) -> Result:
 
 
 def _send(autopilot: Autopilot, link: Link, number: int, *, index: int = 0) -> Result:
-    """Send a requested message, or those of an index of it."""
+    """Send a requested message, or the messages that `index` selects."""
     if number in DESCRIPTIONS:
         messages = DESCRIPTIONS[number](autopilot.snapshot, index)
     else:
@@ -381,7 +381,7 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Accept the clearing of the mission, which an empty upload is, too. Refuse anything else."""
+    """Accept a clearing of the mission, also by an empty upload. Refuse anything else."""
     result = dialect.MAV_MISSION_ACCEPTED
     if message.get_type().startswith("MISSION_REQUEST"):
         result = dialect.MAV_MISSION_INVALID_SEQUENCE

@@ -46,7 +46,7 @@ _PIXEL_PITCH_MM = 0.01  # arbitrary: field of view = 2 atan(sensor / 2 / focal l
 
 @dataclass(slots=True)
 class _Schedule:
-    """Due at the first poll and then every `interval_s` in phase with it.
+    """A schedule that is due at the first poll, and then every `interval_s` in phase with it.
 
     A late poll does not shift the phase. Missed times are skipped.
     """

@@ -42,7 +42,7 @@ class _Linked(Peer):
 
     Args:
         slots: Place of the autopilot of each system at the peer's endpoint.
-        awaits_frames: False for a companion that has started the camera, until it speaks.
+        awaits_frames: False for a companion that has started the camera, until it sends a message.
     """
 
     def __init__(
@@ -237,8 +237,8 @@ class Station:
     """Camera, referee and links of one autopilot.
 
     It joins the peers of several endpoints, and is the camera component among them. Two autopilots
-    of the same system id at one endpoint would be one vehicle that jumps. The frames of the second
-    are dropped, and a STATUSTEXT names both senders. Frames of others keep their own signatures.
+    of the same system id at one endpoint would look like one vehicle that jumps. The frames of the
+    second are dropped, and a STATUSTEXT names both senders. Frames of others keep their signatures.
 
     Args:
         urls: Endpoints to open. One that cannot be opened raises LinkError.
@@ -382,7 +382,7 @@ class Station:
     def _place(self) -> None:
         """Use the given origin if no camera has sent a better one within a second.
 
-        The second is one of the autopilot's clock, which may run much faster than the wall clock.
+        It is a second of the autopilot's clock, which may run much faster than the wall clock.
         """
         stamp_s = self._tracker.attitude_stamp_s
         if self._placed or stamp_s is None:

@@ -313,7 +313,7 @@ def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
 
 @compiled
 def _heading_rate(clean: Vector, heading: float, state: Vector, gains: Vector) -> float:
-    """Return the yaw rate round the vertical, rad/s, and advance the heading reference."""
+    """Return the yaw rate around the vertical, rad/s, and advance the heading reference."""
     dt = gains[G_DT]
     limit = gains[G_YAW_RATE_LIMIT]
     wanted = clean[SP_YAW_RATE] if math.isfinite(clean[SP_YAW_RATE]) else 0.0

@@ -150,7 +150,7 @@ class RateLoops:
     ) -> dict[str, float]:
         """Return the gains by names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
 
-        A share is the part of `tilt_nm` or `yaw_nm` that full command gives round its axis.
+        A share is the part of `tilt_nm` or `yaw_nm` that full command gives around its axis.
         """
         full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
         return {

@@ -304,7 +304,7 @@ class _StandIn:
         - The tilt limit is raised if acceleration_mps2 needs it, to LARGEST_TILT_DEG at most.
 
         Raises:
-            ConfigError: The profile cannot fly. Gives the numbers.
+            ConfigError: The profile cannot fly. The message gives the numbers.
             ValueError: The propellers take more shaft power than hover_power_w.
         """
         mass_kg = self.mass_kg or base.mass_kg

@@ -179,7 +179,7 @@ def _refresh_and_control(
     setpoint: Vector,
     gains: Vector,
 ) -> None:
-    """Do what lies between two steps of the physics, in one call."""
+    """Do all work between two steps of the physics in one call."""
     truth[T_STAMP] = stamp_s
     _refresh(raw, commands, regression, battery, dt_s, armed, truth)
     _control(state, truth, setpoint, gains, armed, commands)

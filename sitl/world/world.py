@@ -1,6 +1,6 @@
 """A world: axis-aligned boxes on flat ground with a start and a goal, generated or from a file.
 
-The paper's generator has two numbers (section VI-A). With probability `density`, a cell of
+The paper's generator has two parameters (section VI-A). With probability `density`, a cell of
 10 x 10 m contains a `size` x `size` m cuboid of unlimited height at its centre. Each cell draws
 from its own random stream (seed, family, density, size, cell), so a larger area only adds obstacles
 and never moves the others.
@@ -174,10 +174,10 @@ def load_world(
     The same seed always gives the same world. Start and goal (3,), ENU m, replace the world's own.
 
     Raises:
-        UnknownName: No world has this name. Suggests the nearest.
+        UnknownName: No world has this name. The message suggests the nearest.
         PlaceError: Start or goal is outside or blocked.
         WorldError: The generator spec is invalid.
-        ConfigError: The file cannot be used. Names file, line and key.
+        ConfigError: The file cannot be used. The message names file, line and key.
     """
     if seed < 0:
         raise WorldError(f"seed must be at least 0, got {seed}")
@@ -224,7 +224,7 @@ def _place(what: str, place: Sequence[float] | Vector | None) -> Vector | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
-    """The generator's two numbers and the family of the random streams."""
+    """The generator's two parameters and the family of the random streams."""
 
     density: float  # probability that a cell contains an obstacle
     size_m: float  # side of the cuboid
