@@ -56,7 +56,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputComparison:
-    """Which outputs are compared, and how.
+    """The outputs to compare, and the rules of the comparison.
 
     Attributes:
         files: compared files, relative to the folder in which the program runs.

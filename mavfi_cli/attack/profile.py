@@ -399,7 +399,7 @@ def function_of(place: AttackPlace, name: str) -> Location:
     """Find the entry of a function in scope.
 
     Raises:
-        UnknownName: there is no function of that name; names the nearest.
+        UnknownName: there is no function of that name; the message suggests the nearest.
     """
     with started(place) as tracee:
         image = place.image(tracee)

@@ -20,10 +20,10 @@ T = TypeVar("T")
 
 
 class TracerThread(Generic[T]):
-    """Runs work that traces a node in a thread of its own.
+    """A separate thread that does work with a traced node.
 
     Args:
-        work: receives a function that it calls once the node runs towards the awaited event.
+        work: receives a function to call once the node runs towards the awaited event.
     """
 
     def __init__(self, work: Callable[[Notice], T]) -> None:

@@ -134,11 +134,11 @@ class WorkFolder:
             raise TargetError(self._name, problem) from None
 
     def had(self, name: str) -> bool:
-        """Return whether a file was in the folder before the run."""
+        """Return True if a file was in the folder before the run."""
         return (self._copy / name).is_file()
 
     def wrote(self, name: str) -> bool:
-        """Return whether the last run wrote an existing file of the folder."""
+        """Return True if the last run wrote an existing file of the folder."""
         before, after = self._copy / name, self.path / name
         if not before.is_file():
             return True

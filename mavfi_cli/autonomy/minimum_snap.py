@@ -59,7 +59,7 @@ class MinimumSnap:
 
         Args:
             is_free: returns True if a polyline (k, 3) lies in free space.
-            passes_max: number of times that it is solved; each pass adds a vertex.
+            passes_max: largest number of passes; each one solves it again with one more vertex.
         """
         vertices = _distinct(path_enu_m)
         for _ in range(passes_max):

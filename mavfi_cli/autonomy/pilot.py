@@ -180,7 +180,7 @@ class _ActivePlan:
         return 0 if self.trajectory is None else self.waypoint_at(self.trajectory, self.time_s)
 
     def waypoint_at(self, trajectory: Trajectory, time_s: float) -> int:
-        """Return the index of a trajectory's waypoint at a time. The newest answer is kept."""
+        """Return the index of a trajectory's waypoint at a time. The newest result is cached."""
         known, known_s, index = self._located
         if trajectory is not known or time_s != known_s:
             index = waypoint_index(trajectory, time_s)

@@ -323,7 +323,7 @@ def find(name: str) -> Planner:
     Names of our own planners may be spelt differently; see `canonical_planner`.
 
     Raises:
-        UnknownName: No planner has this name. Suggests the nearest.
+        UnknownName: No planner has this name. The message suggests the nearest.
         MavfiError: Its package does not load.
     """
     plain = canonical_planner(name)

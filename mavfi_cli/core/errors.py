@@ -178,7 +178,7 @@ class BuildMismatch(FaultError):
     """A fault record of another build. The message names every object that differs."""
 
     def __init__(self, differences: Iterable[str]) -> None:
-        super().__init__(f"the record is of another build: {'; '.join(differences)}")
+        super().__init__(f"the record comes from another build: {'; '.join(differences)}")
 
 
 class Interrupted(MavfiError):

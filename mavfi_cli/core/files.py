@@ -131,7 +131,7 @@ _unsynced: set[Path] = set()
 def leave_unsynced(folder: Path) -> None:
     """Let this process and its forks write files below a folder without syncing them.
 
-    For a folder that a power failure may damage, because its files are removed, or kept after
+    Use it if a power failure may damage the folder, because its files are removed, or kept after
     `sync_folder`. A sync takes 10 to 300 ms, and nobody else works in this time.
     """
     _unsynced.add(folder.absolute())

@@ -166,7 +166,7 @@ class RecordedTrigger:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedActivation:
-    """Whether a corrupted value was read, and by whom first."""
+    """Whether a corrupted value was read, and its first reader."""
 
     activation: str = ""
     first_reader: Reader | None = None
@@ -178,7 +178,7 @@ class StateFault:
 
     Attributes:
         reason: Why it was not injected.
-        request: What the user asked for, as a `FaultConfig`.
+        request: The user's request, as a `FaultConfig`.
         states, units: Names of what the fault strikes, and their units.
         strikes: The first strikes; `strike_count` counts all.
     """
@@ -202,7 +202,7 @@ class RecordedAlarm:
     """An alarm of a detector.
 
     Attributes:
-        message: What raised it: report, plan, ahead (active plan) or tick.
+        message: Kind of the message that raised it: report, plan, ahead (active plan) or tick.
         recomputes: Recomputed stage if it is another than `stage`; else None, which is not written.
     """
 
@@ -225,7 +225,7 @@ class RecordedRecovery:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
-    """What a detector did.
+    """The work of a detector in one flight.
 
     Attributes:
         checks: Number by kind of message.
@@ -281,11 +281,11 @@ class MissionInstructionFault:
     Attributes:
         state: planned, applied, not_injected or null (nothing was to be flipped).
         reason: Why it was not injected.
-        request: What the user asked for, as an `InstructionConfig`.
+        request: The user's request, as an `InstructionConfig`.
         stamp_s: Simulated time of the struck invocation, s.
         k: Number of the struck execution of the instruction.
         corruption: None without a flip.
-        injection: None if the process was cut off, so that nobody knows.
+        injection: None if the process was cut off before the result was known.
     """
 
     state: str = ""

@@ -323,8 +323,8 @@ class Forks:
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
         """Fork the worker. Return True in the fork; in the worker, return False after its end.
 
-        The fork ends by returning from `perform`. There is none after HALT, or, as the client is
-        told, if the system has no memory or no process left.
+        The fork ends by returning from `perform`. No fork is made after HALT, or if the system has
+        no memory or no process left, which the client learns from a message.
 
         Args:
             key: names the fork in the message about its end, which has the wall time since the
@@ -390,7 +390,7 @@ def _isolate_streams(folder: Path) -> None:
 
 
 def die_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends. Exit now if it has ended."""
+    """Have the kernel kill this process when its parent ends. Exit if it is already gone."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)

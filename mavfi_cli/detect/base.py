@@ -83,7 +83,7 @@ def find_detector(
         threshold: Replaces the model's threshold; a number of sigmas for `gad`.
 
     Raises:
-        UnknownName: No detector has this name. Suggests the nearest.
+        UnknownName: No detector has this name. The message suggests the nearest.
         MavfiError: Its package does not load.
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
@@ -323,7 +323,7 @@ class FittedDetector:
 
     @classmethod
     def _arrays(cls, model: Model, path: Path) -> dict[str, FloatArray]:
-        """Return the arrays of a model. A ModelError says why this version cannot use it."""
+        """Return the arrays of a model. A ModelError explains why this version cannot use it."""
         if problem := model.incompatibility(cls.name, cls.shapes):
             raise ModelError(problem, path=path)
         arrays = {}

@@ -183,7 +183,7 @@ class _FlownPlans:
         return None if plan is before[0] and waypoint == before[1] else (plan, waypoint)
 
     def _strike(self, strike: PlanStrike, plan_stamp_s: float) -> None:
-        """Apply a strike to the active plan, unless the value was published so."""
+        """Apply a strike to the active plan, unless the published value already includes it."""
         plan, state = self._plans.get(plan_stamp_s), BY_NAME[strike.state]
         if plan is None or strike.waypoint >= len(plan.waypoints):
             return
@@ -274,7 +274,7 @@ def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> ND
 
 
 def columns_of(table: Any) -> dict[str, NDArray[Any]]:
-    """Return the columns of an Arrow table as masked arrays, which tell NaN from null."""
+    """Return the columns of an Arrow table as masked arrays, which distinguish NaN from null."""
     columns: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
         column = table[name].combine_chunks()

@@ -56,7 +56,7 @@ OF_PROCESSES = (Effect.FLIP, Effect.STOP, Effect.SLOW)
 
 
 class Persistence(Enum):
-    """How long a corruption lasts."""
+    """The duration of a corruption."""
 
     TRANSIENT = "transient"
     STUCK_AT = "stuck-at"

@@ -160,7 +160,7 @@ class Injector(NoInjector):
 
     @property
     def missed(self) -> str:
-        """Why the fault never struck."""
+        """The reason why the fault never struck."""
         never, since = {
             When.PHASE: (
                 f"the pilot was never in phase {self._trigger.phase}",

@@ -36,7 +36,7 @@ class _WireState(State):
         return number
 
     def write(self, message: Message, index: int, value: Scalar) -> Message:
-        """Return a copy of a received message with the value. Its frame stays the old one."""
+        """Return a copy of a received message with the value. Its frame is unchanged."""
         changed, field = copy.copy(message), getattr(message, self.source)
         if self.column is not None:
             field = [*field[: self.column], value, *field[self.column + 1 :]]

@@ -1,4 +1,4 @@
-"""A user's own companion: its programs, and when its flight has succeeded."""
+"""A user's own companion: its programs, and the conditions of its success."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _words(command: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessConfig:
-    """When a flight has succeeded: all conditions that are given, and no collision.
+    """The conditions of success: all given ones must hold, without a collision.
 
     Attributes:
         goal_m: The vehicle is at rest within this distance of the goal, m.
@@ -122,10 +122,10 @@ class SuccessConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateConfig:
-    """What the gate between a companion and its autopilot does.
+    """The behaviour of the gate between a companion and its autopilot.
 
     Attributes:
-        action: What takes the place of a setpoint with an alarm: `hold`, the last accepted
+        action: The replacement of a setpoint with an alarm: `hold`, the last accepted
             setpoint; `brake`, a standstill; `autopilot`, nothing, and the autopilot is switched to
             its own hold.
         patience: Number of consecutive alarms after which `hold` becomes `brake`.
@@ -159,14 +159,13 @@ class CompanionConfig:
             ready.
         link: mavfi's end of the companion's MAVLink link. `udpin` with port 0 listens on a free
             port; `udpout` calls a program that listens on a fixed one, as PX4 does.
-        success: When the flight has succeeded; by default when the last program has ended with
-            code 0.
+        success: Conditions of success; by default the last program has ended with code 0.
         time_limit_s: Limit of simulated time from arming, s; None for the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
-            straight way to the goal at the speed limit.
+            straight flight to the goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. A message
             that a fault changes is signed again with it.
-        gate: What the gate does with `--detector`.
+        gate: Behaviour of the gate with `--detector`.
         name: Name in the models of its detectors.
     """
 
@@ -184,7 +183,9 @@ class CompanionConfig:
             raise ConfigError("must have at least one program", key="program")
         for name in self.program:
             if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
-                raise ConfigError(f"must have letters, digits, - and _, got {name!r}", key=name)
+                raise ConfigError(
+                    f"must have only letters, digits, - and _, got {name!r}", key=name
+                )
         _require_range("time_limit_s", self.time_limit_s, 1.0, 86_400.0)
         _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
         if self.success.exit is not None and self.success.exit not in self.program:

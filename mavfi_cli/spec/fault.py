@@ -189,13 +189,13 @@ class FaultConfig:
         target = self.wire_target[1]
         trigger, corruption = self.trigger(), self.corruption()
         if trigger.when is When.FORESEEN:
-            raise FaultSpecError(f"{self.target}: at must be anything but foreseen, got {self.at}")
+            raise FaultSpecError(f"{self.target}: at must not be foreseen, got {self.at}")
         fields = WireFields.of(target.partition(".")[0])
         if corruption.effect in OF_MESSAGES:
             if "." in target:
                 raise FaultSpecError(
-                    f"{self.target}: {corruption.effect.value} must have a whole message, got a "
-                    "field"
+                    f"{self.target}: {corruption.effect.value} must have a whole message as "
+                    "target, got a field"
                 )
             return fields, None
         require_effect(self.target, corruption.effect, (*OF_VALUES, *OF_MESSAGES))
@@ -276,9 +276,7 @@ class FaultConfig:
             if not target.startswith("waypoint_"):
                 raise UnknownName("state of control's queue", target, _QUEUED)
             if self.trigger().when is When.INVOCATION:
-                raise FaultSpecError(
-                    f"{self.target}: at must be anything but an invocation, got {self.at}"
-                )
+                raise FaultSpecError(f"{self.target}: at must not be an invocation, got {self.at}")
         return draw_fault(
             target,
             seed=self.seed,

@@ -135,7 +135,7 @@ class Stack:
             _require_node("standby", node)
             if node == "control":
                 raise ValueError(
-                    "standby: control keeps its queue in its own process, so it cannot be one"
+                    "standby: must not name control, which keeps its queue in its own process"
                 )
         if self.smoother not in SMOOTHERS:
             raise UnknownName("smoother", self.smoother, SMOOTHERS)
@@ -167,7 +167,7 @@ class Stack:
                         "processes: control works in every tick, so it must be alone in its process"
                     )
                 if node in seen:
-                    raise ValueError(f"processes: {node} is in two of them")
+                    raise ValueError(f"processes: must not name {node} twice")
                 seen.add(node)
 
     def settings_of(self, params: type) -> dict[str, Any]:

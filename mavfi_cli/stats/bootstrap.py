@@ -26,12 +26,12 @@ Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
 
 
 def mean(values: FloatArray) -> FloatArray:
-    """Reduce the last axis."""
+    """Return the mean over the last axis."""
     return np.asarray(values.mean(axis=-1))
 
 
 def median(values: FloatArray) -> FloatArray:
-    """Reduce the last axis."""
+    """Return the median over the last axis."""
     return np.asarray(np.median(values, axis=-1))
 
 

@@ -1,4 +1,4 @@
-"""Two treatments: tests, the worst case, effects with intervals, and what they say about a claim.
+"""Two treatments: tests, the worst case, effects with intervals, and the verdict on a claim.
 
 The worst case and its recovery are those of the paper's section VII-A. It gives, for Factory, a
 worst-case flight time with faults 73.8 % above the golden run's, recovered by 64.2 % in section
@@ -51,7 +51,7 @@ class McNemar:
         *,
         weights: FloatArray | None = None,
     ) -> McNemar:
-        """McNemar's test (Psychometrika 12, 1947), exact: the differing pairs as fair coins.
+        """McNemar's exact test (Psychometrika 12, 1947), in which differing pairs are fair coins.
 
         With weights, the p-value is that of `sign_flips` of the weighted differences.
 
@@ -148,7 +148,7 @@ class WorstCase:
     Attributes:
         golden: the reference, the mean of the golden flights.
         golden_worst, faulty_worst, protected_worst: the largest values.
-        increase: faulty worst case over the reference, minus 1; 0.738 in the example.
+        increase: faulty worst case divided by the reference, minus 1; 0.738 in the example.
         recovered: reduction by protection, in the same unit; 0.642.
         recovered_share: recovered part of the increase, 0.87; NaN unless the faulty worst case
             exceeds the worst golden one.
@@ -169,7 +169,7 @@ class WorstCase:
         """Compare the flight times, or energies, of the successful missions of each setting.
 
         Args:
-            golden: OWN if each value is over that of the same mission's golden flight.
+            golden: OWN if each value is divided by that of the same mission's golden flight.
         """
         known = bool(golden and faulty)
         reference = math.fsum(golden) / len(golden) if known else math.nan
@@ -209,7 +209,7 @@ def paired_difference(
 
     Args:
         first, second: whether each mission is a hit under each treatment, (n,).
-        clusters: key that missions share which depend on each other, (n,).
+            clusters: key shared by the missions that depend on each other, (n,).
     """
     change = np.asarray(second, dtype=np.int64) - np.asarray(first, dtype=np.int64)
     pairs = len(change)
@@ -242,7 +242,7 @@ def net_share(
 
     Args:
         before, after: whether each mission is a hit without and with the treatment, (n,).
-        clusters: key that missions share which depend on each other, (n,).
+            clusters: key shared by the missions that depend on each other, (n,).
     """
     hits, pairs = int(before.sum()), len(before)
     if not hits:

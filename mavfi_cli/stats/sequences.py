@@ -60,7 +60,7 @@ def anytime_count(z: float, count: int, level: float) -> float:
     from scipy.optimize import brentq
 
     def short(number: float) -> float:
-        """Standard errors that are missing at this number."""
+        """Standard errors that are lacking at this number of observations."""
         return anytime_z(number, level) - z * math.sqrt(number / count)
 
     enough = float(count)

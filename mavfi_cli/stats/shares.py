@@ -127,7 +127,7 @@ def score_interval(share: float, number: float, confidence: float) -> tuple[floa
 def unseen_share(total: int, confidence: float = 0.95) -> float:
     """The largest share that explains why none of `total` independent runs is a hit.
 
-    The one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 without runs.
+    It is the one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 if no runs.
     """
     return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0  # exact; SciPy searches
 
@@ -165,8 +165,8 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
     """The fewest missions whose Wilson interval has a half width of at most `margin`.
 
-    From (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m, which is, with u = z²/n, the quadratic
-    u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
+    The condition (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m is, with u = z²/n, the
+    quadratic u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
 
     Args:
         margin: half of the interval's width.
@@ -222,8 +222,8 @@ class CrossLayer:
     Attributes:
         corruption: share of faults in the isolated kernel that silently corrupt its output.
         failure: share of faults that fail the mission.
-        failure_given_corruption: the second over the first, with the ends of the failure's interval
-            over the corruption's point estimate. None if the estimate would be above 1 (crashes and
+        failure_given_corruption: `failure` / `corruption`, with the ends of the failure's interval
+            divided by the corruption's estimate. None if the estimate would be above 1 (crashes and
             hangs fail missions too) or no output was corrupted.
     """
 
@@ -296,8 +296,8 @@ def _spread(
     """Variance of the number of hits: of runs alone, and by stratum with its number of clusters.
 
     The share is a ratio of two estimated totals (Cochran, sections 6.4 and 9A). So the residuals of
-    a cluster's runs against the share of the whole are summed. The spread of these sums tells how
-    far the share would move with other clusters. It contains the likeness of a cluster's runs, the
+    a cluster's runs against the share of the whole are summed. The spread of these sums shows how
+    far the share would move with other clusters. It covers the similarity of a cluster's runs, the
     unequal sizes of clusters, and the error of the estimated weights of strata.
     """
     share = sum(hits) / len(hits) if hits else 0.0
@@ -322,7 +322,7 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
     """The estimated total over strata, from members drawn uniformly from each stratum.
 
     The interval has the correction for a finite population (Cochran, section 5.4). It is that of
-    the logarithm, because lengths of windows are skewed, and is not lower than what was seen. One
+    the logarithm, because lengths of windows are skewed, and is not lower than the drawn total. One
     member out of several does not reveal its error, so there is no upper end.
 
     Args:

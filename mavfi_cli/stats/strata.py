@@ -40,14 +40,14 @@ def spread(hits: int, missions: int) -> float:
 def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) -> list[int]:
     """Number of missions of each stratum, at least 1.
 
-    In proportion to size times spread (J. Neyman, J. Royal Statistical Society 97, 1934), except
-    for a share DEFENCE in proportion to size alone, so that a stratum whose spread was
-    underestimated keeps its missions (T. Hesterberg, Technometrics 37, 1995).
+    It is proportional to size times spread (J. Neyman, J. Royal Statistical Society 97, 1934),
+    except for a share DEFENCE that is proportional to size alone, so that a stratum whose spread
+    was underestimated keeps its missions (T. Hesterberg, Technometrics 37, 1995).
 
     Args:
         sizes: shares of the strata in the population; they add up to 1.
         spreads: standard deviations in the strata, all above 0.
-        missions: number of missions, at least that of the strata.
+        missions: number of missions, at least the number of strata.
     """
     total = math.fsum(size * own for size, own in zip(sizes, spreads, strict=True))
     free = missions - len(sizes)

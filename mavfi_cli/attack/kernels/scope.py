@@ -4,9 +4,8 @@ A planner has two scopes. In isolation the kernel is the search, OMPL's `solve`,
 In a mission the kernel is the planner node's work for one request, with or without a search
 (`node_scope`).
 
-Call these functions in the kernel's process, after the kernel has run once (`autonomy.warm`):
-a just-in-time compiled kernel has no address before. The result can be
-sent to a tracer.
+Call these functions in the kernel's process, after the kernel has run once (`autonomy.warm`): a
+just-in-time compiled kernel has no address before that. The result can be sent to a tracer.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class KernelScope:
         inner: functions of the kernel. If it executes too many instructions to profile them all,
             invocations of these functions are sampled. For a planner node, windows that begin at
             them are sampled, and the first function is the search.
-        end: an optional instruction from whose first execution on nothing is attacked, because
+        end: an optional instruction. Nothing is attacked from its first execution on, because
             only the output is written then.
     """
 
@@ -88,7 +87,7 @@ def kernel_scope(kernel: str) -> KernelScope:
     """Find the entry and the scope of a kernel in this process.
 
     Raises:
-        UnknownName: no such kernel; names the nearest.
+        UnknownName: no such kernel; the message suggests the nearest.
         FaultError: the kernel has not run in this process yet.
     """
     if kernel not in KERNELS:
@@ -104,7 +103,7 @@ def library_scope(library: str, function: str) -> KernelScope:
     """Find the entry of a library's function. All code of the library is in scope.
 
     Raises:
-        UnknownName: no such library or function; names the nearest.
+        UnknownName: no such library or function; the message suggests the nearest.
     """
     entry = Image(os.getpid()).function(function, [library])
     return KernelScope(kernel=function, entry=entry, objects=(library,), regions={})
@@ -140,10 +139,10 @@ def node_scope(node: str, planner: str) -> KernelScope:
 
     A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
     after that is in scope up to the reply: the tests of straight segments and of pieces of the
-        trajectory, and the search if there is one.
+    trajectory, and the search if there is one.
 
     Raises:
-        UnknownName: no such node or planner; names the nearest.
+        UnknownName: no such node or planner; the message suggests the nearest.
         FaultError: its kernel has not run in this process yet.
     """
     kernel = kernel_of_node(node, planner)

@@ -42,7 +42,7 @@ DATA_REGISTERS = frozenset((Site.GENERAL, Site.FLAGS, Site.VECTOR, Site.X87, Sit
 
 
 class Role(Enum):
-    """Whether the corrupted operand is read or written by the instruction."""
+    """The role of the corrupted operand: the instruction reads it or writes it."""
 
     SOURCE = "source"  # corrupted before the instruction executes
     DESTINATION = "destination"  # corrupted after the instruction has written it
@@ -259,7 +259,7 @@ Draw = Callable[
 
 
 class Rule(Enum):
-    """How the time of a fault is drawn."""
+    """A rule that draws the time of a fault."""
 
     INSTRUCTION = "instruction-uniform"  # every executed instruction in scope is equally likely
     CPU_TIME = "cpu-time"  # uniform over the CPU time of the fault-free run
@@ -306,7 +306,7 @@ class Strategy:
         rng: np.random.Generator,
         following: Instruction | None = None,
     ) -> InstructionCorruption | None:
-        """Draw a corruption of an instruction, given the next one; None if there is none."""
+        """Draw a corruption of an instruction, given the next one; None if no corruption fits."""
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
         return _draw_corruption(instruction, self.model, rng)

@@ -16,7 +16,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 
 class BitActivation(Enum):
-    """What happened to the corrupted bits within the followed window."""
+    """The fate of the corrupted bits within the followed window."""
 
     READ = "read"
     OVERWRITTEN = "overwritten"
@@ -54,7 +54,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
     """Run the target to the exact execution that the trigger names.
 
     Returns:
-        Why it was not reached, or the empty string.
+        The reason why it was not reached, or the empty string.
     """
     for stage in fault.trigger:
         address = image.address(stage.location)

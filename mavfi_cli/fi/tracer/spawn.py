@@ -205,7 +205,7 @@ _PATHS = {
 
 @dataclass(slots=True)
 class ObservedRun:
-    """What a program did in one run.
+    """The observed actions of a program in one run.
 
     Attributes:
         started: description of the first thread, child or program that it started; empty if none.

@@ -52,7 +52,7 @@ class StoppedFork:
         return Path(f"/proc/{self.tracee.pid}")
 
     def _outline(self) -> tuple[object, ...]:
-        """Return what is compared as it is: calls, registers, mappings, signals and threads."""
+        """Return what is compared directly: calls, registers, mappings, signals and threads."""
         registers = self.tracee.registers
         vector = registers.extended()
         return (

@@ -56,7 +56,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Mechanism(Enum):
-    """How executions are counted."""
+    """A mechanism that counts executions and stops at one of them."""
 
     PERF = "perf"
     DEBUG = "debug-registers"
@@ -156,7 +156,7 @@ def _threads_of(pid: int) -> list[int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """How a process ended; exactly one of the two fields is set."""
+    """The end of a process; exactly one of the two fields is set."""
 
     exit_code: int | None
     signal: int | None
