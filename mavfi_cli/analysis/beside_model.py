@@ -127,7 +127,7 @@ class FlownScheme:
     """A scheme in flight.
 
     Attributes:
-        problem: why it was not flown; then it has no numbers.
+        problem: the reason why it was not flown; it then has no numbers.
         over_none, over_aad: None if the other scheme was not flown.
     """
 

@@ -411,7 +411,7 @@ def results(
         error_free, faults: as `pairs_of` returns them.
         scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
             and the scores of its error-free flights.
-        about: what the evaluation contains besides.
+        about: the other fields of the evaluation.
     """
     return Evaluation(
         **about,

@@ -39,7 +39,7 @@ class KernelSummary:
     """A summary of attacked kernels.
 
     Attributes:
-        faults: how they were drawn: `rule`, `compat` and `model`.
+        faults: the way in which they were drawn: `rule`, `compat` and `model`.
         seed: seed of the faults.
         flight: the flight whose inputs the kernels had.
     """

@@ -73,7 +73,7 @@ class FlightOverhead:
         weighted: Sequence[tuple[DetectionCost, float]],
         confidence: float,
     ) -> Self:
-        """Average the costs of one detector over its weighted flights, of which one must exist."""
+        """Average the costs of one detector over its weighted flights, which must not be empty."""
         costs = [cost for cost, _ in weighted]
         weights = np.array([weight for _, weight in weighted])
 

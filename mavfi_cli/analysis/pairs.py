@@ -93,21 +93,21 @@ class Flights:
     It has the columns of an export. A column that the export lacks is empty. Further columns:
         fault: the configured fault as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
-        at: when a source-level fault strikes; empty without one.
+        at: the trigger of a source-level fault; empty without one.
         as_paper: whether vehicle, speed, sensors, the single flip of drawn bits and the 13 watched
             states are those of the paper. Stack, detector model and `at` may differ.
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
         ended: whether the fault ended a node, by a crash or a hang.
-    Of its golden flight:
+    Columns about its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.
         over_own: flight time divided by it; empty if one of the two is lost.
         added_s: flight time minus it; empty if one of the two is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
-    Of the flight with the same fault and no detector, empty without such a flight: bare_struck,
-    bare_ended, bare_lost, bare_over_own, bare_harmed.
+    Columns about the flight with the same fault and no detector, empty without such a flight:
+    bare_struck, bare_ended, bare_lost, bare_over_own, bare_harmed.
     """
 
     table: pa.Table
@@ -273,7 +273,7 @@ class Flights:
 
     @property
     def ratios(self) -> FloatArray:
-        """Flight times over those of the missions' golden flights, where both succeed."""
+        """Flight times divided by those of the missions' golden flights, where both succeed."""
         return self.known("over_own")
 
     @property
@@ -362,8 +362,9 @@ def against_golden(
     """Compare flights with their golden flights, which may be empty; all columns are (n,).
 
     Returns:
-        Flight time over that of the golden flight, empty if one of the two is lost. Whether the
-        flight is harmed: lost, or longer than LONGER; empty unless the golden flight succeeds.
+        Flight time divided by that of the golden flight, empty if one of the two is lost; and
+        whether the flight is harmed: lost, or longer than LONGER; empty unless the golden flight
+        succeeds.
     """
     succeeds = pc.equal(own_lost, _NO)
     ratio = pc.divide(time_s, own_time_s)

@@ -3,10 +3,10 @@
 Flight time, distance, energy and replans cover successful flights, response times all counted
 flights. A faulty flight is counted if its fault struck a value that was read or caught.
 
-The cost of a fault (Fig. 16 of the paper) is the flight time over that of the golden flight of the
-same mission on the same platform, if both reached the goal. It extends the measure of the paper,
-which flies one fixed world, to several worlds. The longest flight over the mean golden flight is
-also given. It depends on the length of the mission.
+The cost of a fault (Fig. 16 of the paper) is the flight time divided by that of the golden flight
+of the same mission on the same platform, if both reached the goal. It extends the measure of the
+paper, which flies one fixed world, to several worlds. The ratio of the longest flight to the mean
+golden flight is also given. It depends on the length of the mission.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ class _CostInSeconds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CostRatio:
-    """Flight time over that of the golden flight.
+    """Flight time divided by that of the golden flight.
 
     Attributes:
         recovered_share: the part of the largest increase without detector that the detector
@@ -230,9 +230,9 @@ class CostDifference:
 
     Attributes:
         pairs: faults that have a cost on both platforms.
-        differ: how many of them have different costs.
+        differ: number of them that have different costs.
         extra_s, p_value: mean difference of costs and its p-value, by missions.
-        p95_ratio: ratio of the 95th percentiles of flight time over own golden flight.
+        p95_ratio: ratio of the 95th percentiles of flight time / own golden flight time.
         largest_ratio: the same ratio of the largest values, over all flights of each platform.
         longest_ratio: ratio of the longest flight times, over all flights of each platform.
     """
@@ -306,7 +306,7 @@ def figures(plan: ComparedPlan, flights: pa.Table, **about: Any) -> PlatformComp
 
     Args:
         flights: table with the columns of SCHEMA.
-        about: what the comparison contains besides.
+        about: the other fields of the comparison.
     """
     platforms, settings = [row.platform for row in plan.platforms], plan.settings
     whole = flights.append_column("succeeded", pc.equal(flights["outcome"], "success"))

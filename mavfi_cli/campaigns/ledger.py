@@ -135,7 +135,7 @@ class Drawn(NamedTuple):
 class Ledger:
     """One campaign's missions and results.
 
-    Use it as a context manager. Any number of readers may run beside one writer.
+    Use it as a context manager. Any number of readers may run alongside one writer.
 
     Attributes:
         export: the table of flights if the ledger was opened from an export, which has no records;
@@ -323,7 +323,7 @@ class Ledger:
         Args:
             cells: labels of the settings with their numbers.
             missions: number, cell, pair and changes of every mission.
-            draws: of a stratified campaign.
+            draws: the faults that missions of a stratified campaign were given.
             results: columns of the table `results` by name; a missing column is empty.
 
         Raises:

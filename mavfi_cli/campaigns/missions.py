@@ -222,12 +222,12 @@ class MissionResult:
     Attributes:
         result: its result.json, as `mavfi fly` writes it. A mission that crashed or hung before it
             could write one has the known fields only. Empty for an error.
-        injected: what happened to its fault; None for an error.
+        injected: the fate of its fault; None for an error.
         reason: the record's reason for the outcome, or why the mission could not begin.
         wall_s: wall time of the final attempt, s.
         attempts: number of attempts; above 1 after kills from outside the mission.
         path: absolute path of the kept run folder; None if it was not kept.
-        stratum, weight: of a stratified sample; None and 1 in a uniform one.
+        stratum, weight: stratum and weight in a stratified sample; None and 1 in a uniform one.
     """
 
     number: int

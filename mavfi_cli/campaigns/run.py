@@ -217,7 +217,7 @@ def fly_missing(
     """Fly every mission without a result, up to the stopping rule.
 
     Args:
-        rounds: of a stratified campaign.
+        rounds: the rounds of a stratified campaign.
 
     Raises:
         MavfiError: as `run_campaign`.

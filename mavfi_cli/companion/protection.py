@@ -7,8 +7,8 @@ recomputes the stage of a withheld message (paper, section V-E), or holds the ve
     RECOMPUTE   recompute perception         request another   drop the waypoint    recompute it
     HOLD        never                        hold              hold                 hold
 
-PASS and ACCEPT let the message take effect. A vehicle that holds drops the plan, hovers, and plans
-anew from there. docs/explanation/detection.md gives the rules for each alarm and the bounds on
+PASS and ACCEPT let the message take effect. A vehicle that holds drops the plan, hovers, and
+replans from there. docs/explanation/detection.md gives the rules for each alarm and the bounds on
 recomputation, with their reasons.
 """
 
@@ -307,7 +307,7 @@ class Recovery:
     """Acts on the pilot and its active plan after alarms.
 
     Attributes:
-        state: Newest vehicle state, from which a holding vehicle plans anew.
+        state: Newest vehicle state, from which a holding vehicle replans.
     """
 
     def __init__(

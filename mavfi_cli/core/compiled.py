@@ -71,7 +71,7 @@ def processor_level() -> str:
 def in_cache(kernel: Callable[..., Any]) -> bool:
     """Return True if a call of a compiled function would load its machine code from disk.
 
-    Also True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call takes long.
+    It is also True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call takes long.
     """
     cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     try:

@@ -256,7 +256,7 @@ def inject(
     kind = NUMPY_TYPES.get(corrupted.dtype.name)
     if kind is None:
         known = ", ".join(NUMPY_TYPES)
-        raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; types are {known}")
+        raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; the types are {known}")
     if corrupted.size == 0:
         raise FaultSpecError("cannot flip bits of an array without elements")
     rng = Stream.FAULT.generator(seed, "value")

@@ -358,7 +358,7 @@ class Codec:
 def renewed(message: Message, signing: Signing | None = None) -> Message | None:
     """Return a received message, whose fields were changed, with a frame that is valid again.
 
-    The header stays. Checksum and signature are made anew. Fields that the dialect lacks are lost.
+    The header stays. Checksum and signature are recomputed. Fields that the dialect lacks are lost.
 
     Returns:
         None if the frame is signed and there is no key.

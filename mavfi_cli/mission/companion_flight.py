@@ -55,7 +55,7 @@ class CompanionFlight:
 
     Args:
         link: Open link to the vehicle. Its opener closes it.
-        interrupts: Signals that ask for the end.
+        interrupts: Signals that request the end.
 
     Attributes:
         programs: At the end, how often each program has started and how its processes ended.

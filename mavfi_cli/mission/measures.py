@@ -96,7 +96,7 @@ class FlightRecord:
         state_fault, instruction_fault: The section `fault`, by its level.
         recorded_fault: The whole section as plain values.
         referee: None if the vehicle left no truth.
-        seeds: Of the mission (`root`) and of its fault.
+        seeds: Seeds of the mission (`root`) and of its fault.
         files: SHA-256 of the user's files.
     """
 

@@ -189,7 +189,7 @@ class SharedFlight(NoInjection):
     def further(self) -> SharedFlight | None:
         """Return the flight of the missions whose nodes end or hang.
 
-        None in a fork, or if there are none.
+        Return None in a fork, or if no such mission is left.
         """
         if self.config is not None or not self._struck:
             return None

@@ -200,7 +200,7 @@ class DetectorBalance:
 
     Attributes:
         level: `source` or `instruction`.
-        fate: what the faults do to their nodes.
+        fate: the effect of the faults on their nodes.
         harmed, lost: balances of harmed and of lost missions.
     """
 
@@ -378,7 +378,7 @@ class Delays:
 
 
 def delay_sentence(parts: Sequence[Delays]) -> str:
-    """Describe how many flights are late by over 1 s, without and with detectors; "" if none."""
+    """Describe how many flights end over 1 s late without and with detectors; "" if not flown."""
     sentences = []
     for part in parts:
         longer = {name: int((added > 1.0).sum()) for name, added in part.added_s.items()}

@@ -279,7 +279,7 @@ def _arm_of(flight: Row) -> str:
 
 
 def _trial_of(flight: Row) -> str:
-    """Fault, world, start, noise and computer as text: what the flights of all arms share."""
+    """Fault, world, start, noise and computer as text, which the flights of all arms share."""
     config = json.loads(flight["changes"])
     scene = {name: value for name, value in config.items() if name not in _APART}
     return canonical([scene, flight["fault"]])

@@ -47,7 +47,7 @@ def judged(
 
     Args:
         flights: flights by stack.
-        settled: by stack, what was flown to settle claims; none for the other stacks.
+        settled: the missions flown to settle claims, by stack; the other stacks have none.
     """
     settled = settled or {}
     judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}

@@ -112,7 +112,7 @@ class _ListedMission:
     """A mission that deserves a closer look.
 
     Attributes:
-        ratio: flight time over the golden one's; None if it is lost.
+        ratio: flight time divided by the golden one's; None if it is lost.
         command: repeats the flight.
         picture: its top view as a data URL; empty if it was not kept.
     """
@@ -337,7 +337,7 @@ def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
 
 
 def _spread(stack: str, flights: Flights) -> Picture | None:
-    """Flight time with a fault in a state over that of the golden flight, by world and detector."""
+    """Flight times with a fault in a state, relative to golden flights, by world and detector."""
     seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
     hit = flights.comparable.timed.chosen(**seen)
     groups = hit.by("world", "detector")

@@ -51,7 +51,7 @@ _SEEDS = ("seed", "world_seed", "time_limit_s")
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
     """The flights that differ from the item's missions on a stack only in _SEEDS.
 
-    Empty if all of these are golden and the item needs flights with a fault.
+    The result is empty if all are golden and the item needs flights with a fault.
     """
     kinds = {
         kind_of(changes_of(mission.config), _SEEDS)
@@ -414,7 +414,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 
 def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
-    """The longest flight over the mean golden one, as increase in per cent."""
+    """The increase from the mean golden flight to the longest flight, in per cent."""
     golden_s, times_s = (_of_successes(those, "flight_time_s") for those in (bare, flights))
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)

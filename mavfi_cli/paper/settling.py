@@ -1,6 +1,6 @@
 """Settles claims: flies missions for undecided claims until all are decided or the time is over.
 
-Every look judges all claims anew, by tests that hold at any look (`stats.sequences`). The next
+Every look judges all claims again, by tests that hold at any look (`stats.sequences`). The next
 missions are those of the claim that the fewest seconds would decide, if its effect stays as it is.
 """
 

@@ -41,7 +41,7 @@ class CampaignSource:
         versions: versions of the programs that flew it; empty if an export does not record them.
         host: host of the first record; empty if an export does not record it.
         digest: SHA-256 of an exported file; empty for a folder.
-        settling: what was flown to settle claims; None if nothing was.
+        settling: the missions flown to settle claims; None if there were none.
         again: command that flies the rest of its list; empty if it is not known.
     """
 

@@ -46,7 +46,7 @@ class Finding:
     Attributes:
         effect: number with its 95 % interval; None if there is none.
         counts: description of the missions behind the effect.
-        why: why there is no effect.
+        why: the reason why there is no effect.
     """
 
     effect: Interval | None = None
@@ -61,13 +61,13 @@ class Judgement:
     Attributes:
         effect: number with its 95 % interval, which is not corrected; None if there is none.
         counts: description of the missions behind the effect.
-        why: why nothing can decide the claim; empty for the other verdicts.
+        why: the reason why nothing can decide the claim; empty for the other verdicts.
         p: p-value of the test against the nearest end of the range, corrected for its family; 1
             without an effect.
         p_alone: p-value of the same test without a correction for its family or for looks.
         needed: observations that decide an undecided claim if the effect stays as it is; infinite
             if it lies on an end of the range.
-        bounds: of settled missions, the 95 % interval at all looks together; else None.
+        bounds: the 95 % interval of settled missions at all looks together; else None.
         without_size: whether the bounds exclude an effect of the claim's size on either side of 0:
             two one-sided tests (D. J. Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15,
             1987).
@@ -97,7 +97,7 @@ class Claim:
         size: the size of the effect that the paper states; None without one.
         rule: the range, and where it comes from, in words.
         isolated: whether it is about isolated kernels instead of flights.
-        fates: what the faults may do to their nodes; each fate is judged separately.
+        fates: possible effects of the faults on their nodes; each fate is judged separately.
     """
 
     name: str
@@ -215,13 +215,13 @@ def judge(
 
     Where missions were added until claims were decided, half of the level is spent on the first
     look, whose number of missions was planned, and half on all looks together. So a p-value is
-    twice the smaller of that of the first look and that of `anytime_p`.
+    twice the smaller of the p-value at the first look and `anytime_p`.
 
     Args:
         findings: finding of each claim.
         ranges: low and high end of each claim's range, which belong to it.
-        first: where missions were added, the first look at each claim, None if it had no effect;
-            None if none were added.
+        first: the first look at each claim, which is None if it had no effect; None for all if no
+            missions were added.
     """
     z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
     tested = [place for place, value in enumerate(z) if not math.isnan(value)]
@@ -269,7 +269,7 @@ def judge(
 def _z(effect: Interval | None, low: float, high: float) -> float:
     """Standard errors between the effect and the nearest end; NaN without an interval.
 
-    The standard error is that of the interval's side that faces the end.
+    The standard error comes from the side of the interval that faces the end.
     """
     if effect is None or math.isnan(effect.low) or math.isnan(effect.high):
         return math.nan

@@ -236,7 +236,7 @@ def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, st
 
 
 def _costs(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
-    """Draw the extra flight time over the golden run with faults: worst and 95th percentile."""
+    """Draw how much faults lengthen the golden flight time: worst and 95th percentile."""
     settings = [name for name in comparison.plan.settings if name != _GOLDEN]
     places, width = _places(comparison, settings)
     rows = [row for row in comparison.costs if row.pairs]

@@ -44,8 +44,8 @@ class FaultConfig:
     Attributes:
         target: Injection site: a stage, a state or a group of states; `detector` or `detector.PART`
             for the detector's memory, such as `detector.threshold`; `process.NODE` to kill the
-            node's process; `queue.STATE` for a waypoint's state in control's copy of the plan. Of a
-            user's companion: `process.PROGRAM`, `MESSAGE.FIELD` of MAVLink, `MESSAGE.FIELD[INDEX]`
+            node's process; `queue.STATE` for a waypoint's state in control's copy of the plan. In
+            a user's companion: `process.PROGRAM`, MAVLink's `MESSAGE.FIELD`, `MESSAGE.FIELD[INDEX]`
             of an array, or `MESSAGE`; `output.` or `input.` before it selects a direction.
         seed: Root seed of the fault's random streams.
         at: Trigger: "random", "time=SECONDS", "tick=N", "phase=NAME", "foreseen" or "invocation=N".

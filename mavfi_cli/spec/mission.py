@@ -257,7 +257,7 @@ class MissionConfig:
     def shared_flight(self) -> MissionConfig | None:
         """The flight from which the mission can be forked: the mission without its fault.
 
-        None for a mission whose flight other processes or the wall clock affect.
+        It is None for a mission whose flight other processes or the wall clock affect.
         """
         alone = (
             self.isolate

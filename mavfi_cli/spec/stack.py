@@ -49,7 +49,7 @@ class Stack:
             command, the trajectory's clock slows down by the ratio of clipped to demanded speed.
         skips_endless_slices: A waypoint ends at once if its slice of 10 ms is stretched to 2^63 s
             or more.
-        guards_tracking: The vehicle stops and plans anew if it is farther than `tracking_guard_m`
+        guards_tracking: The vehicle stops and replans if it is farther than `tracking_guard_m`
             from the reference.
         refuses_far_waypoints: The collision check reports a waypoint as a collision if it is not
             finite, or farther than `farthest_waypoint_m` from the first one.

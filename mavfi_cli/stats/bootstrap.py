@@ -46,9 +46,9 @@ def interval(
 ) -> Interval:
     """A statistic with its bootstrap interval, or the normal one for the mean of LARGE samples.
 
-    The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is that of the
-    percentiles if BCa is not defined, as for the median of tied values, and if there are more
-    values than resamples, because BCa leaves out each value in turn.
+    The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is the
+    percentile interval if BCa is not defined, as for the median of tied values, or if there are
+    more values than resamples, because BCa leaves out each value in turn.
 
     Args:
         values: (n,) one value per mission; the differences for a paired difference.

@@ -53,7 +53,7 @@ class McNemar:
     ) -> McNemar:
         """McNemar's exact test (Psychometrika 12, 1947), in which differing pairs are fair coins.
 
-        With weights, the p-value is that of `sign_flips` of the weighted differences.
+        With weights, `sign_flips` of the weighted differences gives the p-value.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
@@ -209,7 +209,7 @@ def paired_difference(
 
     Args:
         first, second: whether each mission is a hit under each treatment, (n,).
-            clusters: key shared by the missions that depend on each other, (n,).
+        clusters: key shared by the missions that depend on each other, (n,).
     """
     change = np.asarray(second, dtype=np.int64) - np.asarray(first, dtype=np.int64)
     pairs = len(change)
@@ -235,14 +235,14 @@ def net_share(
     """Share of the hits that a treatment undoes, minus those that it causes, on the same missions.
 
     (hits before - hits after) / hits before. It is below 0 if the treatment causes more than it
-    undoes. The interval is that of percentiles of draws: of the share of missions that are hits
-    before, and of the shares of hits and of others that change, each from its posterior
+    undoes. The interval has the percentiles of draws: the share of missions that are hits before,
+    and the shares of hits and of others that change, are each drawn from their posterior
     distribution under Jeffreys' prior. The numbers of missions are divided by the design effect of
     the clusters.
 
     Args:
         before, after: whether each mission is a hit without and with the treatment, (n,).
-            clusters: key shared by the missions that depend on each other, (n,).
+        clusters: key shared by the missions that depend on each other, (n,).
     """
     hits, pairs = int(before.sum()), len(before)
     if not hits:
@@ -264,7 +264,7 @@ def net_share(
 
 
 def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> float:
-    """Variance of a mean over that of as many independent values; at least 1."""
+    """Ratio of the variance of a mean to that of as many independent values; at least 1."""
     residuals = values - values.mean()
     squares = float((residuals**2).sum())
     sums: dict[Hashable, float] = {}
@@ -283,7 +283,7 @@ def recovered_share(
 
     It is a ratio of two differences. The three rates are drawn from their posterior distributions
     under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as
-    well. The interval is that of the percentiles of the ratio. Draws in which the faults cost
+    well. The interval has the percentiles of the ratio. Draws in which the faults cost
     nothing count as well.
 
     Args:

@@ -223,7 +223,7 @@ class CrossLayer:
         corruption: share of faults in the isolated kernel that silently corrupt its output.
         failure: share of faults that fail the mission.
         failure_given_corruption: `failure` / `corruption`, with the ends of the failure's interval
-            divided by the corruption's estimate. None if the estimate would be above 1 (crashes and
+            divided by the corruption's point estimate. None if the estimate is above 1 (crashes and
             hangs fail missions too) or no output was corrupted.
     """
 
@@ -268,7 +268,7 @@ def clustered_share(
     """The share of hits with its 95 % interval.
 
     Args:
-        clusters: stratum and cluster of each run; None for a run that stands for itself.
+        clusters: stratum and cluster of each run; None for a run that is its own cluster.
     """
     alone, spread = _spread(hits, clusters, sampled)
     freedom = [len(hits), *(number - 1 for number, _ in spread)]
@@ -281,7 +281,7 @@ def clustered_share(
 def design_effect(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled | None = None
 ) -> float:
-    """Variance of a share over that of as many independent runs; at least 1."""
+    """Ratio of the variance of a share to that of as many independent runs; at least 1."""
     share = sum(hits) / len(hits) if hits else 0.0
     if not 0.0 < share < 1.0:
         return 1.0
@@ -321,8 +321,8 @@ def _spread(
 def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
     """The estimated total over strata, from members drawn uniformly from each stratum.
 
-    The interval has the correction for a finite population (Cochran, section 5.4). It is that of
-    the logarithm, because lengths of windows are skewed, and is not lower than the drawn total. One
+    The interval has the correction for a finite population (Cochran, section 5.4). It is that
+    of the logarithm, because window lengths are skewed, and is not below the observed total. One
     member out of several does not reveal its error, so there is no upper end.
 
     Args:

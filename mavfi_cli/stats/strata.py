@@ -120,7 +120,7 @@ def weighted_share(
 
     The interval adds the distances to the ends of the strata's Wilson intervals in quadrature
     (MOVER; G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so that a stratum without
-    hits still has a width. The number of missions of a stratum is that of `kish`. The stratum's
+    hits still has a width. A stratum counts with its effective number, `kish`. The stratum's
     share of the counted missions is estimated too. This adds the square of (share of hits in the
     stratum - share of hits) times the variance of that share.
 

@@ -1,6 +1,6 @@
-"""How far repeated fault-free flights of a user's companion differ: outcome, time and path.
+"""The spread of repeated fault-free flights of a user's companion: outcome, time and path.
 
-Such a flight does not repeat, so this spread stands beside every effect of a fault.
+Such a flight does not repeat, so every effect of a fault must be compared with this spread.
 """
 
 from __future__ import annotations

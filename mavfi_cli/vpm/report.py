@@ -449,7 +449,7 @@ def _elasticity(below: float | None, above: float | None) -> float | None:
 
 
 def _time_ratio(inputs: ModelInputs, schemes: Mapping[str, Scheme], scheme: str) -> float | None:
-    """Flight time of a scheme over that of REFERENCE; None if either cannot fly."""
+    """Flight time of a scheme divided by that of REFERENCE; None if either cannot fly."""
     fast, slow = (inputs.velocity_mps(schemes[name]) for name in (REFERENCE, scheme))
     return None if fast is None or slow is None else fast / slow
 
@@ -478,7 +478,7 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     parameter, wanted = calibration.parameter, calibration.tmr_time_ratio
 
     def time_ratio(value: float, scheme: str = "tmr") -> float:
-        """Flight time of a scheme over REFERENCE's; infinite if one of them cannot fly."""
+        """Flight time of a scheme divided by REFERENCE's; infinite if one of them cannot fly."""
         inputs = _with_board(_with_number(vehicle, parameter, value), board, 1.0)
         ratio = _time_ratio(inputs, SCHEMES, scheme)
         return math.inf if ratio is None else ratio

@@ -168,7 +168,7 @@ class PoseTracker:
 class Witness:
     """Derives collision, clearance and energy of a foreign vehicle from its pose.
 
-    The record begins when the vehicle arms. The energy is that of the regression; the power of the
+    The record begins when the vehicle arms. The energy comes from the regression; the power of the
     propellers is not known. The profile's body box and regression stand for the vehicle's.
     """
 

@@ -328,7 +328,7 @@ class Kernel:
         tolerance: description of the differences that `compare` treats as unnoticeable.
         repeatable: true if the call leaves no state behind, so that calling it warms it up.
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
-        inner: compiled functions at which windows begin, beside those of its scope.
+        inner: compiled functions at which windows begin, in addition to those of its scope.
         code: returns entry and scope of a plug-in kernel; called after the kernel has run.
         memory_mb: memory that a run may allocate beyond that of the loaded kernel, MB.
     """

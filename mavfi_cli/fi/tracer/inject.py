@@ -104,7 +104,7 @@ def _erase_trap(tracee: Tracee, instruction: Instruction) -> None:
 def _apply(
     tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> Injection:
-    """Invert the bits at the stop in front of `instruction`.
+    """Invert the bits at the stop before `instruction`.
 
     A destination is corrupted after the instruction has executed. The result is read back. A
     change that the operating system discards or refuses counts as not applied.
@@ -202,7 +202,7 @@ def _follow(
 def strike(
     tracee: Tracee, fault: InstructionFault, *, window: int
 ) -> tuple[Injection | None, Followed]:
-    """Corrupt the target at the stop in front of the attacked instruction; follow the bits.
+    """Corrupt the target at the stop before the attacked instruction; follow the bits.
 
     Args:
         tracee: the process, stopped there.

@@ -131,8 +131,8 @@ def record_window(
         tracee: the process, stopped at the start of the window.
         scope: the code whose instructions are recorded.
         until_return: the target is at a function's entry; the window ends when it returns.
-        markers: addresses in scope; the window ends in front of the next execution of one. It
-            always contains the instruction that the target is stopped in front of.
+        markers: addresses in scope; the window ends before the next execution of one. It
+            always contains the instruction at which the target is stopped.
         watch: called regularly with the number of instructions recorded since the last call.
 
     Raises:

@@ -243,7 +243,7 @@ class Tracee:
     def run_to(self, address: int, count: int = 1, detour: Detour | None = None) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
 
-        If the thread is stopped in front of an execution, this execution counts as the first.
+        If the thread is stopped just before an execution, this execution counts as the first.
 
         Args:
             detour: the location of a detour that can count them.
@@ -298,8 +298,8 @@ class Tracee:
     def fork(self) -> Tracee:
         """Fork the stopped process, which must have been attached to `alone`.
 
-        The fork has the same registers and memory, and waits in the same system call. Its parent
-        is that of the process.
+        The fork has the same registers and memory, and waits in the same system call. It has
+        the same parent as the process.
 
         Raises:
             OSError: there is no memory or no process left.

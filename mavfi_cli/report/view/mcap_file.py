@@ -95,7 +95,7 @@ def _write(
 
 
 def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]]:
-    """Metadata records of an MCAP file, by name: what was flown, and on which versions."""
+    """Metadata records of an MCAP file, by name: the missions, and the versions of the software."""
     records: dict[str, Mapping[str, object]] = {}
     for flight in flights:
         record = flight.run.record
