@@ -362,9 +362,8 @@ def against_golden(
     """Compare flights with their golden flights, which may be empty; all columns are (n,).
 
     Returns:
-        Flight time divided by that of the golden flight, empty if one of the two is lost; and
-        whether the flight is harmed: lost, or longer than LONGER; empty unless the golden flight
-        succeeds.
+        Flight time / golden flight time, empty if one of the two is lost; and whether the flight
+        is harmed: lost, or longer than LONGER; empty unless the golden flight succeeds.
     """
     succeeds = pc.equal(own_lost, _NO)
     ratio = pc.divide(time_s, own_time_s)

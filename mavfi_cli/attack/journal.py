@@ -79,8 +79,8 @@ class Journal:
         most = max(counts.values(), default=0)
         if most > runs:
             raise ConfigError(
-                f"already holds {most} runs; choose another folder, or more runs: runs must be at "
-                f"least {most}, got {runs}",
+                f"already holds {most} runs, so runs must be at least {most}, got {runs}; choose "
+                "more runs or another folder",
                 path=self._folder,
             )
 

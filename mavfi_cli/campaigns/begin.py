@@ -278,9 +278,7 @@ def begin(
     """
     begun = (folder / LEDGER).is_file()
     if append and spec.sampling is Sampling.STRATIFIED:
-        raise ConfigError(
-            "missions cannot be added to the rounds of a stratified campaign", key="append"
-        )
+        raise ConfigError("the rounds of a stratified campaign cannot grow", key="append")
     if missing_only and not begun:
         raise ConfigError("no campaign was begun there", path=folder)
     if begun:

@@ -73,7 +73,7 @@ def _fault(values: Factors, seed: int) -> Factors:
         if name not in _FAULT[level]:
             match = nearest(name, (*_ALIASES, *_FAULT[level]))
             hint = f"; did you mean {match!r}?" if match else ""
-            raise ConfigError(f"no factor of faults at {level} level{hint}", key=name)
+            raise ConfigError(f"is not a factor of faults at {level} level{hint}", key=name)
     if targets:
         return {_LEVELS[level][0]: {**fault, "seed": seed}}
     if given or "level" in values:

@@ -131,7 +131,7 @@ class RunningProgram:
         return True
 
     def terminate(self) -> None:
-        """Ask the program to end, and continue it first in case it is stopped."""
+        """Continue the program if it is stopped, and ask it to end."""
         for number in (signal.SIGCONT, signal.SIGTERM):
             self.signal(number, group=True)
 

@@ -243,7 +243,7 @@ def number(value: float, shape: str = "", scale: float = 1.0, unit: str = "") ->
 
 
 def percent(share: float, shape: str = ".1f") -> str:
-    """Format a share of one as per cent."""
+    """Format a share in per cent."""
     return number(share, shape, 100.0, " %")
 
 
@@ -272,7 +272,7 @@ def with_ends(
 
 
 def rate(share: Share, digits: int = 1, ends: int = 0) -> str:
-    """Format a share as per cent with its interval.
+    """Format a share in per cent with its interval.
 
     Args:
         ends: digits of the ends of the interval.

@@ -183,9 +183,7 @@ class CompanionConfig:
             raise ConfigError("must have at least one program", key="program")
         for name in self.program:
             if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
-                raise ConfigError(
-                    f"must have only letters, digits, - and _, got {name!r}", key=name
-                )
+                raise ConfigError(f"must be letters, digits, - or _, got {name!r}", key=name)
         _require_range("time_limit_s", self.time_limit_s, 1.0, 86_400.0)
         _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
         if self.success.exit is not None and self.success.exit not in self.program:

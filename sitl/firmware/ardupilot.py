@@ -36,7 +36,7 @@ _FULL_SHARE = 0.5  # share of the rotors' torque that its mixer gives at full co
 
 
 class ArduPilotLink:
-    """One ArduPilot on the JSON backend, which sends to a UDP port; 0 for any.
+    """One ArduPilot, which sends to our UDP port by its JSON backend; port 0 selects any free one.
 
     Raises LinkError if the port cannot be opened.
     """

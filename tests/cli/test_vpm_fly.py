@@ -128,10 +128,7 @@ def test_what_cannot_be_lifted_is_a_row(command_line, tmp_path, lawn):
         (("--world", "sparse", "--world", "sparse"), "--world: must not name sparse twice"),
         (("--vehicle", "spark", "--vehicle", "spark"), "--vehicle: must not name spark twice"),
         (("--vehicle", "sparck"), "unknown vehicle 'sparck'; did you mean 'spark'?"),
-        (
-            ("--train", "1", "--first-seed", "10003"),
-            "seeds 10000 to 10003 are reserved for training",
-        ),
+        (("--train", "1", "--first-seed", "10003"), "10000 to 10003 are reserved for training"),
         (("--platform", "measured:2"), "--platform: measured:2 has latencies only while it flies"),
     ],
 )

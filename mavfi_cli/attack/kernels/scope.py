@@ -172,7 +172,7 @@ def kernel_of_node(node: str, planner: str) -> str:
         return node
     name = canonical_planner(planner)
     if name not in OUR_PLANNERS:
-        raise UnknownName("planner with a known scope", planner, OUR_PLANNERS)
+        raise UnknownName("planner for instruction-level faults", planner, OUR_PLANNERS)
     return name
 
 

@@ -110,8 +110,8 @@ class WindowTooLong(TargetError):
     def __init__(self, program: str, limit: int) -> None:
         super().__init__(
             program,
-            f"executes more than {limit} instructions in scope, too many to step; a program is "
-            "counted whole where valgrind is installed, or name a function with shorter calls",
+            f"executes more than {limit} instructions in scope, too many to step: name a function "
+            "with shorter calls; a whole program is counted if valgrind is installed",
         )
 
 

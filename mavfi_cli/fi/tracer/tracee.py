@@ -223,7 +223,7 @@ class Tracee:
         self._interrupting = False
 
     def step(self) -> Ended | None:
-        """Execute one instruction, or one iteration of a repeated one. Return as `resume`."""
+        """Execute one instruction, or one iteration of a repeated one. Returns as `resume` does."""
         return self._go(linux.SINGLESTEP)
 
     def resume(self) -> Ended | None:
@@ -484,7 +484,7 @@ class Tracee:
     # -- counted stops
 
     def _run_to_detoured(self, address: int, count: int, detour: Detour) -> bool | None:
-        """Count by a detour; return as `run_to`, or None if no detour can be made here."""
+        """Count by a detour. Returns as `run_to` does, or None if no detour can be made here."""
         if address < self.registers.ip < address + detour.size:
             return None
         pages = self._map_near(address)
