@@ -217,6 +217,10 @@ def fly(
         echo_lines(text.split("\n") if as_json else spread.lines())
         return
     recorder = Recorder() if record else None
+    if record and mission.companion is not None:
+        raise click.UsageError(
+            "--record cannot be combined with --companion: it records mavfi's own nodes"
+        )
     if record:
         viewers.require_viewer(Path(f"flight.{record}"))
     with progress_view(mission, quiet=quiet) as view:

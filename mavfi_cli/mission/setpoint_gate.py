@@ -33,12 +33,13 @@ _BRAKE = 0b1101_1100_0111  # type_mask of a setpoint with a velocity only
 
 @dataclass(slots=True)
 class _Counts:
-    """Numbers of withheld setpoints, by what was sent in their place."""
+    """Numbers of setpoints with an alarm, by what was sent in their place."""
 
     hold: int = 0  # the last accepted setpoint
     brake: int = 0  # a standstill
     autopilot: int = 0  # nothing: the autopilot was told to hold, or to notice the silence
     stale: int = 0  # nothing: the companion is gone
+    none: int = 0  # the setpoint itself: the gate only watches
     alarms: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -118,9 +119,13 @@ class SetpointGate:
 
     def _judge(self, message: Message, now_s: float) -> list[Message]:
         if why := self._staleness(message, now_s):
+            if self._settings.watch_only:
+                self._counts.none += 1
+                self._say(f"{why}: its setpoints pass", now_s)
+                return [message]
             self._counts.stale += 1
             self._say(f"{why}: its setpoints are withheld", now_s)
-            return [message] if self._settings.watch_only else []
+            return []
         self._checks += 1
         sample = self._view.sample(message)
         alarm = self._gate.judge_tick(*sample)
@@ -132,6 +137,7 @@ class SetpointGate:
         self._in_a_row += 1
         if self._settings.watch_only:
             self._gate.accept_tick()
+            self._counts.none += 1
             self._record(alarm, now_s, "none")
             return [message]
         action = self._settings.action
@@ -230,16 +236,17 @@ class SetpointGate:
             self.outbox.append(self._codec.encode(message))
 
     def summary(self) -> dict[str, Any]:
-        """Return checks, alarms and withheld setpoints as plain values."""
+        """Return checks, alarms and responses as plain values."""
         counts = self._counts
-        withheld = {name: getattr(counts, name) for name in ("hold", "brake", "autopilot", "stale")}
+        names = ("hold", "brake", "autopilot", "stale", "none")
+        responses = {name: getattr(counts, name) for name in names}
         return {
             "detector": self._config.name,
             "protect": list(self._config.protect),
             "threshold": self._gate.detector.threshold,
             "checks": {"setpoint": self._checks},
-            "alarm_count": sum(withheld.values()),
-            "responses": withheld,
+            "alarm_count": sum(responses.values()),
+            "responses": responses,
             "alarms": counts.alarms,
             "recoveries": {},
         }

@@ -151,7 +151,10 @@ class FaultConfig:
             raise FaultSpecError(
                 f"{self.target}: a fault that kills a process takes only a seed and a trigger"
             )
-        if self.trigger().when is When.INVOCATION:
+        self._check_trigger_of_process()
+
+    def _check_trigger_of_process(self) -> None:
+        if self.trigger().when in (When.INVOCATION, When.FORESEEN):
             raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
 
     def check_program(self, programs: Collection[str]) -> None:
@@ -166,8 +169,7 @@ class FaultConfig:
             raise UnknownName("program", name or "", programs)
         corruption = self.corruption()
         require_effect(self.target, corruption.effect, OF_PROCESSES)
-        if self.trigger().when in (When.INVOCATION, When.FORESEEN):
-            raise FaultSpecError(f"{self.target}: at must be a time, tick or phase, got {self.at}")
+        self._check_trigger_of_process()
         if corruption.persistence is not Persistence.TRANSIENT:
             raise FaultSpecError(
                 f"{self.target}: persistence must be transient, got {self.persistence}"

@@ -32,6 +32,12 @@ OF_THE_WORLD = (
 )  # fmt: skip
 """Settings of the world and of the simulation in it."""
 
+OF_THE_COMPANION = (
+    "planner", "platform", "stack", "a_max_mps2", "map_resolution_m", "map_range_m",
+    "node_restart_s", "node_watchdog_s",
+)  # fmt: skip
+"""Settings of mavfi's own companion."""
+
 NOT_OF_GOLDEN: Mapping[str, Any] = {
     "fault": None, "instruction": None, "detector": None, "isolate": (),
 }  # fmt: skip
@@ -202,6 +208,10 @@ class MissionConfig:
         for name in ("link", "realtime", "instruction", "isolate", "land"):
             if getattr(self, name):
                 raise ConfigError("cannot be combined with --companion", key=name)
+        plain = MissionConfig()
+        for name in OF_THE_COMPANION:
+            if getattr(self, name) != getattr(plain, name):
+                raise ConfigError("has no effect on the flight of a user's companion", key=name)
 
     def _check_platform(self) -> None:
         if PlatformProfile.factor_of(self.platform) is None:

@@ -88,6 +88,10 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
         (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
         (("--start", "1,inf,2"), "--start: must be three finite numbers"),
         (("--stack", "mavbench:foo=3"), "foo: unknown key; known: "),
+        (("--inject", "process.planner", "--at", "foreseen"), "process.planner: at must be a time"),
+        (("--companion", "true", "--planner", "rrt"), "--planner: has no effect on the flight of"),
+        (("--companion", "true", "--restart", "2"), "--restart: has no effect on the flight of"),
+        (("--companion", "true", "--record", "mcap"), "--record cannot be combined with --comp"),
         (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: must be true or false"),
     ],
 )

@@ -113,7 +113,9 @@ def test_a_wild_setpoint_is_held_back_then_braked_and_a_good_one_passes(gate):
     passed = velocities(own, [-1000.0, -1000.0, -1000.0, -1000.0, 2.0])
     assert passed == [[2.0], [2.0], [0.0], [0.0], [2.0]]
     summary = own.summary()
-    assert summary["responses"] == {"hold": 2, "brake": 2, "autopilot": 0, "stale": 0}
+    assert summary["responses"] == {
+        "hold": 2, "brake": 2, "autopilot": 0, "stale": 0, "none": 0,
+    }  # fmt: skip
     assert summary["alarms"][0]["states"] == ["setpoint_vy"]
     texts = [m.text for frame in own.outbox for m in Codec(0, 0).decode(frame)]
     assert texts[0].startswith("mavfi gate: setpoint withheld")
@@ -159,8 +161,13 @@ def test_the_autopilot_is_told_to_hold_once_a_second(gate):
 def test_watching_only_reports(gate):
     own = gate(watch_only=True)
     assert velocities(own, [-1000.0, 2.0]) == [[-1000.0], [2.0]]
-    assert len(own.summary()["alarms"]) == 2
+    summary = own.summary()
+    assert (len(summary["alarms"]), summary["alarm_count"]) == (2, 2)
+    assert {name for name, count in summary["responses"].items() if count} == {"none"}
     assert "reported" in own.said[0]
+    gone = gate(watch_only=True, gone=lambda: "the program script is gone")
+    assert velocities(gone, [2.0] * 12) == [[2.0]] * 12
+    assert gone.summary()["responses"]["stale"] == 0
 
 
 def test_setpoints_of_a_companion_that_is_gone_end_once_they_no_longer_change(gate):
