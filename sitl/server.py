@@ -27,6 +27,7 @@ from sitl.autopilot.autopilot import COMPONENT, Autopilot
 from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.camera.component import Camera
+from sitl.camera.ranges import SENSORS
 from sitl.command_line import stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.options import ServerOptions, VehicleSetup, parse
@@ -37,19 +38,22 @@ from sitl.vehicle.profile import VehicleProfile, load_profile
 from sitl.world import World, load_world
 
 _COMMANDS = (dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT)
-_FRAMES = (
-    dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED,
-    dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
-    dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
+_FRAMES = frozenset(
+    {
+        dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED,
+        dialect.MAVLINK_MSG_ID_DATA_TRANSMISSION_HANDSHAKE,
+        dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
+    }
 )
+_ON_REQUEST = _FRAMES.union(SENSORS)
 _MOST_TEXTS = 10  # newest texts of a client that wait for the others
 
 
 class Client(Peer):
     """Turns bytes of one connection into calls of the simulation, and messages into bytes.
 
-    Depth frames go to the clients that started the capture. All clients get the camera's
-    heartbeat.
+    Depth frames go to the clients that started the capture, and ranges to those that requested
+    them. All clients get the camera's heartbeat.
 
     Attributes:
         texts: Frames of received STATUSTEXTs for the other clients, unchanged, as an autopilot
@@ -73,7 +77,7 @@ class Client(Peer):
             for component in (COMPONENT, CAMERA)
         )
         self._camera_answers: list[Any] = []
-        self._wants_frames = False
+        self._unwanted = _ON_REQUEST  # ids of the camera's messages
         self.texts: deque[bytes] = deque(maxlen=_MOST_TEXTS)
 
     def rejoin(self) -> None:
@@ -112,9 +116,11 @@ class Client(Peer):
         Return False if none is due.
         """
         with self._simulation.wall.sample("link"):
-            due = self._simulation.camera_due
-            if not self._wants_frames:
-                due = [message for message in due if message.get_msgId() not in _FRAMES]
+            due = [
+                message
+                for message in self._simulation.camera_due
+                if message.get_msgId() not in self._unwanted
+            ]
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> bool:
@@ -140,10 +146,16 @@ class Client(Peer):
     def _offer_camera(self, message: Any) -> None:
         answers = self._simulation.camera.handle(message)
         self._camera_answers += answers
-        if answers and answers[-1].result == dialect.MAV_RESULT_ACCEPTED:
-            starts = message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE
-            if starts or message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
-                self._wants_frames = starts
+        if not answers or answers[-1].result != dialect.MAV_RESULT_ACCEPTED:
+            return
+        if message.command == dialect.MAV_CMD_IMAGE_START_CAPTURE:
+            self._unwanted -= _FRAMES
+        elif message.command == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
+            self._unwanted |= _FRAMES
+        elif message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+            number = {round(message.param1)}
+            ends = message.param2 < 0.0
+            self._unwanted = self._unwanted | number if ends else self._unwanted - number
 
 
 _PATIENCE_S = 0.5

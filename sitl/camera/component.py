@@ -24,12 +24,14 @@ from mavfi_cli.core.frames import (
 from mavfi_cli.link.codec import Message, dialect
 from sitl.autopilot.telemetry import int32
 from sitl.camera.depth import render_depth
+from sitl.camera.ranges import SENSORS
 from sitl.geodesy import Origin
 
 _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
 
 COMPONENT_ID: int = dialect.MAV_COMP_ID_CAMERA
 MAX_RATE_HZ = 50.0  # one frame per control tick
+_SENSOR_INTERVAL_S = 0.1
 _MAX_SIDE_PX = 2048
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -119,6 +121,7 @@ class Camera:
         self._heartbeat = _Schedule(1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
         self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
+        self._sensors: dict[int, _Schedule] = {}  # that a client has requested, by message id
 
     def handle(self, message: Message) -> list[Message]:
         """Return the answer to a message, or nothing if it is not for a camera."""
@@ -135,7 +138,7 @@ class Camera:
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """Return the messages due at a stamp: a heartbeat, and a frame from the pose.
+        """Return the messages due at a stamp: a heartbeat, and a frame and ranges from the pose.
 
         Args:
             stamp_s: Boot clock of the vehicle, s. A step back by 1 s counts as a reboot.
@@ -143,13 +146,20 @@ class Camera:
             quaternion_flu_enu: Attitude of the vehicle (4,).
         """
         if stamp_s < self._stamp_s - 1.0:
-            for schedule in filter(None, (self._heartbeat, self._frames)):
+            schedules = (self._heartbeat, self._frames, *self._sensors.values())
+            for schedule in filter(None, schedules):
                 schedule.restart()
         self._stamp_s = stamp_s
         due = self.idle() if self._heartbeat and self._heartbeat.due(stamp_s) else []
-        if self._frames is not None and self._frames.due(stamp_s):
+        frame_is_due = self._frames is not None and self._frames.due(stamp_s)
+        sensors = [number for number, each in self._sensors.items() if each.due(stamp_s)]
+        if frame_is_due or sensors:
             offset_m = rotate(rotation_matrix(quaternion_flu_enu), self.mount_offset_flu_m)
-            due += self._take_frame(position_enu_m + offset_m, quaternion_flu_enu)
+            lens_enu_m = position_enu_m + offset_m
+            if frame_is_due:
+                due += self._take_frame(lens_enu_m, quaternion_flu_enu)
+            for number in sensors:
+                due += SENSORS[number](self._boxes, stamp_s, lens_enu_m, quaternion_flu_enu)
         return due
 
     def idle(self) -> list[Message]:
@@ -247,11 +257,24 @@ class Camera:
             accepted = self._start_capture(message)
         elif number == dialect.MAV_CMD_IMAGE_STOP_CAPTURE:
             self._frames, self._frames_left = None, 0
+        elif number == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+            accepted = self._set_interval(message)
         elif number == dialect.MAV_CMD_SET_CAMERA_MODE:
             accepted = _whole(message.param2) == dialect.CAMERA_MODE_IMAGE
         else:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         return int(dialect.MAV_RESULT_ACCEPTED if accepted else dialect.MAV_RESULT_DENIED)
+
+    def _set_interval(self, message: Message) -> bool:
+        """Send a range sensor's messages every param2 microseconds; 0: 10 Hz, -1: never."""
+        number, interval_us = _whole(message.param1), float(message.param2)
+        if number not in SENSORS or not (interval_us >= 0.0 or interval_us == -1.0):
+            return False
+        self._sensors.pop(number, None)
+        if 0.0 <= interval_us < math.inf:
+            interval_s = round(interval_us * 1e-6, 6) or _SENSOR_INTERVAL_S
+            self._sensors[number] = _Schedule(max(interval_s, 1.0 / MAX_RATE_HZ))
+        return True
 
     def _start_capture(self, message: Message) -> bool:
         """Start by param2, the interval in s (0: default), and param3, the number of frames."""

@@ -1,0 +1,93 @@
+"""Range finders beside the depth camera: a ring of 72 sectors, and one beam forward and one down.
+
+They are at the optical centre on a levelled mount, which turns with the vehicle's yaw only. Ranges
+come from the depth renderer, so they have its resolution of 0.1 m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from mavfi_cli.core.frames import Vector, quaternion_from_euler, yaw_from_quaternion
+from mavfi_cli.link.codec import Message, dialect
+from sitl.camera.depth import LEVELS_PER_M, NOTHING, render_depth
+
+_LEAST_CM, _MOST_CM = 10, 2500
+_CM_PER_LEVEL = round(100 / LEVELS_PER_M)
+_QUADRANTS = 4
+_SECTORS = 72  # of OBSTACLE_DISTANCE
+_COLUMNS = 180  # of the image of a quadrant: at most 0.64 degrees apart
+_SIDEWAYS = [(2 * column + 1 - _COLUMNS) / _COLUMNS for column in range(_COLUMNS)]  # to the right
+_STRETCH = [math.hypot(1.0, side) for side in _SIDEWAYS]  # range per planar depth
+_SECTOR_OF = [
+    [
+        round((90.0 * quadrant + math.degrees(math.atan(side))) * _SECTORS / 360.0) % _SECTORS
+        for side in _SIDEWAYS
+    ]
+    for quadrant in range(_QUADRANTS)
+]
+_FORWARD, _DOWN = dialect.MAV_SENSOR_ROTATION_NONE, dialect.MAV_SENSOR_ROTATION_PITCH_270
+_UNKNOWN_COVARIANCE = 255
+_RIGHT_ANGLE = math.pi / 2.0
+
+
+def _sector_ranges_cm(boxes_enu_m: Vector, position_enu_m: Vector, yaw_rad: float) -> list[int]:
+    """Return the ranges in the horizontal plane, cm, of 72 sectors of 5 degrees.
+
+    The first sector is centred on the vehicle's nose, and the others follow clockwise. 2501 means
+    that there is nothing within 25 m.
+
+    Args:
+        boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax.
+        position_enu_m: Position of the ring (3,).
+        yaw_rad: ENU yaw, counter-clockwise from east.
+    """
+    ranges_cm = [_MOST_CM + 1] * _SECTORS
+    for quadrant, sectors in enumerate(_SECTOR_OF):
+        attitude = quaternion_from_euler(0.0, 0.0, yaw_rad - quadrant * _RIGHT_ANGLE)
+        image = render_depth(boxes_enu_m, position_enu_m, attitude, _COLUMNS, 1, _RIGHT_ANGLE)
+        for sector, level, stretch in zip(sectors, image[0].tolist(), _STRETCH, strict=True):
+            if level != NOTHING:
+                ranges_cm[sector] = min(ranges_cm[sector], int(level * _CM_PER_LEVEL * stretch))
+    return ranges_cm
+
+
+def _ring(
+    boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
+) -> list[Message]:
+    """Return OBSTACLE_DISTANCE from a pose (ENU m; FLU to ENU) at a stamp of the boot clock."""
+    yaw_rad = yaw_from_quaternion(quaternion)
+    return [
+        dialect.MAVLink_obstacle_distance_message(
+            round(stamp_s * 1e6), dialect.MAV_DISTANCE_SENSOR_LASER,
+            _sector_ranges_cm(boxes_enu_m, position, yaw_rad), 360 // _SECTORS,
+            _LEAST_CM, _MOST_CM, 0.0, 0.0, dialect.MAV_FRAME_BODY_FRD,
+        )
+    ]  # fmt: skip
+
+
+def _beams(
+    boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
+) -> list[Message]:
+    """Return two DISTANCE_SENSOR, forward (id 0) and down (id 1), as `_ring` does."""
+    yaw_rad = yaw_from_quaternion(quaternion)
+    messages = []
+    for number, (orientation, pitch_rad) in enumerate(((_FORWARD, 0.0), (_DOWN, _RIGHT_ANGLE))):
+        attitude = quaternion_from_euler(0.0, pitch_rad, yaw_rad)
+        level = int(render_depth(boxes_enu_m, position, attitude, 1, 1, 1.0)[0, 0])
+        range_cm = _MOST_CM + 1 if level == NOTHING else level * _CM_PER_LEVEL
+        messages.append(
+            dialect.MAVLink_distance_sensor_message(
+                round(stamp_s * 1e3) & 0xFFFF_FFFF, _LEAST_CM, _MOST_CM, range_cm,
+                dialect.MAV_DISTANCE_SENSOR_LASER, number, orientation, _UNKNOWN_COVARIANCE,
+            )
+        )  # fmt: skip
+    return messages
+
+
+SENSORS: dict[int, Callable[[Vector, float, Vector, Vector], list[Message]]] = {
+    dialect.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: _ring,
+    dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR: _beams,
+}
+"""The messages of each sensor from boxes, stamp, position and attitude, by message id."""
