@@ -48,6 +48,7 @@ def flown(mavfi, tmp_path_factory):
     return home / "campaigns" / "short", run
 
 
+@pytest.mark.slow
 def test_a_campaign_is_flown_and_summed_up(flown):
     folder, run = flown
     summary = json.loads(run.stdout)

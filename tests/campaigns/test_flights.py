@@ -43,6 +43,7 @@ def flown(short_config, tmp_path_factory):
         return list(ledger.results())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "changes"),
     [

@@ -16,6 +16,7 @@ def assert_only_steps(text):
     assert all(line.endswith(" ...") for line in text.splitlines() if "does not name" not in line)
 
 
+@pytest.mark.slow
 def test_it_writes_one_page(command_line, tmp_path):
     page = tmp_path / "page.html"
     left, out, err = command_line("report", str(RESULTS / "instruction.parquet"), "-o", str(page))

@@ -68,6 +68,7 @@ def test_a_killed_mission_by_the_wall_clock_leaves_no_vehicle(flying):
         await_end(vehicle)
 
 
+@pytest.mark.slow
 def test_a_killed_mission_leaves_its_tlog(flying, mavfi):
     mission = flying()
     mission.await_line("flies a plan")

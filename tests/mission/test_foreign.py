@@ -217,6 +217,7 @@ def test_eyes_bring_camera_world_and_referee(autopilot, autopilot_on_udp, fly_sh
     assert sum(flown_s) < fake.stamp_s  # the clock of the second began where the first had ended
 
 
+@pytest.mark.slow
 def test_a_given_origin_holds(autopilot_on_udp, fly_short):
     _, url = autopilot_on_udp(FakePX4(), camera=False)
     run = load_run(fly_short(link=url, origin=(9.0, 3.0, 0.0), time_limit_s=1.0, **EYES).path)

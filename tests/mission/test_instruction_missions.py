@@ -76,6 +76,7 @@ def test_a_null_injection_changes_nothing(fly_short, short_flight, node):
     assert (fault["state"], fault["node"], fault["corruption"]) == ("null", node, None)
 
 
+@pytest.mark.slow
 @traced
 def test_the_record_says_what_was_hit(attacked):
     result = load_run(attacked.path).result

@@ -21,6 +21,7 @@ print([name for name in sys.modules if name.startswith(("capstone", "mavfi_cli.f
 """
 
 
+@pytest.mark.slow
 def test_a_source_level_flight_loads_no_debugger(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", FLIGHT, tmp_path], capture_output=True, text=True, check=False

@@ -37,6 +37,7 @@ def flown(folder):
     return folder.trace.read_bytes(), folder.tlog.read_bytes(), result
 
 
+@pytest.mark.slow
 @traced
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed):

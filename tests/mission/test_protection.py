@@ -351,6 +351,7 @@ def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
     assert change["state"] == "threshold"
 
 
+@pytest.mark.slow
 def test_a_flip_in_a_number_of_a_plan_is_seen_by_the_extended_watch_alone(
     fly_short, short_flight, tmp_path
 ):

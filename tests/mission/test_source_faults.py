@@ -132,8 +132,8 @@ def test_a_time_to_a_collision_that_is_foreseen_is_read(troubled, tmp_path):
 
 def test_the_document_lists_the_phases():
     text = (Path(__file__).parents[2] / "docs" / "reference" / "faults.md").read_text()
-    (listed,) = re.findall(r"`phase=slowing` \|.*?: (.*?) \(", text)
-    assert listed.split(", ") == [mode.value for mode in PilotMode]
+    (listed,) = re.findall(r"`phase=slowing` \|.*? The modes are (.*?)\.", text)
+    assert re.split(", | and ", listed) == [mode.value for mode in PilotMode]
 
 
 def test_a_trigger_that_never_comes_is_not_injected(struck):

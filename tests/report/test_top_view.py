@@ -130,6 +130,7 @@ def test_a_flight_that_failed_shows_where(run, outcome):
     np.testing.assert_array_equal(mark.get_offsets(), [end])
 
 
+@pytest.mark.slow
 def test_without_referee_world_or_trace_there_is_a_picture_all_the_same(run, tmp_path):
     heard = run.trace.drop_columns([c for c in run.trace.column_names if c.startswith("truth_")])
     foreign = replace(changed(run, world=None, referee=None), trace=heard)

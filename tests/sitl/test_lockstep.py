@@ -50,6 +50,7 @@ def test_offboard_flight_and_the_truth_about_it(companion, take_off, tmp_path):
         assert np.diff(log["stamp_s"]) == pytest.approx(0.02)
 
 
+@pytest.mark.slow
 def test_same_messages_give_the_same_bytes(companion, take_off, order):
     orders = {**take_off, 230: [order(2000, 0, 0.1, 0, component=100)]}
 

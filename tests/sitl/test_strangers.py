@@ -130,6 +130,7 @@ def test_a_wreck_is_told_and_a_reboot_begins_again(open_server):
     assert "restarted" in open_server.said()
 
 
+@pytest.mark.slow
 def test_telemetry_of_250_hz(open_server):
     with connected(open_server.tcp) as connection:
         client = Client(connection)

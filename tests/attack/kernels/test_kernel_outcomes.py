@@ -96,6 +96,7 @@ def fault_in_r10(place, profile, bit):
     raise AssertionError("r10 is not set")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("expected", BODIES)
 def test_known_outcomes(known, expected):
     place = known(BODIES[expected])

@@ -133,6 +133,7 @@ def test_nothing_to_replay_is_an_error(tmp_path):
         list(replay_runs(tmp_path))
 
 
+@pytest.mark.slow
 def test_tolerance_makes_small_corruption_benign(attack, control_campaign):
     _, (strict,) = control_campaign
     _, (lenient,) = attack("control", runs=30, tolerance=1e300)

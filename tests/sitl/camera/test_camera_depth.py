@@ -46,6 +46,7 @@ def twin(
     return np.where(depth < 25.5, levels, 255.0).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(64, 48), (1, 1), (7, 90), (256, 144)])
 @pytest.mark.parametrize("world", ["dense", "factory", "farm"])
 def test_bit_equal_to_numpy(world: str, size: tuple[int, int]) -> None:
