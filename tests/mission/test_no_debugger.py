@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 FLIGHT = """
 import sys
 from pathlib import Path
