@@ -152,7 +152,7 @@ class Camera:
         self._stamp_s = stamp_s
         due = self.idle() if self._heartbeat and self._heartbeat.due(stamp_s) else []
         frame_is_due = self._frames is not None and self._frames.due(stamp_s)
-        sensors = [number for number, each in self._sensors.items() if each.due(stamp_s)]
+        sensors = [number for number, schedule in self._sensors.items() if schedule.due(stamp_s)]
         if frame_is_due or sensors:
             offset_m = rotate(rotation_matrix(quaternion_flu_enu), self.mount_offset_flu_m)
             lens_enu_m = position_enu_m + offset_m
@@ -268,10 +268,10 @@ class Camera:
     def _set_interval(self, message: Message) -> bool:
         """Send a range sensor's messages every param2 microseconds; 0: 10 Hz, -1: never."""
         number, interval_us = _whole(message.param1), float(message.param2)
-        if number not in SENSORS or not (interval_us >= 0.0 or interval_us == -1.0):
+        if number not in SENSORS or not (0.0 <= interval_us < math.inf or interval_us == -1.0):
             return False
         self._sensors.pop(number, None)
-        if 0.0 <= interval_us < math.inf:
+        if interval_us >= 0.0:
             interval_s = round(interval_us * 1e-6, 6) or _SENSOR_INTERVAL_S
             self._sensors[number] = _Schedule(max(interval_s, 1.0 / MAX_RATE_HZ))
         return True

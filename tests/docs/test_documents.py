@@ -89,13 +89,13 @@ def named_commands(document):
 
 
 @pytest.fixture(scope="module")
-def told_help():
+def help_texts():
     """The help of each command, asked for once."""
     return {}
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_named_option_exists(document, mavfi, told_help):
+def test_every_named_option_exists(document, mavfi, help_texts):
     if document.name == "CHANGELOG.md":
         pytest.skip("it also names options that are gone")
     wrong = []
@@ -103,10 +103,11 @@ def test_every_named_option_exists(document, mavfi, told_help):
         options = {word.partition("=")[0] for word in words if re.match("--?[a-z]", word)}
         if options and words[0].islower():
             names = tuple(words[: 2 if words[0] in ("campaign", "detect", "world") else 1])
-            if names not in told_help:
-                told_help[names] = mavfi(*names, "--help").stdout
-            told = told_help[names]
-            wrong += [(words, each) for each in options if not re.search(rf"{each}\b", told)]
+            if names not in help_texts:
+                help_texts[names] = mavfi(*names, "--help").stdout
+            wrong += [
+                (words, each) for each in options if not re.search(rf"{each}\b", help_texts[names])
+            ]
     assert wrong == []
 
 
