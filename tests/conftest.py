@@ -102,6 +102,7 @@ def mavfi():
             contextlib.chdir(cwd),
             mock.patch.multiple(sys, argv=line),
             mock.patch("os.execv", _become),
+            mock.patch("mavfi_cli.cli.leave", sys.exit),
             _collected(1, contextlib.redirect_stdout) as out,
             _collected(2, contextlib.redirect_stderr) as err,
         ):

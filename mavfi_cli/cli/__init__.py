@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 
 from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import UnknownName
-from mavfi_cli.core.terminal import exit_code
+from mavfi_cli.core.terminal import exit_code, leave
 
 # name -> (module, what it does); the help page must not import the modules. A command of the
 # vehicle's side replaces this process.
@@ -142,7 +142,7 @@ def main() -> NoReturn:
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, _interrupt)
     code = exit_code(lambda: cli.main(prog_name="mavfi", standalone_mode=False))
-    sys.exit(128 + signal.SIGTERM if _terminated else code)
+    leave(128 + signal.SIGTERM if _terminated else code)
 
 
 def _interrupt(*_: object) -> NoReturn:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import os
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterable
+from typing import NoReturn
 
 import click
 
@@ -64,6 +69,16 @@ def exit_code(program: Callable[[], object]) -> int:
             note_error(f"{place}{error.strerror or described(error)}")
         return 1
     return code if isinstance(code, int) else 0
+
+
+def leave(code: int) -> NoReturn:
+    """End this process as `sys.exit` does, but without freeing each object, which takes a second."""
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(code)
 
 
 def _no_such_option(error: click.NoSuchOption) -> str:
