@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+    from mavfi_cli.fi.tracer.record_fields import FaultRecord
     from mavfi_cli.mission.progress import Recorder, Watcher
     from mavfi_cli.spec.mission import MissionConfig
 
@@ -28,6 +29,7 @@ def fly(
     out: str | Path = "runs",
     watcher: Watcher | None = None,
     recorder: Recorder | None = None,
+    repeat: FaultRecord | None = None,
     **settings: Any,
 ) -> Run:
     """Fly one mission and return its loaded run. A mission that fails is a result, not an error.
@@ -37,6 +39,7 @@ def fly(
         out: Folder in which the run folder is made.
         watcher: Receives progress and events.
         recorder: Keeps what the nodes receive: depth frames, clouds, maps and plan requests.
+        repeat: Record of an instruction-level fault to strike again, instead of drawing one.
         settings: Fields of `MissionConfig` that replace those of `config`. `fault`, `instruction`
             and `detector` are their dataclasses or mappings with the same keys.
 
@@ -47,7 +50,9 @@ def fly(
     """
     mission = _mission(config, settings)
     require_folder(Path(out))
-    if mission.instruction is not None:  # the attacked node loads in parallel
+    if (
+        mission.instruction is not None and mission.companion is None
+    ):  # the attacked node loads in parallel
         from mavfi_cli.attack.served import ServedProcess
         from mavfi_cli.mission.instruction import PROGRAM
 
@@ -55,7 +60,7 @@ def fly(
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_mission
 
-    folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder)
+    folder = fly_mission(mission, Path(out), watcher or Watcher(), recorder=recorder, repeat=repeat)
     return load_run(folder.path)
 
 

@@ -35,6 +35,25 @@ int main(int c, char **v) {
     printf("%ld %.17g\\n", sink, sum);
     return 0;
 }""",
+    # Three threads call `work` for ever. It prints the number of calls for each character it reads.
+    "workers": """
+#include <pthread.h>
+#include <stdio.h>
+static volatile long calls[3]; static volatile double sum;
+void never(void) { puts("never"); }
+__attribute__((noinline)) double work(long n) {
+    double x = 1; for (long i = 1; i < 200; i++) x += (double) n / i; return x;
+}
+static void *run(void *at) { for (;;) { sum = work(++*(volatile long *) at); } return 0; }
+int main(void) {
+    pthread_t t; for (int i = 0; i < 3; i++) pthread_create(&t, 0, run, (void *) &calls[i]);
+    puts("ready"); fflush(stdout);
+    while (getchar() != EOF) {
+        if (getchar() == EOF) break;
+        printf("%ld\\n", calls[0] + calls[1] + calls[2]); fflush(stdout);
+    }
+    return 0;
+}""",
     # For -nostdlib -static: no object of it has writable data.
     "bare": """
 static void call(long number, long a, long b, long c) {

@@ -111,7 +111,7 @@ def _kernel(configs: Sequence[MissionConfig]) -> str | None:
 
 
 def _require_same_faults(config: MissionConfig, alone: KernelSummary) -> None:
-    from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
+    from mavfi_cli.attack.live import mission_strategy  # loads the tracer
 
     fault = config.instruction
     assert fault is not None

@@ -1,32 +1,23 @@
-"""Runs one fault: reach the location, flip, follow, run to the end, judge.
-
-A fault in a process that keeps running, such as a node of a mission, is applied in a thread of its
-own, because ptrace obeys only the thread that attached.
-"""
+"""Runs one fault: reach the location, flip, follow, run to the end, judge."""
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mavfi_cli.attack.place import Golden
 from mavfi_cli.attack.target import JudgedPlace, RunOutcome, RunVerdict
-from mavfi_cli.attack.tracer_thread import Notice
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import record
-from mavfi_cli.fi.tracer.counted import CountedStop
 from mavfi_cli.fi.tracer.fault import InstructionFault, Rule, Strategy
-from mavfi_cli.fi.tracer.image import Image, Regions, Scope
-from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, instruction_at, reach, strike
+from mavfi_cli.fi.tracer.inject import NOTHING, Followed, Injection, reach, strike
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.fi.tracer.sampling import draw_fault_here
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 GOLDEN_RUNS = 3
@@ -165,7 +156,7 @@ class Attacker:
             if tracee.resume_until_alarm(alarm) is not None:
                 return None, f"the {self.place.kind} ended before the moment"
             moment_s = plan.retry_s
-            fault, reason = _fault_here(tracee, image, scope, plan, rng)
+            fault, reason = draw_fault_here(tracee, image, scope, plan, rng)
             if fault is not None:
                 return fault, ""
         return None, reason
@@ -208,98 +199,8 @@ class Attacker:
         )
 
 
-def _fault_here(
-    tracee: Tracee, image: Image, scope: Scope, plan: Strategy, rng: np.random.Generator
-) -> tuple[InstructionFault | None, str]:
-    here = tracee.registers.ip
-    if tracee.registers.system_call is not None and not plan.in_system_calls:
-        return None, f"inside system call {tracee.registers.system_call}"
-    if here not in scope and not plan.whole_process:
-        return None, f"outside the scope, in {image.locate(here).object}"
-    instruction = instruction_at(tracee, here)
-    corruption = None if instruction is None else plan.draw_at(instruction, rng)
-    if instruction is None or corruption is None:
-        return None, "no operand that the fault model allows"
-    fault = InstructionFault(
-        trigger=(CountedStop(image.locate(here), 1),),
-        execution=0,
-        instruction=instruction.text,
-        instruction_bytes=instruction.raw,
-        corruption=corruption,
-    )
-    return fault, ""
-
-
 def run_out(tracee: Tracee) -> Ended:
     """Let a run continue to its end."""
     while tracee.ended is None:
         tracee.resume()
     return tracee.ended
-
-
-# -- a process that keeps running
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LiveAttack:
-    """The result of a fault in a process that other code runs."""
-
-    injection: Injection | None  # None: the trigger was not reached, or null injection
-    followed: Followed
-    reason: str
-    ended: Ended | None  # None: the process lives on, detached
-    record: FaultRecord
-
-
-def attack_live(
-    pid: int,
-    fault: InstructionFault,
-    *,
-    path: Path,
-    regions: Regions | None = None,
-    window: int = 64,
-    armed: Notice = lambda: None,
-    reached: Notice = lambda: None,
-    leave_stopped: bool = False,
-    **context: Any,
-) -> LiveAttack:
-    """Apply one fault in a running process, such as a node of a mission, and let it continue.
-
-    The record is written to disk before the process runs to the trigger. The process must be a
-    child of the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached,
-    the kernel notifies the tracer first: read its exit status from the result, not from
-    `Popen.wait`.
-
-    Args:
-        window: number of instructions for which a destination fault is followed.
-        armed: called once the process runs towards the trigger.
-        reached: called when the process has stopped at the trigger.
-        leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
-        context: further entries of the record: kernel, stage, sampling rule, seed, scope.
-
-    Raises:
-        TracingForbidden: the operating system refuses.
-        FaultError: the location holds another instruction.
-    """
-    tracee = Tracee.attach(pid)
-    try:
-        image = Image(pid, regions)
-        planned = record.planned(fault, image, **context)
-        record.write(path, planned)
-        armed()
-        reason = reach(tracee, image, fault)
-        injection, followed = None, NOTHING
-        if not reason:
-            reached()
-            injection, followed = strike(tracee, fault, window=window)
-            reason = "" if injection is None else injection.reason
-            if leave_stopped and tracee.ended is None:
-                os.kill(pid, signal.SIGSTOP)
-    finally:
-        if tracee.ended is None:
-            tracee.detach()
-    done = record.completed(planned, injection, followed, not_injected_reason=reason)
-    record.write(path, done)
-    return LiveAttack(
-        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
-    )

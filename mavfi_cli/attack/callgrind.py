@@ -67,17 +67,21 @@ def count_executions(
         "--compress-pos=no", "--compress-strings=no", "--skip-plt=no", "--log-file=/dev/null",
         "--vgdb=no", f"--dump-every-bb={_BLOCKS}", f"--callgrind-out-file={counts}", "--",
     ]  # fmt: skip
-    with open(command.stdin, "rb") as given, open(stdout, "wb") as out, open(stderr, "wb") as err:
-        process = subprocess.Popen(
-            [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
-            stdin=given, stdout=out, stderr=err, start_new_session=True,
-            preexec_fn=functools.partial(die_with, os.getpid()),
-        )  # fmt: skip
-    count = _Count(counts=counts, golden=golden, native_s=native_s)
+    count, process = _Count(counts=counts, golden=golden, native_s=native_s), None
     try:
+        with (
+            open(command.stdin, "rb") as given,
+            open(stdout, "wb") as out,
+            open(stderr, "wb") as err,
+        ):
+            process = subprocess.Popen(
+                [*tool, *command.argv], cwd=command.directory, env=dict(command.environment),
+                stdin=given, stdout=out, stderr=err, start_new_session=True,
+                preexec_fn=functools.partial(die_with, os.getpid()),
+            )  # fmt: skip
         code = _await_end(process, name, count, report)
     finally:
-        if process.poll() is None:
+        if process is not None and process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     if code < 0:

@@ -23,7 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -255,8 +255,7 @@ def _draw(plan: Plan, setup: _TargetSetup, prepared: TargetRuns) -> list[FaultRe
         if len(prepared.goldens) > 1:
             what["input"] = number
         if profile is None or fault is None:
-            undrawn = {"version": record.VERSION, "state": "planned", "trigger": [], **what}
-            records.append(cast(FaultRecord, undrawn))
+            records.append(record.undrawn(**what))
             continue
         assert profile.image is not None
         struck = replace(fault, corruption=None) if plan.null else fault

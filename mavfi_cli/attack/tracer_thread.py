@@ -45,6 +45,11 @@ class TracerThread(Generic[T]):
         if self._done.done():
             self._done.result()
 
+    @property
+    def done(self) -> bool:
+        """True once the work is done."""
+        return self._done.done()
+
     def result(self) -> T:
         """Wait until the work is done; return its result or raise its error."""
         return self._done.result()

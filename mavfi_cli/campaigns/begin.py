@@ -377,10 +377,13 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
     elif config.fault is not None:
         config.fault.check()
     if config.instruction is not None:
-        from mavfi_cli.attack.strategy import mission_strategy  # loads the tracer
+        from mavfi_cli.attack.live import mission_strategy  # loads the tracer
 
         mission_strategy(config.instruction)
-        config.instruction.node()
+        if users is None:
+            config.instruction.node()
+        else:
+            config.instruction.check_program(users.program)
     if config.detector is not None and users is not None:
         config.detector.build_for_companion(users.mark)
     elif config.detector is not None:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.core.files import Json
 from mavfi_cli.mission.measures import FlightRecord
+from mavfi_cli.spec.fault import is_omitted
 from mavfi_cli.spec.mission import MissionConfig
 
 Label = str | int | float | bool | None
@@ -82,8 +83,14 @@ def _plain(value: Any) -> Any:
     """Convert a value as a JSON round trip would, without the slow copies of `asdict`."""
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
-    names = getattr(value, "__dataclass_fields__", None)
-    return value if names is None else {name: _plain(getattr(value, name)) for name in names}
+    members = getattr(value, "__dataclass_fields__", None)
+    if members is None:
+        return value
+    return {
+        name: _plain(getattr(value, name))
+        for name, member in members.items()
+        if not is_omitted(value, member)
+    }
 
 
 def kind_of(changes: Changes, apart: Collection[str]) -> str:

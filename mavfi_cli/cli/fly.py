@@ -23,6 +23,7 @@ from mavfi_cli.core.errors import ConfigError, FaultSpecError
 from mavfi_cli.core.terminal import echo, echo_lines, note_error
 
 if TYPE_CHECKING:
+    from mavfi_cli.fi.tracer.record_fields import FaultRecord
     from mavfi_cli.mission.run_folder import Run
     from mavfi_cli.spec.detector import DetectorConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 _SOURCE = {"at", "exact_bits", "effect", "persistence", "duration_s", "together", "direction"}
 _DYING = "needs nodes that can die: --inject process.NODE, or --level instruction"
 _EITHER = {"bits", "field", "fault_seed"}
-_INSTRUCTION = {"sites", "roles", "compat"}
+_OF_PROGRAM = {"objects", "function"}
+_INSTRUCTION = {"sites", "roles", "compat", *_OF_PROGRAM}
 _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
 _SMALL = 1.0e-3  # change of a value, of the value itself or of 1 in its unit
 _LARGE = [
@@ -147,7 +149,8 @@ _detector, _output = section("Detector"), section("Output")
 @_instruction("--level", type=click.Choice(["source", "instruction"]), default="source",
               help="`instruction` corrupts an operand of one machine instruction of a kernel. "
                    "--inject is then point_cloud, octomap, collision_check, planner, control, "
-                   "perception or planning.")  # fmt: skip
+                   "perception or planning; with --companion, PROGRAM or PROGRAM/EXECUTABLE for a "
+                   "process that the program starts.")  # fmt: skip
 @_instruction("--site", "sites", multiple=True, type=types.SITE,
               help="Kind of operand: general, flags, vector, x87, mask, instruction-pointer, "
                    "opcode, memory. May be repeated  [the first five: registers].")  # fmt: skip
@@ -156,6 +159,15 @@ _detector, _output = section("Detector"), section("Output")
 @_instruction("--compat", type=types.COMPAT, metavar="INJECTOR",
               help="Choose operands and bits as another injector: pinfi, pinfi-bugs, "
                    "rosfi-2021.")  # fmt: skip
+@_instruction("--scope", "objects", multiple=True, metavar="OBJECT",
+              help="Shared object or executable of a --companion's process to strike. May be "
+                   "repeated  [all; in a Python program all but the interpreter].")  # fmt: skip
+@_instruction("--function", metavar="NAME",
+              help="Strike a --companion's process only in code that executes during calls of this "
+                   "function.")  # fmt: skip
+@_instruction("--replay", metavar="RUN", type=click.Path(exists=True, file_okay=False),
+              help="Strike the instruction that a --companion's flight recorded in this run "
+                   "folder, at the same moment.")  # fmt: skip
 @_detector("--detector", type=types.DETECTOR, metavar="NAME",
            help="Detector that watches the states and triggers recovery: gad, aad, range, l2, or "
                 "the name of a plug-in  [none].")  # fmt: skip
@@ -190,6 +202,7 @@ def fly(
     quiet: bool,
     config: Path | None,
     golden: int | None,
+    replay: str | None,
     **_options: Any,
 ) -> None:
     """Fly one mission from take-off to the goal, through unknown obstacles.
@@ -224,7 +237,10 @@ def fly(
     if record:
         viewers.require_viewer(Path(f"flight.{record}"))
     with progress_view(mission, quiet=quiet) as view:
-        run = library.fly(mission, out=out, watcher=view, recorder=recorder)
+        run = library.fly(
+            mission, out=out, watcher=view, recorder=recorder,
+            repeat=None if replay is None else _record_of(Path(replay)),
+        )  # fmt: skip
     folder = run.folder
     if record:
         viewers.save(
@@ -330,11 +346,13 @@ def _faults(
     base: MissionConfig, given: Given
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
     """The mission's fault at source or instruction level, checked."""
-    from mavfi_cli.attack.strategy import mission_strategy
+    from mavfi_cli.attack.live import mission_strategy
     from mavfi_cli.mission.companion_faults import check_companion_fault
     from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
+    if "replay" in given:
+        return None, _recorded_fault(Path(given["replay"]), given.get("companion", base.companion))
     source = given.get("level", "source" if base.instruction is None else "instruction") == "source"
     prior = base.fault if source else base.instruction
     target = given.get("inject", None if prior is None else prior.target)
@@ -343,7 +361,7 @@ def _faults(
         if not source:
             raise click.UsageError("--level instruction needs --inject NODE")
         return None, None
-    own, other = (_SOURCE, _INSTRUCTION) if source else (_INSTRUCTION, _SOURCE)
+    own, other = (_SOURCE, _INSTRUCTION) if source else (_INSTRUCTION | {"at"}, _SOURCE - {"at"})
     refuse_given(other, f"needs --level {'instruction' if source else 'source'}")
     values = {name: given[name] for name in (_EITHER | own) & set(given)}
     direction = values.pop("direction", None)
@@ -363,8 +381,40 @@ def _faults(
             check_companion_fault(fault, CompanionConfig.load(companion).program)
         return fault, None
     mission_strategy(fault)  # reports wrong names now
-    fault.node()
+    companion = given.get("companion", base.companion)
+    if companion is None:
+        refuse_given(_OF_PROGRAM, "needs --companion")
+        refuse_given({"at"}, "needs --level source, or --companion")
+        fault.node()
+    else:
+        fault.check_program(CompanionConfig.load(companion).program)
     return None, fault
+
+
+def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
+    """Return the request of a recorded fault in a user's companion.
+
+    Raises:
+        RecordError: the run has no such record.
+    """
+    from mavfi_cli.core.config import structure
+    from mavfi_cli.spec.companion import CompanionConfig
+    from mavfi_cli.spec.fault import InstructionConfig
+
+    others = _SOURCE | _EITHER | _INSTRUCTION | {"inject", "level"}
+    refuse_given(others, "cannot be combined with --replay, which takes it from the record")
+    if companion is None:
+        raise click.UsageError("--replay needs --companion; `mavfi replay` repeats other flights")
+    fault = structure(_record_of(run).get("request") or {}, InstructionConfig)
+    fault.check_program(CompanionConfig.load(companion).program)
+    return fault
+
+
+def _record_of(run: Path) -> FaultRecord:
+    from mavfi_cli.fi.tracer.record import read
+    from mavfi_cli.mission.run_folder import RunFolder
+
+    return read(RunFolder(run).fault)
 
 
 def _detector_of(base: MissionConfig, given: Given) -> DetectorConfig | None:

@@ -183,6 +183,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 _SCRATCH, _OWNED = "mavfi-", ".mavfi-scratch"
 
+_TRIES = 10  # to remove a folder in which a program that is being killed may still write
+
 
 class ScratchFolder:
     """A private temporary folder that is removed however the process ends.
@@ -234,7 +236,10 @@ def _locked_folder(place: Path, prefix: str) -> tuple[Path, int]:
 
 def _remove_scratch(path: Path, lock: int, owner: int) -> None:
     if os.getpid() == owner:
-        shutil.rmtree(path, ignore_errors=True)
+        for _ in range(_TRIES):
+            shutil.rmtree(path, ignore_errors=True)
+            if not path.exists():
+                break
         os.close(lock)
 
 

@@ -72,7 +72,7 @@ def exit_code(program: Callable[[], object]) -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process as `sys.exit` does, but without freeing each object, which takes a second."""
+    """End this process as `sys.exit` does, but free no objects, which would take a second."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

@@ -8,9 +8,10 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from types import MappingProxyType
 from typing import Any
 
-from mavfi_cli.companion.injection import Killer, SourceInjection
+from mavfi_cli.companion.injection import Killer, NoInjection, SourceInjection
 from mavfi_cli.core.errors import FaultSpecError
 from mavfi_cli.core.flight_record import Strike
 from mavfi_cli.core.seeds import Stream
@@ -156,7 +157,25 @@ class Throttle(threading.Thread):
         self.join()
 
 
-class CompanionInjection(SourceInjection):
+class CompanionFault(NoInjection):
+    """A fault in a user's companion.
+
+    Attributes:
+        running: The started programs by name.
+        link: Strikes messages; None for a fault in a process.
+    """
+
+    running: Mapping[str, RunningProgram] = MappingProxyType({})
+    link: LinkInjector | None = None
+
+    def aim_at(self, shortest_flight_s: float) -> None:
+        """Draw the fault over the shortest time of flight, s."""
+
+    def tick(self, moment: Moment) -> None:
+        """Strike a process if it is due, and end what has a duration."""
+
+
+class CompanionInjection(CompanionFault, SourceInjection):
     """Injection of one fault into the messages or the processes of a user's companion.
 
     Args:
@@ -168,20 +187,17 @@ class CompanionInjection(SourceInjection):
         UnknownName: It has no such program, message or field.
     """
 
-    link: LinkInjector | None = None
-
     def __init__(
         self, config: FaultConfig, programs: Mapping[str, Any], signing: Signing | None = None
     ) -> None:
         super().__init__(config)
         self._signing = signing
-        self.running: Mapping[str, RunningProgram] = {}
         self._throttle: Throttle | None = None
         self._until_s = math.inf
         check_companion_fault(config, programs)
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """Draw the fault over the shortest time of flight, s."""
+        """See `CompanionFault`."""
         config = self._config
         if config.killed_node is not None:
             self.injector = Killer(config, shortest_flight_s, self._on_strike)
@@ -197,7 +213,7 @@ class CompanionInjection(SourceInjection):
         self._stage = config.wire_target[0] or "message"
 
     def tick(self, moment: Moment) -> None:
-        """Strike a process if it is due, and end what has a duration."""
+        """See `CompanionFault`."""
         self.injector.strike(moment)
         if self._throttle is not None and moment.stamp_s >= self._until_s:
             self._throttle.end()
@@ -238,5 +254,5 @@ def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> N
     else:
         raise FaultSpecError(
             f"{config.target}: the target in a user's companion must be a MAVLink message such as "
-            "SET_POSITION_TARGET_LOCAL_NED.vx, or process.PROGRAM"
+            "SET_POSITION_TARGET_LOCAL_NED.vx, or process.PROGRAM (PROGRAM at instruction level)"
         )

@@ -30,7 +30,7 @@ from mavfi_cli.link.router import Router, Side
 from mavfi_cli.link.telemetry import AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
 from mavfi_cli.link.transport import Transport, signing_from_file
-from mavfi_cli.mission.companion_faults import CompanionInjection, Throttle
+from mavfi_cli.mission.companion_faults import CompanionFault, Throttle
 from mavfi_cli.mission.programs import Programs, RunningProgram
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace
@@ -87,7 +87,7 @@ class CompanionFlight:
         self._gate = self._planned_gate()
         self._commanders: set[tuple[int, int]] = set()
         self._ticks = 0  # since the first arming
-        self._faults = injection if isinstance(injection, CompanionInjection) else None
+        self._faults = injection if isinstance(injection, CompanionFault) else None
         self._mode, self._failsafe = "", False
         self._next_progress_s = 0.0
         self._crew = _Crew(companion, self.logger)

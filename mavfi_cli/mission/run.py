@@ -90,7 +90,7 @@ def fly_mission(
     """
     config = config.with_firmware()
     if config.companion is not None:
-        return _fly_companion(config, out, watcher)
+        return _fly_companion(config, out, watcher, repeat)
     parts = CompanionParts.of(config)  # unknown names end here
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
     _warm_up(config, watcher)  # first: else a link is full of stale messages by then
@@ -132,7 +132,9 @@ def fly_mission(
     return folder
 
 
-def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFolder:
+def _fly_companion(
+    config: MissionConfig, out: Path, watcher: Watcher, repeat: FaultRecord | None
+) -> RunFolder:
     """Fly a user's companion. Raises as `fly_mission`."""
     assert config.companion is not None
     programs = CompanionConfig.load(config.companion)
@@ -143,6 +145,10 @@ def _fly_companion(config: MissionConfig, out: Path, watcher: Watcher) -> RunFol
     if config.fault is not None:
         key = signing_from_file(programs.key_file)
         injection = CompanionInjection(config.fault, programs.program, key)
+    elif config.instruction is not None:
+        from mavfi_cli.mission.instruction.companion import ProcessInjection  # loads the tracer
+
+        injection = ProcessInjection(config.instruction, programs.program, repeat)
     with interruptible() as interrupt, other_end(config) as (link, vehicle):
         assert vehicle is not None
         flight = CompanionFlight(config, programs, link, watcher, interrupt, injection)

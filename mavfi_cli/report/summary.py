@@ -279,12 +279,18 @@ def _activation(activation: RecordedActivation) -> str:
 
 
 def _instruction_lines(fault: MissionInstructionFault) -> list[str]:
-    lines = [
-        f"Fault       node {fault.node}, invocation {fault.invocation} of "
-        f"{fault.invocations} of {fault.kernel}, at {_number(fault.stamp_s, 's', 2)}; "
-        f"{fault.sampling}, windows {fault.windows}",
-        f"            before execution {fault.k} of {fault.instruction} ({_place(fault)})",
-    ]
+    at = f"at {_number(fault.stamp_s, 's', 2)}; {fault.sampling}"
+    if fault.invocation is None:
+        lines = [f"Fault       process {fault.kernel} of {fault.node}, {at}"]
+        where = f"before execution {fault.k} of the code in scope, {fault.instruction}"
+    else:
+        lines = [
+            f"Fault       node {fault.node}, invocation {fault.invocation} of "
+            f"{fault.invocations} of {fault.kernel}, {at}, windows {fault.windows}"
+        ]
+        where = f"before execution {fault.k} of {fault.instruction}"
+    if fault.instruction:
+        lines.append(f"            {where} ({_place(fault)})")
     if fault.state == "null":
         return [*lines, "            null injection: nothing was flipped"]
     if fault.state == "not_injected":

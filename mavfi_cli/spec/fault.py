@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import Field as Member
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mavfi_cli.core.errors import FaultSpecError, UnknownName, named_member
 from mavfi_cli.core.seeds import Stream
@@ -29,6 +30,7 @@ from mavfi_cli.fi.fault import (
 if TYPE_CHECKING:
     from mavfi_cli.link.fields import WireFields
 
+T = TypeVar("T")
 _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
 PROCESS = "process"  # target prefix: process of a node
@@ -321,19 +323,37 @@ _NODES = {
 }
 
 
+def _omitted(default: T) -> T:
+    """Return a field that records omit while it has its default."""
+    return field(default=default, metadata={"omitted": True})
+
+
+def is_omitted(config: object, own: Member[Any]) -> bool:
+    """Return True if records omit this field of a configuration."""
+    return bool(own.metadata) and getattr(config, own.name) == own.default
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstructionConfig:
     """One instruction-level fault of a mission.
 
     Attributes:
-        target: Injection site: a node, or a stage from which a node is drawn.
+        target: Injection site: a node, or a stage from which a node is drawn. In a user's
+            companion: `PROGRAM`, or `PROGRAM/EXECUTABLE` for a process that the program has
+            started, such as `fly/mavsdk_server`.
         seed: Root seed of the fault's random streams.
         sampling: Sampling rule. Missions reject rules by time because they are not repeatable.
-        compat: Injector whose choice of registers and bits is copied. The time remains uniformly
-            distributed over executed instructions.
+        compat: Injector whose choice of registers and bits is copied. In mavfi's own nodes the time
+            remains uniformly distributed over executed instructions.
         sites, roles: Kinds of operands; empty for the default.
         bits: Number of distinct bits to flip.
         null: Null injection, which does everything except the flip.
+        at: In a user's companion: the moment from which instructions are counted, as in
+            `FaultConfig`.
+        objects: In a user's companion: the shared objects and executables that may be struck;
+            empty for all.
+        function: In a user's companion: only code that executes during calls of this function may
+            be struck.
     """
 
     target: str
@@ -345,9 +365,40 @@ class InstructionConfig:
     field: str = "any"  # field of the bits: sign, exponent, mantissa or any
     bits: int = 1
     null: bool = False
+    at: str = _omitted("random")
+    objects: tuple[str, ...] = _omitted(())
+    function: str | None = _omitted(None)
 
     def __post_init__(self) -> None:
         _check_seed(self.seed)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for a record."""
+        unset = {name for name, own in self.__dataclass_fields__.items() if is_omitted(self, own)}
+        return {name: value for name, value in asdict(self).items() if name not in unset}
+
+    @property
+    def program(self) -> str:
+        """Program of a user's companion that is struck."""
+        return self.target.partition("/")[0]
+
+    @property
+    def executable(self) -> str | None:
+        """Name of the struck process's executable; None for the program's own process."""
+        return self.target.partition("/")[2] or None
+
+    def moment(self) -> FaultConfig:
+        """Return a fault in the program's process at the moment from which is counted."""
+        return FaultConfig(target=f"{PROCESS}.{self.program}", seed=self.seed, at=self.at)
+
+    def check_program(self, programs: Collection[str]) -> None:
+        """Validate the fault in a user's companion, given its programs.
+
+        Raises:
+            UnknownName: No program has this name.
+            FaultSpecError: A process does not have this trigger.
+        """
+        self.moment().check_program(programs)
 
     def describe(self, struck: str | None = None) -> str:
         """Describe the fault for a title, such as "a bit in an instruction of octomap".
@@ -364,7 +415,11 @@ class InstructionConfig:
 
         Raises:
             UnknownName: The node or stage does not exist.
+            FaultSpecError: A setting needs a user's companion.
         """
+        for name, own in self.__dataclass_fields__.items():
+            if own.metadata and not is_omitted(self, own):
+                raise FaultSpecError(f"{name} needs --companion")
         if self.target not in _NODES:
             raise UnknownName("node or stage", self.target, _NODES)
         nodes = _NODES[self.target]

@@ -205,7 +205,7 @@ class MissionConfig:
             if self.fault is not None and self.fault.wire_target is not None:
                 raise ConfigError("a MAVLink message needs --companion", key="inject")
             return
-        for name in ("link", "realtime", "instruction", "isolate", "land"):
+        for name in ("link", "realtime", "isolate", "land"):
             if getattr(self, name):
                 raise ConfigError("cannot be combined with --companion", key=name)
         plain = MissionConfig()
@@ -248,6 +248,8 @@ class MissionConfig:
         """Return plain values for the record of the run, without settings of the host."""
         values = asdict(self)
         del values["isolate"], values["key_file"]
+        if self.instruction is not None:
+            values["instruction"] = self.instruction.as_dict()
         if self.autopilot == OWN_AUTOPILOT:
             del values["autopilot"], values["firmware"]
         if self.link is None:

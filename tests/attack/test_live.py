@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from native_programs import register_corruption
 
-from mavfi_cli.attack.attacker import attack_live
+from mavfi_cli.attack.live import attack_live
 from mavfi_cli.attack.profile import profile_call, profile_calls
 from mavfi_cli.attack.tracer_thread import EntryCounter
 from mavfi_cli.core.errors import TargetError

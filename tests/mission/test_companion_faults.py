@@ -1,5 +1,6 @@
 """Faults in the messages and processes of a user's companion."""
 
+import json
 import os
 import signal
 import sys
@@ -189,6 +190,55 @@ def test_a_struck_flight_has_a_record_of_its_fault(tmp_path, fault, outcome, lin
     assert run.record.state_fault.state == "applied"
     assert any(line in text for text in summary_lines(run.record))
     assert any(event.kind == "fault" for event in run.record.events)
+
+
+@pytest.mark.slow
+def test_an_instruction_of_a_program_is_struck_in_flight_and_struck_again(tmp_path, mavfi):
+    companion = tmp_path / "hop.toml"
+    companion.write_text(
+        f"[program.hop]\ncommand = '{sys.executable} {HOP} {{link}} 2 lands'\n"
+        "[success]\nlanded = true\n"
+    )
+    line = ["fly", "--companion", companion, "--world", "farm", "--speed", 2, "--time-limit", 60]
+    line += ["--no-picture", "--quiet", "--json", "--out", tmp_path]
+    drawn = ["--level", "instruction", "--inject", "hop", "--at", "time=4"]
+    faults = []
+    for fault in ([*drawn, "--fault-seed", 5], ["--replay", tmp_path / "farm-3-001"]):
+        done = mavfi(*line, *fault)
+        result = json.loads(done.stdout)
+        faults.append(result["fault"])
+        assert result["outcome"] in ("success", "crash", "failsafe", "timeout")
+        assert result["config"]["instruction"]["at"] == "time=4"
+        assert any(event["kind"] == "fault" for event in result["events"])
+    assert all(fault["state"] == "applied" and fault["node"] == "hop" for fault in faults)
+    first, again = ((fault["object"], fault["offset"], fault["corruption"]) for fault in faults)
+    assert first == again
+    assert not first[0].startswith(("python", "libpython"))
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        (["--level", "instruction", "--inject", "hopp"], "did you mean 'hop'"),
+        (["--level", "instruction", "--inject", "hop", "--at", "foreseen"], "got foreseen"),
+        (["--inject", "process.hop", "--scope", "libc.so.6"], "--level instruction"),
+        (["--replay", ".", "--inject", "hop"], "--replay"),
+    ],
+)
+def test_faults_in_instructions_that_a_companion_cannot_have(tmp_path, mavfi, line, problem):
+    (tmp_path / "hop.toml").write_text("[program.hop]\ncommand = 'true'\n")
+    done = mavfi("fly", "--companion", "hop.toml", *line, cwd=tmp_path)
+    assert done.returncode == 2
+    assert problem in done.stderr
+
+
+@pytest.mark.parametrize("option", [["--scope", "x"], ["--function", "x"], ["--at", "time=3"]])
+def test_settings_of_a_program_need_a_users_companion(tmp_path, mavfi, option):
+    done = mavfi("fly", "--level", "instruction", "--inject", "octomap", *option, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"{option[0]} needs" in done.stderr
+    done = mavfi("fly", "--replay", ".", cwd=tmp_path)
+    assert "--replay needs --companion" in done.stderr
 
 
 def test_a_message_needs_a_users_companion(tmp_path):

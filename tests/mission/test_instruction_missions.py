@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from mavfi_cli.attack.live import mission_strategy
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.strategy import mission_strategy
 from mavfi_cli.autonomy import tracking
 from mavfi_cli.cli.runs import replay
 from mavfi_cli.core.config import structure

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 from mavfi_cli.core.errors import BuildMismatch, RecordError, lack_of
 from mavfi_cli.core.files import Json, read_json, write_text
+from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.fi.tracer.counted import CountedStop, Detour
 from mavfi_cli.fi.tracer.fault import (
     InstructionCorruption,
@@ -59,6 +60,19 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecor
     return cast(FaultRecord, record)
 
 
+def undrawn(**context: Any) -> FaultRecord:
+    """Return the record of a fault that will be drawn at its moment. `context` as for `planned`."""
+    record = {
+        "version": VERSION,
+        "state": "planned",
+        "level": "instruction",
+        "trigger": [],
+        "corruption": None,
+        **context,
+    }
+    return cast(FaultRecord, record)
+
+
 def _stage_to_json(stage: CountedStop) -> StageRecord:
     location = stage.location
     entry = StageRecord(object=location.object, offset=location.offset, count=stage.count)
@@ -78,6 +92,34 @@ def completed(
     activation = asdict(followed) | {"activation": followed.activation.value}
     written = {"state": "completed", "injection": what, "activation": activation, **result}
     return cast(FaultRecord, {**record, **written})
+
+
+def repeatable(written: FaultRecord) -> dict[str, Any]:
+    """Return a completed record without the measured time of the stop."""
+    injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
+    reason = written.get("not_injected_reason", "")
+    state = "applied" if injection["applied"] else "not_injected"
+    if written["corruption"] is None and not reason:
+        state = "null"
+    ending = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
+    return {**written, **ending}
+
+
+def describe(written: FaultRecord) -> str:
+    """Describe a completed fault in one line."""
+    if not written["trigger"]:
+        return f"fault in {written['kernel']}: not injected ({written['not_injected_reason']})"
+    place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
+    where = f"{written['kernel']}, {written['instruction']} at {place}"
+    corruption = written["corruption"]
+    if corruption is None:
+        return f"null fault in {where}: nothing is flipped"
+    if not written["injection"]["applied"]:
+        return f"fault in {where}: not injected ({written.get('not_injected_reason', '')})"
+    bits = ", ".join(map(str, corruption["bits"]))
+    what = corruption["register"] or corruption["site"]
+    activation = written["activation"]["activation"].replace("_", " ")
+    return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
 
 
 def fault_of(record: FaultRecord) -> InstructionFault:

@@ -33,6 +33,7 @@ class FaultRecord(TypedDict, total=False):
     injection: Json
     activation: Json
     not_injected_reason: str
+    request: Json  # of a mission
     node: str
     kernel: str
     golden_sha256: str

@@ -22,7 +22,7 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.counted import CodeAt, CountedRun, CountedStop, Detour, Locate
 from mavfi_cli.fi.tracer.decode import decode
 from mavfi_cli.fi.tracer.fault import InstructionFault, Strategy
-from mavfi_cli.fi.tracer.image import Location, Scope
+from mavfi_cli.fi.tracer.image import Image, Location, Scope
 from mavfi_cli.fi.tracer.inject import clean_step, instruction_at
 from mavfi_cli.fi.tracer.tracee import DETOUR_COST, Tracee
 
@@ -321,3 +321,39 @@ def draw_fault(
             corruption=corruption,
         )
     raise FaultError("no executed instruction in scope has an operand that the fault model allows")
+
+
+def draw_fault_here(
+    tracee: Tracee,
+    image: Image,
+    scope: Scope,
+    plan: Strategy,
+    rng: np.random.Generator,
+    execution: int = 0,
+) -> tuple[InstructionFault | None, str]:
+    """Draw a fault in the instruction before which a thread has stopped.
+
+    Args:
+        execution: number of the execution for the record.
+
+    Returns:
+        The fault, or None and why there is none.
+    """
+    here = tracee.registers.ip
+    if tracee.registers.system_call is not None and not plan.in_system_calls:
+        return None, f"inside system call {tracee.registers.system_call}"
+    if here not in scope and not plan.whole_process:
+        return None, f"outside the scope, in {image.locate(here).object}"
+    instruction = instruction_at(tracee, here)
+    following = None if instruction is None else instruction_at(tracee, instruction.next_address)
+    corruption = None if instruction is None else plan.draw_at(instruction, rng, following)
+    if instruction is None or corruption is None:
+        return None, "no operand that the fault model allows"
+    fault = InstructionFault(
+        trigger=(CountedStop(image.locate(here), 1),),
+        execution=execution,
+        instruction=instruction.text,
+        instruction_bytes=instruction.raw,
+        corruption=corruption,
+    )
+    return fault, ""

@@ -46,6 +46,7 @@ _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP
 
 _TYPE_BREAKPOINT, _EXECUTE, _LENGTH, _CLOSE_ON_EXEC = 5, 4, 8, 8
 _DISABLED_AT_EXEC_END = 1 << 36 | 1 << 37  # remove_on_exec, sigtrap
+_IN_NEW_THREADS = 1 << 1 | 1 << 35  # inherit, inherit_thread
 _USER_ONLY = 1 << 5 | 1 << 6  # exclude_kernel, exclude_hv
 _ATTRIBUTES = struct.Struct("<IIQQQQQIIQQ56x")  # perf_event_attr, version 7: 128 bytes
 
@@ -67,9 +68,9 @@ class Mechanism(Enum):
         return cls.PERF if perf_allowed() is None else cls.DEBUG
 
 
-def _open_event(tid: int, address: int, period: int) -> int:
+def _open_event(tid: int, address: int, period: int, *, inherited: bool = False) -> int:
     linux.require_supported()
-    extra = _DISABLED_AT_EXEC_END if period else 0
+    extra = (_DISABLED_AT_EXEC_END if period else 0) | (_IN_NEW_THREADS if inherited else 0)
     attributes = _ATTRIBUTES.pack(
         _TYPE_BREAKPOINT, 128, 0, period, 0, 0, _USER_ONLY | extra, 0, _EXECUTE, address, _LENGTH,
     )  # fmt: skip
@@ -111,10 +112,13 @@ class ExecutionCounter:
 
     Args:
         stop_at: the thread traps before this execution; 0: never.
+        inherited: threads that it starts have a counter of their own.
     """
 
-    def __init__(self, tid: int, address: int, stop_at: int = 0) -> None:
-        self._fd = _open_event(tid, address, stop_at)
+    def __init__(
+        self, tid: int, address: int, stop_at: int = 0, *, inherited: bool = False
+    ) -> None:
+        self._fd = _open_event(tid, address, stop_at, inherited=inherited)
 
     def read(self) -> int:
         """Return the executions since the counter was opened, even after the thread has ended."""
@@ -134,7 +138,9 @@ def perf_allowed() -> str | None:
     return None
 
 
-_TRACER_TRAPS = frozenset((1, 2, 4, 6, 0x80))  # TRAP_BRKPT, _TRACE, _HWBKPT, _PERF, SI_KERNEL
+_TRAP_PERF = 6
+# TRAP_BRKPT, _TRACE, _HWBKPT, _PERF, SI_KERNEL
+_TRACER_TRAPS = frozenset((1, 2, 4, _TRAP_PERF, 0x80))
 _NOT_FROM_OTHERS = 0x2000_0000  # __WNOTHREAD: only tracees and children of this thread
 _ANY_CHILD = -1
 
@@ -146,7 +152,15 @@ def _signal_code(tid: int) -> int:
     return int(buffer[2])
 
 
-def _threads_of(pid: int) -> list[int]:
+def _signal_of(status: linux.Status) -> int:
+    """Return the signal that a stop delivers to its thread, which is none of the tracer's."""
+    if not status.stopped or status.event:
+        return 0
+    ours = status.signal == signal.SIGTRAP and _signal_code(status.tid) == _TRAP_PERF
+    return 0 if ours else status.signal
+
+
+def threads_of(pid: int) -> list[int]:
     """Return the thread ids of a process, ascending; empty when it has ended."""
     try:
         return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
@@ -188,12 +202,16 @@ class Tracee:
         self.registers, self.memory = Registers(self.tid), linux.Memory(self.pid)
 
     @classmethod
-    def attach(cls, pid: int, *, mechanism: Mechanism | None = None, alone: bool = False) -> Tracee:
-        """Attach to every thread of a running process and stop its main thread, the target.
+    def attach(
+        cls, pid: int, *, thread: int | None = None, mechanism: Mechanism | None = None,
+        alone: bool = False,
+    ) -> Tracee:  # fmt: skip
+        """Attach to every thread of a running process and stop one of them, the target.
 
         The attaching thread must have no other children that other code waits for.
 
         Args:
+            thread: the target; None for the main thread.
             mechanism: how executions are counted; by default the best that is allowed.
             alone: the process has one thread, and the attaching thread may trace others.
 
@@ -202,16 +220,17 @@ class Tracee:
             TargetError: no such process.
         """
         seized: set[int] = set()
-        while missing := [t for t in _threads_of(pid) if t not in seized]:
-            for thread in missing:
+        while missing := [t for t in threads_of(pid) if t not in seized]:
+            for each in missing:
                 # It may have ended between the listing and the attach.
                 with contextlib.suppress(ProcessLookupError):
-                    linux.seize(thread, kill_with_tracer=True)
-                seized.add(thread)
+                    linux.seize(each, kill_with_tracer=True)
+                seized.add(each)
         if not seized:
             raise TargetError(f"process {pid}", "does not exist")
         group = pid if alone else _ANY_CHILD
-        tracee = cls(pid, pid, group, mechanism or Mechanism.best())
+        target = pid if thread is None or thread not in seized else thread
+        tracee = cls(pid, target, group, mechanism or Mechanism.best())
         tracee.interrupt()
         return tracee
 
@@ -264,6 +283,49 @@ class Tracee:
                 left -= self.registers.ip == address
             return True
 
+    def run_any_to(self, address: int) -> bool:
+        """Run until any thread is about to execute `address`. This thread becomes the target.
+
+        Without `PERF` only the target thread is awaited.
+
+        Returns:
+            False if the process ended first.
+        """
+        if self.registers.ip == address:
+            return True
+        with contextlib.ExitStack() as counters:
+            for thread in threads_of(self.pid):
+                try:
+                    counter = ExecutionCounter(thread, address, 1, inherited=True)
+                except OSError:  # not allowed, or the thread has ended
+                    continue
+                counters.callback(counter.close)
+            if self.mechanism is Mechanism.DEBUG:
+                return self.run_to(address)
+            self.registers.forget()
+            with contextlib.suppress(ProcessLookupError):
+                linux.request(linux.CONT, self.tid, 0, self._take_signal())
+            while self.ended is None:
+                status = self._wait()
+                if status.ended:
+                    self._note_end(status)
+                elif status.trapped and (here := Registers(status.tid)).ip == address:
+                    self.tid, self.registers = status.tid, here
+                    return True
+                else:
+                    self._continue(status, linux.CONT)
+            return False
+
+    def run_for(self, duration_s: float) -> Ended | None:
+        """Let the stopped target run for a wall-clock time, and stop it wherever it is."""
+        self.registers.forget()
+        with contextlib.suppress(ProcessLookupError):  # killed at a stop: its end is reported next
+            linux.request(linux.CONT, self.tid, 0, self._take_signal())
+        time.sleep(duration_s)
+        with contextlib.suppress(ProcessLookupError):
+            self.interrupt()
+        return self.ended
+
     def count_to_end(self, address: int) -> int:
         """Run to the end of the program and count the executions of `address` on the way."""
         self.registers.rearm()
@@ -290,10 +352,7 @@ class Tracee:
     def await_call(self) -> None:
         """Let the stopped process run until it waits in a system call, and stop it there."""
         while self.registers.system_call is None:
-            self.registers.forget()
-            linux.request(linux.CONT, self.tid)
-            time.sleep(_LOOK_S)
-            self.interrupt()
+            self.run_for(_LOOK_S)
 
     def fork(self) -> Tracee:
         """Fork the stopped process, which must have been attached to `alone`.
@@ -358,7 +417,7 @@ class Tracee:
     def detach(self) -> None:
         """Let the process continue without a tracer; the target thread must be stopped."""
         self.memory.close()
-        for thread in _threads_of(self.pid):
+        for thread in threads_of(self.pid):
             if thread != self.tid:
                 self._detach_running(thread)
         linux.request(linux.DETACH, self.tid, 0, self._take_signal())
@@ -467,7 +526,7 @@ class Tracee:
         if status.event == linux.EVENT_STOP and status.signal != signal.SIGTRAP:
             how, number = linux.LISTEN, 0  # group-stop: stay stopped until SIGCONT
         else:
-            number = status.signal if status.event == 0 else 0
+            number = _signal_of(status)
         if number:
             self.signals.append(number)
         # If it was killed meanwhile, its end is reported next.
@@ -478,7 +537,7 @@ class Tracee:
         with contextlib.suppress(ProcessLookupError, ChildProcessError):
             linux.request(linux.INTERRUPT, thread)
             status = linux.wait(thread)
-            number = status.signal if status.stopped and status.event == 0 else 0
+            number = _signal_of(status)
             linux.request(linux.DETACH, thread, 0, number)
 
     # -- counted stops

@@ -16,18 +16,17 @@ import contextlib
 import pickle
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from mavfi_cli.attack.attacker import LiveAttack, attack_live
 from mavfi_cli.attack.kernels.scope import KernelScope, kernel_of_node
+from mavfi_cli.attack.live import LiveAttack, attack_live, mission_strategy
 from mavfi_cli.attack.profile import TargetProfile
 from mavfi_cli.attack.served import ServedProcess
-from mavfi_cli.attack.strategy import mission_strategy
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.autonomy.collision import CollisionInputs
 from mavfi_cli.autonomy.occupancy import MapSnapshot
@@ -43,7 +42,6 @@ from mavfi_cli.core.files import (
     read_bounded,
     write_atomically,
 )
-from mavfi_cli.core.flight_record import SCHEMA
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import KERNELS, Briefing, DepthFrame, PointCloud
 from mavfi_cli.fi.tracer import record
@@ -233,7 +231,7 @@ class _GoldenNode:
             "windows": profile.windows,
             "profiled_instructions": profile.executed,
             "seed": request.seed,
-            "request": asdict(request),
+            "request": request.as_dict(),
         }
         return replace(fault, corruption=None) if request.null else fault, context
 
@@ -482,12 +480,12 @@ class InstructionInjection(NoInjection):
             return []
         self._reported = True
         done = self._tracer.result()
-        return [] if self._fault.corruption is None else [_attack_text(done.record)]
+        return [] if self._fault.corruption is None else [record.describe(done.record)]
 
     def finish(self) -> dict[str, Any]:
         """Return the record at the end of the mission, which is the same in every repetition."""
         assert self._tracer is not None
-        return _repeatable(self._tracer.result().record)
+        return record.repeatable(self._tracer.result().record)
 
     def close(self) -> None:
         """End the node's process if no executor owns it."""
@@ -500,7 +498,7 @@ class StruckInjection(StruckNode):
 
     def __init__(self, struck: Struck, node: str, order: int) -> None:
         written = self._written = struck.record
-        text = "" if written["corruption"] is None else _attack_text(written)
+        text = "" if written["corruption"] is None else record.describe(written)
         lost = None if struck.loss is None else LostNode(struck.loss)
         super().__init__(node, order, struck.effect.value, lost, text)
 
@@ -510,28 +508,4 @@ class StruckInjection(StruckNode):
 
     def finish(self) -> dict[str, Any]:
         """Return the record, as `InstructionInjection` does."""
-        return _repeatable(self._written)
-
-
-def _repeatable(written: FaultRecord) -> dict[str, Any]:
-    """Return a completed record without measured times."""
-    injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
-    reason = written.get("not_injected_reason", "")
-    state = "applied" if injection["applied"] else "not_injected"
-    if written["corruption"] is None and not reason:
-        state = "null"
-    ending = {"schema": SCHEMA, "state": state, "reason": reason, "injection": injection}
-    return {**written, **ending}
-
-
-def _attack_text(written: FaultRecord) -> str:
-    place = written["symbol"] or f"{written['object']}+{written['offset']:#x}"
-    where = f"{written['kernel']}, {written['instruction']} at {place}"
-    if not written["injection"]["applied"]:
-        return f"fault in {where}: not injected ({written.get('not_injected_reason', '')})"
-    corruption = written["corruption"]
-    assert corruption is not None
-    bits = ", ".join(map(str, corruption["bits"]))
-    what = corruption["register"] or corruption["site"]
-    activation = written["activation"]["activation"].replace("_", " ")
-    return f"fault in {where}: bit {bits} of {corruption['role']} {what}, {activation}"
+        return record.repeatable(self._written)

@@ -1,0 +1,290 @@
+"""Applies one fault in a process that keeps running: a node of a mission, or a user's program.
+
+Call it in a thread of its own, because ptrace obeys only the thread that attached.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavfi_cli.attack.tracer_thread import Notice
+from mavfi_cli.core.errors import FaultSpecError
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
+from mavfi_cli.fi.tracer.image import Image, Regions, Scope
+from mavfi_cli.fi.tracer.inject import (
+    NOTHING,
+    Followed,
+    Injection,
+    clean_step,
+    instruction_at,
+    reach,
+    strike,
+)
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.fi.tracer.sampling import draw_fault_here
+from mavfi_cli.fi.tracer.tracee import Ended, Tracee, threads_of
+from mavfi_cli.spec.fault import UNIFORM, InstructionConfig
+
+MOST_STEPS = 1000  # executed instructions between a moment and the fault
+_WINDOW = 64  # instructions for which a fault is followed
+_LOOK_S, _SEARCH_S = 1e-3, 10.0  # time between two looks for code in scope, and of all looks
+
+
+def mission_strategy(fault: InstructionConfig) -> Strategy:
+    """Return the strategy that draws the fault.
+
+    Raises:
+        UnknownName: A name does not exist.
+        FaultSpecError: The rule is not repeatable, or conflicts with the fault model.
+    """
+    model = FaultModel.named(
+        sites=fault.sites, roles=fault.roles, field=fault.field, bits=fault.bits
+    )
+    strategy = Strategy.of(fault.sampling, model, compat=fault.compat)
+    if fault.compat is None and strategy.rule is not Rule.INSTRUCTION:
+        raise FaultSpecError(
+            f"sampling by {fault.sampling} cannot be repeated; a mission's sampling must be "
+            f"{UNIFORM} (`mavfi kernels` accepts both)"
+        )
+    return strategy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveAttack:
+    """The result of a fault in a process that other code runs."""
+
+    injection: Injection | None  # None: the trigger was not reached, or null injection
+    followed: Followed
+    reason: str
+    ended: Ended | None  # None: the process lives on, detached
+    record: FaultRecord
+
+
+def attack_live(
+    pid: int,
+    fault: InstructionFault,
+    *,
+    path: Path,
+    regions: Regions | None = None,
+    window: int = _WINDOW,
+    armed: Notice = lambda: None,
+    reached: Notice = lambda: None,
+    leave_stopped: bool = False,
+    **context: Any,
+) -> LiveAttack:
+    """Apply one fault in a running process, such as a node of a mission, and let it continue.
+
+    The record is written to disk before the process runs to the trigger. The process must be a
+    child of the calling one or allow tracing (`PR_SET_PTRACER`). If it dies while it is attached,
+    the kernel notifies the tracer first: read its exit status from the result, not from
+    `Popen.wait`.
+
+    Args:
+        window: number of instructions for which a destination fault is followed.
+        armed: called once the process runs towards the trigger.
+        reached: called when the process has stopped at the trigger.
+        leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
+        context: further entries of the record: kernel, stage, sampling rule, seed, scope.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        FaultError: the location holds another instruction.
+    """
+    tracee = Tracee.attach(pid)
+    try:
+        image = Image(pid, regions)
+        planned = record.planned(fault, image, **context)
+        record.write(path, planned)
+        armed()
+        reason = reach(tracee, image, fault)
+        injection, followed = None, NOTHING
+        if not reason:
+            reached()
+            injection, followed = strike(tracee, fault, window=window)
+            reason = "" if injection is None else injection.reason
+            if leave_stopped and tracee.ended is None:
+                os.kill(pid, signal.SIGSTOP)
+    finally:
+        if tracee.ended is None:
+            tracee.detach()
+    done = record.completed(planned, injection, followed, not_injected_reason=reason)
+    record.write(path, done)
+    return LiveAttack(
+        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
+    )
+
+
+def attack_moment(
+    pid: int,
+    plan: Strategy,
+    rng: np.random.Generator,
+    *,
+    path: Path,
+    objects: tuple[str, ...] = (),
+    function: str | None = None,
+    null: bool = False,
+    repeat: FaultRecord | None = None,
+    **context: Any,
+) -> LiveAttack:
+    """Apply one fault in a process at this moment or soon after it, and let it continue.
+
+    A thread is drawn by the CPU time that it has used so far, and stopped. By the rule
+    `INSTRUCTION` it is stepped, and the fault strikes execution k of the instructions in scope; k
+    is drawn uniformly from 1 to `MOST_STEPS`. By a rule of time the fault strikes where the thread
+    is, or where a later look finds it in scope. The process runs by the wall clock, so neither
+    repeats.
+
+    Args:
+        objects: shared objects or executables in scope; empty for all files of the process,
+            without the interpreter of a Python program.
+        function: only code that executes during calls of this function is in scope. The first
+            thread that calls it is struck.
+        null: leave out the flip.
+        repeat: the record of a fault, whose instruction is struck again: its first execution in
+            any thread.
+        context: further entries of the record.
+
+    Raises:
+        TracingForbidden: the operating system refuses.
+        TargetError: no such process.
+        UnknownName: the process has no such object or function.
+        BuildMismatch: the record comes from another build.
+    """
+    image = Image(pid)  # takes long, so the process still runs
+    scope = image.scope(objects or _own_objects(pid, image))
+    entry = None if function is None else image.address(image.function(function, scope.objects))
+    if repeat is not None:
+        record.require_same_build(repeat, image)
+    planned, injection, followed = record.undrawn(**context), None, NOTHING
+    record.write(path, planned)
+    tracee = Tracee.attach(pid, thread=_drawn_thread(pid, rng))
+    begun_s = time.perf_counter()
+    try:
+        fault: InstructionFault | None
+        if repeat is None:
+            fault, reason = _Search(tracee, image, scope, entry, plan, rng).fault()
+        else:
+            fault, reason = record.fault_of(repeat), ""
+            if not tracee.run_any_to(image.address(fault.target)):
+                fault, reason = None, "the program ended before the instruction"
+        if fault is not None:
+            fault = replace(fault, corruption=None) if null else fault
+            planned = record.planned(fault, image, **context)
+            record.write(path, planned)
+            injection, followed = strike(tracee, fault, window=_WINDOW)
+            reason = "" if injection is None else injection.reason
+    finally:
+        thread = _thread_name(tracee.tid)
+        if tracee.ended is None:
+            tracee.detach()
+    done = record.completed(
+        planned, injection, followed, not_injected_reason=reason, thread=thread,
+        traced_s=round(time.perf_counter() - begun_s, 6),
+    )  # fmt: skip
+    record.write(path, done)
+    return LiveAttack(
+        injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done
+    )
+
+
+def _own_objects(pid: int, image: Image) -> list[str]:
+    """Return the objects of a process, without the interpreter if it is a Python program."""
+    program = Path(os.readlink(f"/proc/{pid}/exe")).name
+    left_out = ("python", "libpython") if program.startswith("python") else ()
+    names = (name for name in image.names if not name.startswith(left_out))
+    return [name for name in names if image.find(name) is not None]
+
+
+def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
+    """Draw a thread by the CPU time that it has used, proc_pid_schedstat(5)."""
+    threads = threads_of(pid)
+    if not threads:
+        return pid
+    used = np.array([_cpu_ns(pid, thread) for thread in threads], float) + 1.0
+    return int(threads[int(rng.choice(len(threads), p=used / used.sum()))])
+
+
+def _cpu_ns(pid: int, thread: int) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/task/{thread}/schedstat").read_text().split()[0])
+    except (OSError, ValueError, IndexError):  # it has ended, or the kernel does not tell
+        return 0
+
+
+def _thread_name(tid: int) -> str:
+    try:
+        return Path(f"/proc/{tid}/comm").read_text(errors="replace").strip()
+    except OSError:  # it has ended
+        return ""
+
+
+@dataclass(slots=True)
+class _Search:
+    """Steps a stopped thread to a drawn execution of the code in scope."""
+
+    tracee: Tracee
+    image: Image
+    scope: Scope
+    entry: int | None  # of the function in whose calls the code is in scope
+    plan: Strategy
+    rng: np.random.Generator
+    _caller: int = -1  # stack pointer at the function's entry; a higher one is its caller's
+
+    def fault(self) -> tuple[InstructionFault | None, str]:
+        """Return the fault before which the thread has stopped, or None and why there is none."""
+        by_steps = self.plan.rule is Rule.INSTRUCTION
+        drawn = int(self.rng.integers(MOST_STEPS)) + 1 if by_steps else 0
+        reason, count = "it executed no code in scope", 0
+        until_s = time.monotonic() + _SEARCH_S
+        while self.tracee.ended is None and time.monotonic() < until_s:
+            if by_steps and not self._enter():
+                continue
+            count += 1
+            if count >= drawn:
+                number = count if by_steps else 0
+                fault, reason = draw_fault_here(
+                    self.tracee, self.image, self.scope, self.plan, self.rng, number
+                )
+                if fault is not None:
+                    return fault, ""
+            if by_steps:
+                self._step()
+            else:
+                self.tracee.run_for(self.plan.retry_s or _LOOK_S)
+        return None, "the process ended" if self.tracee.ended is not None else reason
+
+    def _enter(self) -> bool:
+        """Let the thread run towards code in scope. Return True once it is there."""
+        registers, back = self.tracee.registers, self._return_address()
+        inside = registers.ip in self.scope
+        if self.entry is not None and registers.sp > self._caller:
+            self.tracee.run_any_to(self.entry)
+            self._caller = self.tracee.registers.sp if self.tracee.ended is None else 0
+            return self.tracee.ended is None
+        if inside:
+            return True
+        if back in self.scope:  # called from the scope
+            self.tracee.run_to(back)
+        elif self.entry is not None:
+            self._step()
+        else:
+            self.tracee.run_for(_LOOK_S)
+        return False
+
+    def _return_address(self) -> int:
+        """Return the word on top of the stack."""
+        try:
+            return int.from_bytes(self.tracee.memory.read(self.tracee.registers.sp, 8), "little")
+        except OSError:
+            return 0
+
+    def _step(self) -> None:
+        clean_step(self.tracee, instruction_at(self.tracee, self.tracee.registers.ip))

@@ -1,0 +1,128 @@
+"""A fault in an instruction of a process of a user's companion."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mavfi_cli.attack.live import LiveAttack, attack_moment, mission_strategy
+from mavfi_cli.attack.tracer_thread import TracerThread
+from mavfi_cli.companion.injection import Killer
+from mavfi_cli.core.errors import MavfiError
+from mavfi_cli.core.flight_record import Strike
+from mavfi_cli.core.seeds import Stream
+from mavfi_cli.fi.injector import Moment
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.inject import NOTHING
+from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.mission.companion_faults import CompanionFault
+from mavfi_cli.spec.fault import InstructionConfig
+
+
+class ProcessInjection(CompanionFault):
+    """Strikes an instruction of a running program once. A tracer thread does the work.
+
+    Args:
+        request: The fault.
+        programs: The companion's programs by name.
+        repeat: Record of a fault whose instruction is struck again.
+
+    Raises:
+        UnknownName: The companion has no such program.
+        FaultError: Values of the fault contradict each other.
+    """
+
+    def __init__(
+        self, request: InstructionConfig, programs: Mapping[str, Any], repeat: FaultRecord | None
+    ) -> None:
+        super().__init__()
+        request.check_program(programs)
+        self._request, self._strategy, self._repeat = request, mission_strategy(request), repeat
+        self._path: Path | None = None
+        self._tracer: TracerThread[LiveAttack] | None = None
+        self._context: dict[str, Any] = {}
+        self._problem = ""
+        self._reported = False
+
+    def aim_at(self, shortest_flight_s: float) -> None:
+        """See `CompanionFault`."""
+        self._moment = Killer(self._request.moment(), shortest_flight_s, self._on_strike)
+        self.injector = self._moment
+
+    def begin(self, path: Path) -> None:
+        """Write the planned fault."""
+        self._path = path
+        self._context = {
+            "node": self._request.program,
+            "kernel": self._request.executable or self._request.program,
+            "sampling": self._strategy.name,
+            "seed": self._request.seed,
+            "request": self._request.as_dict(),
+            "scope": list(self._request.objects),
+        }
+        record.write(path, record.undrawn(**self._context))
+
+    def tick(self, moment: Moment) -> None:
+        """See `CompanionFault`."""
+        self.injector.strike(moment)
+
+    def _on_strike(self, strike: Strike) -> None:
+        program, path, request = self.running.get(self._request.program), self._path, self._request
+        assert path is not None
+        self._context["stamp_s"] = round(strike.stamp_s, 9)
+        pid = None if program is None else _process_of(program.pid, request.executable)
+        if pid is None:
+            wanted = request.executable or request.program
+            self._problem = f"no process of {wanted} ran at the moment of the fault"
+            return
+        rng = Stream.FAULT.generator(request.seed, "instruction")
+        self._tracer = TracerThread(
+            lambda _armed: attack_moment(
+                pid, self._strategy, rng, path=path, objects=request.objects,
+                function=request.function, null=request.null, repeat=self._repeat, **self._context,
+            )
+        )  # fmt: skip
+
+    def news(self) -> list[str]:
+        """Describe the fault once it has struck."""
+        if self._reported or self._tracer is None or not self._tracer.done:
+            return []
+        self._reported = True
+        return [record.describe(self._written())]
+
+    def finish(self) -> dict[str, Any]:
+        """Return the record. The programs must have ended."""
+        return record.repeatable(self._written())
+
+    def _written(self) -> FaultRecord:
+        reason = self._problem or self._moment.missed
+        if self._tracer is not None:
+            try:
+                return self._tracer.result().record
+            except MavfiError as error:
+                reason = str(error)
+        undrawn = record.undrawn(**self._context)
+        nothing = record.completed(undrawn, None, NOTHING, not_injected_reason=reason)
+        assert self._path is not None
+        record.write(self._path, nothing)
+        return nothing
+
+
+def _process_of(leader: int | None, executable: str | None) -> int | None:
+    """Return the first process of a program's session that runs an executable; None without one.
+
+    Args:
+        leader: The program's own process, which leads the session.
+        executable: File name of the executable; None for the leader.
+    """
+    if leader is None or executable is None:
+        return leader
+    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):
+        with contextlib.suppress(OSError):  # it has ended, or is another user's
+            own = os.getsid(pid) == leader
+            if own and Path(os.readlink(f"/proc/{pid}/exe")).name == executable:
+                return pid
+    return None

@@ -1,0 +1,93 @@
+"""Faults at a moment, in a process with several threads that runs by the wall clock."""
+
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_processes import LONG_S
+
+from mavfi_cli.attack.live import attack_moment
+from mavfi_cli.attack.tracer_thread import TracerThread
+from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer.fault import Strategy
+
+UNIFORM = Strategy.of("instruction-uniform")
+
+
+@pytest.fixture
+def workers(native_program):
+    """A program whose three threads call `work` again and again; it prints its calls when asked."""
+    with subprocess.Popen(
+        [native_program("workers")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+        process.kill()
+
+
+def strike(process, tmp_path, plan=UNIFORM, seed=1, **settings):
+    path = tmp_path / "fault.json"
+    rng = np.random.default_rng(seed)
+    tracer = TracerThread(
+        lambda _: attack_moment(process.pid, plan, rng, path=path, kernel="workers", **settings)
+    )
+    done = tracer.result().record
+    assert record.read(path) == done
+    return done
+
+
+def calls(process):
+    process.stdin.write("?\n")
+    process.stdin.flush()
+    return int(process.stdout.readline())
+
+
+def test_any_thread_that_calls_the_function_is_struck_and_all_go_on(workers, tmp_path):
+    scope = {"objects": ("workers",), "function": "work"}
+    places = set()
+    for seed in range(8):
+        done = strike(workers, tmp_path, seed=seed, null=True, **scope)
+        assert done["not_injected_reason"] == ""
+        assert done["symbol"].startswith("work+")
+        places.add((done["offset"], done["k"]))
+    assert len(places) > 4
+    before = calls(workers)
+    time.sleep(0.05)
+    assert calls(workers) > before
+    assert workers.poll() is None
+
+
+def test_a_recorded_instruction_is_struck_again(workers, tmp_path):
+    first = strike(workers, tmp_path, objects=("workers",), null=True, seed=3)
+    drawn = strike(workers, tmp_path, objects=("workers",), seed=3, repeat=first)
+    assert drawn["offset"] == first["offset"]
+    assert (drawn["object"], drawn["instruction"]) == ("workers", first["instruction"])
+
+
+def test_a_rule_of_time_strikes_where_the_thread_is(workers, tmp_path):
+    done = strike(workers, tmp_path, plan=Strategy.of("", compat="rosfi-2021"), seed=2)
+    assert done["injection"]["applied"]
+    assert done["k"] == 0
+    assert set(done["corruption"]["bits"]) <= set(range(8))
+
+
+def test_what_cannot_be_struck(workers, tmp_path):
+    with pytest.raises(UnknownName, match="did you mean 'workers'"):
+        strike(workers, tmp_path, objects=("worker",))
+    with pytest.raises(UnknownName, match="wrok"):
+        strike(workers, tmp_path, objects=("workers",), function="wrok")
+    tracer = TracerThread(
+        lambda _: attack_moment(
+            workers.pid, UNIFORM, np.random.default_rng(0), path=tmp_path / "fault.json",
+            objects=("workers",), function="never",
+        )
+    )  # fmt: skip
+    until_s = time.monotonic() + LONG_S
+    status = Path(f"/proc/{workers.pid}/status")
+    while "TracerPid:\t0" in status.read_text() and time.monotonic() < until_s:
+        pass
+    workers.kill()
+    assert tracer.result().record["not_injected_reason"] == "the process ended"
