@@ -197,7 +197,7 @@ def test_the_camera_signs_for_its_client(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of_signers", [False, True])
-def test_a_flood_neither_stops_nor_swells_nor_moves_it(of_signers):
-    report = flood(100_000, signed=of_signers)
+@pytest.mark.parametrize(("frames", "of_signers"), [(100_000, False), (30_000, True)])
+def test_a_flood_neither_stops_nor_swells_nor_moves_it(frames, of_signers):
+    report = flood(frames, signed=of_signers)
     assert report.problems(signed=of_signers) == []
