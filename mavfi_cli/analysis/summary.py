@@ -22,7 +22,7 @@ from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
-from mavfi_cli.stats.shares import Interval, Share
+from mavfi_cli.stats.shares import Interval, Share, design_effect, wilson
 from mavfi_cli.stats.strata import weighted_share
 
 METRICS = ("flight_time_s", "distance_m", "energy_regression_j", "replans")
@@ -146,8 +146,8 @@ class Group:
         lacked: grouping labels that these missions lack.
         planned, errors: number of missions on the list, and of those that could not begin.
         watched: whether a detector watches all of them.
-        flights: the flown missions, in the order of the list: `number`, `outcome`, `injected`,
-            METRICS, `stratum`, `weight`, `pair` and `strike`. Golden, faulty and
+        flights: the flown missions, in the order of the list: `number`, `cell`, `outcome`,
+            `injected`, METRICS, `stratum`, `weight`, `pair` and `strike`. Golden, faulty and
             protected flights of a mission share the code `pair`. Labels that differ only in
             TREATMENT share the code `strike`, which stands for the fault.
     """
@@ -216,8 +216,22 @@ class Group:
         """The weight of each mission, (n,); None in a uniform sample."""
         return numbers(self.flights, WEIGHT) if self.stratified else None
 
+    @cached_property
+    def clusters(self) -> IntArray | None:
+        """The cluster of each mission, (n,), if several faults of a uniform sample strike one pair.
+
+        They strike the same invocation of a node, so that their effects are alike.
+        """
+        places = np.column_stack([self.codes("cell"), self.codes("pair")])
+        alone = self.golden or self.stratified or len(np.unique(places, axis=0)) == len(places)
+        return None if alone else self.codes("pair")
+
     def share(self, hits: BoolArray, chosen: BoolArray, confidence: float = 0.95) -> Share:
-        """The share of hits among chosen missions, both (n,), by weight."""
+        """The share of hits among chosen missions, both (n,), by weight and by cluster."""
+        if self.clusters is not None:
+            own, places = hits[chosen].tolist(), self.clusters[chosen].tolist()
+            effect = design_effect(own, [("", place) for place in places])
+            return wilson(sum(own), len(own), design_effect=effect, confidence=confidence)
         weights = np.ones(len(hits)) if self.weights is None else self.weights
         return weighted_share(
             hits.tolist(),
@@ -236,7 +250,8 @@ class Group:
         values = self.metrics[metric]
         there = self.succeeded & self.counted & ~np.isnan(values)
         weights = None if self.weights is None else self.weights[there]
-        return _interval(values[there], confidence, weights)
+        clusters = None if self.clusters is None else self.clusters[there]
+        return _interval(values[there], confidence, weights, clusters)
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
         """Row indices of the counted missions with equal pairs, in this and the other, (m,) each.
@@ -340,6 +355,11 @@ class _Match:
         return self.first.succeeded[self.at_first], self.second.succeeded[self.at_second]
 
     @property
+    def clusters(self) -> IntArray | None:
+        """The cluster of each pair, (m,), as for `Group`."""
+        return None if self.second.clusters is None else self.second.clusters[self.at_second]
+
+    @property
     def weights(self) -> FloatArray | None:
         """The weight of each pair, (m,): that of its fault; None in a uniform sample."""
         return None if self.second.weights is None else self.second.weights[self.at_second]
@@ -351,7 +371,8 @@ class _Match:
         change = change - self.first.metrics[metric][self.at_first]
         there = first & second & ~np.isnan(change)
         weights = None if self.weights is None else self.weights[there]
-        return _interval(change[there], confidence, weights)
+        clusters = None if self.clusters is None else self.clusters[there]
+        return _interval(change[there], confidence, weights, clusters)
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
         """Worst cases relative to each pair's own golden flight, and to the mean of these.
@@ -433,7 +454,10 @@ def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
 
 def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     matches = [match for match in matches if len(match.at_second)]
-    tests = [McNemar.of(*match.success, weights=match.weights) for match in matches]
+    tests = [
+        McNemar.of(*match.success, weights=match.weights, clusters=match.clusters)
+        for match in matches
+    ]
     corrected = holm([test.p_value for test in tests])
     rows = []
     for match, test, p_value in zip(matches, tests, corrected, strict=True):
@@ -453,7 +477,16 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     return rows
 
 
-def _interval(values: FloatArray, confidence: float, weights: FloatArray | None) -> Interval:
+def _interval(
+    values: FloatArray,
+    confidence: float,
+    weights: FloatArray | None,
+    clusters: IntArray | None,
+) -> Interval:
+    """Return the mean. With clusters it is that of their means, which are independent."""
+    if clusters is not None and len(values):
+        _, which = np.unique(clusters, return_inverse=True)
+        values = np.bincount(which, values) / np.bincount(which)
     return interval(values, confidence=confidence, resamples=TABLE_RESAMPLES, weights=weights)
 
 

@@ -102,7 +102,8 @@ def kind_of(changes: Changes, apart: Collection[str]) -> str:
     kind = {name: value for name, value in changes.items() if name not in apart}
     for name in ("fault", "instruction"):
         if kind.get(name) is not None:
-            kind[name] = {**kind[name], "seed": 0}
+            own = {key: value for key, value in kind[name].items() if key != "invocation_seed"}
+            kind[name] = {**own, "seed": 0}
     return canonical(kind)
 
 

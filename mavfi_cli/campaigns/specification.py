@@ -28,6 +28,7 @@ Factors = Mapping[str, Any]  # values of factors by name, as TOML holds them
 
 # Level at which faults strike -> the field of the mission, and its record.
 _LEVELS = {"source": ("fault", FaultConfig), "instruction": ("instruction", InstructionConfig)}
+_SEEDED = {"seed": (*_LEVELS,), "invocation_seed": ("instruction",)}
 # Other names in a specification for a field of either level's fault.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
@@ -40,17 +41,17 @@ _DETECTOR = {"detector": "name"} | {
     member.name: member.name for member in fields(DetectorConfig) if member.name != "name"
 }
 _FAULT = {
-    level: tuple(member.name for member in fields(record) if member.name != "seed")
+    level: tuple(member.name for member in fields(record) if member.name not in _SEEDED)
     for level, (_, record) in _LEVELS.items()
 }
 _OF_FAULTS = dict.fromkeys((*_ALIASES, "level", *_FAULT["source"], *_FAULT["instruction"]))
 NAMES = (*MISSION, *_DETECTOR, *(name for name in _OF_FAULTS if name != "target"))
 
 
-def _mission_of(values: Factors, seed: int, fault_seed: int) -> MissionConfig:
+def _mission_of(values: Factors, seed: int, fault_seeds: Mapping[str, int]) -> MissionConfig:
     mission = {name: values[name] for name in MISSION if name in values}
     mission["seed"] = values.get("seed", seed)
-    mission |= _fault(values, fault_seed)
+    mission |= _fault(values, fault_seeds)
     detector = {_DETECTOR[name]: value for name, value in values.items() if name in _DETECTOR}
     if detector and "name" not in detector:
         raise ConfigError(f"{', '.join(sorted(detector))}: requires a detector")
@@ -59,7 +60,7 @@ def _mission_of(values: Factors, seed: int, fault_seed: int) -> MissionConfig:
     return structure(mission, MissionConfig)
 
 
-def _fault(values: Factors, seed: int) -> Factors:
+def _fault(values: Factors, seeds: Mapping[str, int]) -> Factors:
     """Return the field `fault` or `instruction` of a mission; empty without a fault."""
     given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
     level = given.pop("level", "source")
@@ -75,7 +76,8 @@ def _fault(values: Factors, seed: int) -> Factors:
             hint = f"; did you mean {match!r}?" if match else ""
             raise ConfigError(f"is not a factor of faults at {level} level{hint}", key=name)
     if targets:
-        return {_LEVELS[level][0]: {**fault, "seed": seed}}
+        drawn = {name: seed for name, seed in seeds.items() if level in _SEEDED[name]}
+        return {_LEVELS[level][0]: {**fault, **drawn}}
     if given or "level" in values:
         named = sorted({*given, *({"level"} & set(values))})
         raise ConfigError(f"{', '.join(named)}: requires a stage or a site")
@@ -174,7 +176,7 @@ class FixedWorld:
 Axes = Mapping[str, tuple[Any, ...]]
 MOST = 1_000_000  # missions of one campaign
 # Factors whose value is a list already: a list of lists crosses several.
-LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles")
+LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles", "objects")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,6 +222,9 @@ class Spec:
         seed: root of the seeds of all faults.
         first_seed: first seed of the missions; repetition r flies with first_seed + r.
         repetitions: missions for each combination of factors.
+        faults_per_invocation: number of faults at instruction level that strike the same
+            invocation of a node, in consecutive repetitions with one seed. Missions without such
+            a fault are flown once for each seed.
         fixed: factors that all missions share.
         axes: crossed factors with their values.
         settings: groups of missions, crossed with `axes`.
@@ -232,6 +237,7 @@ class Spec:
     seed: int = 1
     first_seed: int = 1
     repetitions: int = 1
+    faults_per_invocation: int = 1
     keep: Keep = Keep.FAILURES  # run folders to keep: none, failures, sampled or all
     sampling: Sampling = Sampling.UNIFORM  # how faults are drawn: uniform or stratified
     fixed: Factors = field(default_factory=dict)
@@ -241,9 +247,17 @@ class Spec:
     fixed_world: FixedWorld | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("seed", 0), ("first_seed", 0), ("repetitions", 1)):
+        least_values = {"seed": 0, "first_seed": 0, "repetitions": 1, "faults_per_invocation": 1}
+        for name, least in least_values.items():
             if (value := getattr(self, name)) < least:
                 raise ValueError(f"{name}: must be at least {least}, got {value}")
+        if self.faults_per_invocation > 1 and (
+            self.stop is not None or self.sampling is not Sampling.UNIFORM
+        ):
+            raise ValueError(
+                "faults_per_invocation: must be 1 with a stop rule or stratified sampling, which "
+                f"count missions as independent, got {self.faults_per_invocation}"
+            )
 
     def scaled(self, scale: float) -> Spec:
         """Return the same campaign with a fraction of its repetitions, but at least one.
@@ -276,6 +290,9 @@ class Spec:
             for repetition in range(max(count for *_, count in points))
             for values, labels, count in points
             if repetition < count
+            and (
+                repetition % self.faults_per_invocation == 0 or values.get("level") == "instruction"
+            )
         ]
 
     def kinds(self) -> list[PlannedMission]:
@@ -318,13 +335,17 @@ class Spec:
         return points
 
     def _mission(self, values: Factors, labels: Labels, repetition: int) -> PlannedMission:
-        seed = values.get("seed", self.first_seed + repetition)
+        several = self.faults_per_invocation
+        seed = values.get("seed", self.first_seed + repetition // several)
         # The target is part of it, or the faults of all states would share one draw. Nothing else
         # is: the same target gets the same fault under every detector and platform.
         target = next((str(values[name]) for name in _ALIASES if name in values), "")
-        drawn = ("campaign", seed, repetition, target)
+        seeds = {"seed": Stream.FAULT.seed(self.seed, "campaign", seed, repetition, target)}
+        if several > 1:
+            place = ("invocation", seed, repetition // several, target)
+            seeds["invocation_seed"] = Stream.FAULT.seed(self.seed, *place)
         with naming(labels):
-            config = _mission_of(values, seed, Stream.FAULT.seed(self.seed, *drawn))
+            config = _mission_of(values, seed, seeds)
             if self.fixed_world is not None and config.world_seed is None:
                 config = replace(config, world_seed=self.fixed_world.world_seed.get(config.world))
             return PlannedMission(config=config, labels=labels)
@@ -360,6 +381,7 @@ class Spec:
         return {
             **choices,
             repetitions: [self.repetitions],
+            "faults per invocation": [self.faults_per_invocation],
             "first seed": [self.first_seed],
             "fault seed": [self.seed],
             "settings": [setting.name for setting in self.settings],
@@ -393,6 +415,8 @@ class Spec:
         }
         plain = {name: getattr(self, name) for name in names}
         plain["keep"] = self.keep.value
+        if self.faults_per_invocation > 1:
+            plain["faults_per_invocation"] = self.faults_per_invocation
         if self.sampling is not Sampling.UNIFORM:  # other texts stay equal to those of ledgers
             plain["sampling"] = self.sampling.value
         return toml_text({**plain, **tables})

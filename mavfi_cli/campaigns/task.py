@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -69,11 +71,9 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         if config.detector is not None:  # its nodes may get other orders than the golden ones
             keep_orders(config.golden, profiles, fly_golden)
         strike = partial(struck_nodes, profiles=profiles)
-    shared = SharedFlight(branches, fork, strike)
     flown = replace(config, fault=None, instruction=None)
-    try:
-        return fly_mission(flown, out, Watcher(), shared=shared).path
-    except SystemExit:
-        if (further := shared.further()) is None:
-            raise
-    return fly_mission(flown, out, Watcher(), shared=further).path
+    first = SharedFlight(branches, fork, strike)
+    for shared in itertools.chain([first], first.further()):
+        with contextlib.suppress(SystemExit):
+            return fly_mission(flown, out, Watcher(), shared=shared).path
+    raise SystemExit

@@ -216,7 +216,10 @@ class StruckNode(NoInjection):
         node, order: the node, and the number of the struck order, from 1.
         effect: what the fault did to the node, in one word.
         process: the node from this order on; None if the fault left it unchanged.
+        how: how the node ended; empty if it answers or hangs.
     """
+
+    how = ""
 
     def __init__(
         self, node: str, order: int, effect: str, process: NodeProcess | None, text: str

@@ -6,9 +6,10 @@ from there on; the flight waits until it has ended, and continues. Missions whos
 due, and those without a fault, are forked when the flight is over.
 
 A fault in an instruction is struck after the flight, in a rehearsal of its node. If it is masked,
-its mission is forked from the end of the flight, too. If it has changed the node or ended it, the
-same flight is flown once more, as far as the last of these faults. The mission is forked when its
-node begins the struck invocation, and takes over the struck node.
+its mission is forked from the end of the flight, too. If it has ended the node, the same flight is
+flown once more, as far as the last of these faults. The mission is forked when its node begins the
+struck invocation, and loses the node there. If several faults end a node in the same invocation in
+the same way, one further flight loses the node, and their missions are forked from its end.
 
 Every record equals that of the mission flown alone, except in its host section.
 """
@@ -19,7 +20,7 @@ import bisect
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -186,15 +187,22 @@ class SharedFlight(NoInjection):
         assert self.config is not None
         return self.config, self.folder
 
-    def further(self) -> SharedFlight | None:
-        """Return the flight of the missions whose nodes end or hang.
+    def further(self) -> Iterator[SharedFlight]:
+        """Yield the flights of the missions whose nodes end or hang."""
+        deaths: dict[tuple[str, int, str], dict[int, StruckNode]] = {}
+        for number, node in self._struck.items():
+            deaths.setdefault((node.node, node.order, node.how), {})[number] = node
+        alone = dict[int, StruckNode]()
+        for struck in deaths.values():
+            if len(struck) == 1:
+                alone |= struck
+            else:
+                yield _LostFlight(self._of(struck), self._fork, struck)
+        if alone:
+            yield _StruckFlight(self._of(alone), self._fork, alone)
 
-        Return None in a fork, or if no such mission is left.
-        """
-        if self.config is not None or not self._struck:
-            return None
-        branches = {number: self._branches[number] for number in self._struck}
-        return _StruckFlight(branches, self._fork, self._struck)
+    def _of(self, numbers: Iterable[int]) -> dict[int, Branch]:
+        return {number: self._branches[number] for number in numbers}
 
     def _strike(self) -> dict[int, StruckNode]:
         """Strike the faults in instructions. Return those that are masked."""
@@ -260,6 +268,55 @@ class _StruckFlight(SharedFlight):
         if self.config is None:
             raise SystemExit
         return self.config, self.folder
+
+
+class _LostFlight(SharedFlight):
+    """The same flight once more, in which a node is lost as by each of several faults."""
+
+    def __init__(
+        self,
+        branches: Mapping[int, Branch],
+        fork: Callable[[int], bool],
+        struck: Mapping[int, StruckNode],
+    ) -> None:
+        super().__init__(branches, fork)
+        self._requests.clear()
+        self._injections |= struck
+        self._first = next(iter(struck.values()))
+        self._text = ""
+        self.recorder = _Starts(self._lose)
+
+    def _lose(self, node: str, order: int) -> None:
+        """Lose the node over this order."""
+        if (self._first.node, self._first.order) == (node, order):
+            self.flight.isolate_late(node, self._first.process)
+
+    def news(self) -> list[str]:
+        """See `NoInjection`. The news are those of the first fault."""
+        news = self._first.news() if self.config is None else []
+        self._text = "".join(news) or self._text
+        return news
+
+    def end(self) -> tuple[MissionConfig, RunFolder]:
+        """See `SharedFlight`. In each fork, the logged strike is that of its own fault."""
+        assert self.flight.companion is not None
+        executor = self.flight.companion.executor
+        executor.settle()  # the forks cannot share the processes of its nodes
+        executor.close()
+        config, folder = super().end()
+        (own,) = (node for node in self._injections.values() if isinstance(node, StruckNode))
+        self.host["struck"] = own.effect
+        if own is not self._first:
+            own.note_answer()
+            events = self.flight.logger.events
+            events[:] = [
+                replace(event, text=text)
+                if (event.kind, event.text) == ("fault", self._text)
+                else event
+                for text in own.news()
+                for event in events
+            ]
+        return config, folder
 
 
 class _Starts(Recorder):

@@ -348,6 +348,8 @@ class InstructionConfig:
         sites, roles: Kinds of operands; empty for the default.
         bits: Number of distinct bits to flip.
         null: Null injection, which does everything except the flip.
+        invocation_seed: Seed by which node and invocation are drawn; None for `seed`. Faults with
+            the same one strike the same invocation.
         at: In a user's companion: the moment from which instructions are counted, as in
             `FaultConfig`.
         objects: In a user's companion: the shared objects and executables that may be struck;
@@ -365,6 +367,7 @@ class InstructionConfig:
     field: str = "any"  # field of the bits: sign, exponent, mantissa or any
     bits: int = 1
     null: bool = False
+    invocation_seed: int | None = _omitted(None)
     at: str = _omitted("random")
     objects: tuple[str, ...] = _omitted(())
     function: str | None = _omitted(None)
@@ -376,6 +379,11 @@ class InstructionConfig:
         """Return plain values for a record."""
         unset = {name for name, own in self.__dataclass_fields__.items() if is_omitted(self, own)}
         return {name: value for name, value in asdict(self).items() if name not in unset}
+
+    @property
+    def place_seed(self) -> int:
+        """Seed by which node and invocation are drawn."""
+        return self.seed if self.invocation_seed is None else self.invocation_seed
 
     @property
     def program(self) -> str:
@@ -417,13 +425,13 @@ class InstructionConfig:
             UnknownName: The node or stage does not exist.
             FaultSpecError: A setting needs a user's companion.
         """
-        for name, own in self.__dataclass_fields__.items():
-            if own.metadata and not is_omitted(self, own):
+        for name in ("at", "objects", "function"):
+            if not is_omitted(self, self.__dataclass_fields__[name]):
                 raise FaultSpecError(f"{name} needs --companion")
         if self.target not in _NODES:
             raise UnknownName("node or stage", self.target, _NODES)
         nodes = _NODES[self.target]
-        return nodes[int(Stream.FAULT.generator(self.seed, "node").integers(len(nodes)))]
+        return nodes[int(Stream.FAULT.generator(self.place_seed, "node").integers(len(nodes)))]
 
     def sampling_name(self) -> str:
         """Return the name of the population of instructions, which every report states."""

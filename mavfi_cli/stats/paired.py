@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +50,17 @@ class McNemar:
         second: Sequence[bool] | BoolArray,
         *,
         weights: FloatArray | None = None,
+        clusters: NDArray[np.int64] | None = None,
     ) -> McNemar:
         """McNemar's exact test (Psychometrika 12, 1947), in which differing pairs are fair coins.
 
-        With weights, `sign_flips` of the weighted differences gives the p-value.
+        With weights, `sign_flips` of the weighted differences gives the p-value. With clusters it
+        is that of the sums of their differences.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
             weights: (n,) weights of a stratified sample; None for equal ones.
+            clusters: (n,) the cluster of each mission; None for independent missions.
         """
         from scipy.stats import binomtest
 
@@ -72,12 +75,16 @@ class McNemar:
             neither=neither,
             p_value=p_value,
         )
+        changes = np.asarray(second, np.int64) - np.asarray(first, np.int64)
+        if clusters is not None and len(changes):
+            sums = np.bincount(np.unique(clusters, return_inverse=True)[1], changes)
+            return replace(test, p_value=sign_flips(sums.tolist()))
         if weights is None:
             return test
-        changes = weights * (np.asarray(second, np.int64) - np.asarray(first, np.int64))
+        weighted = weights * changes
         return WeightedMcNemar(
-            **{**asdict(test), "p_value": sign_flips(changes.tolist())},
-            difference=float(changes.sum() / weights.sum()) if len(changes) else math.nan,
+            **{**asdict(test), "p_value": sign_flips(weighted.tolist())},
+            difference=float(weighted.sum() / weights.sum()) if len(weighted) else math.nan,
         )
 
     @property

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from mavfi_cli.analysis.summary import METRICS, Group
 from mavfi_cli.campaigns.missions import Injected
+from mavfi_cli.stats.paired import McNemar
 
 FATES = (Injected.ACTIVE.value, Injected.NOT_INJECTED.value)
 PAIRS = "abcd"
@@ -21,6 +22,9 @@ def group(missions, fates=FATES):
         "number": np.arange(count),
         "outcome": pa.array(["success"] * count, pa.string()),
         "injected": pa.array([counted if c else other for _, c in missions], pa.string()),
+        "cell": np.zeros(count, dtype=np.int64),
+        "stratum": pa.nulls(count, pa.string()),
+        "weight": np.ones(count),
         "pair": np.array([PAIRS.index(pair) for pair, _ in missions], dtype=np.int64),
         "strike": np.zeros(count, dtype=np.int64),
         **{name: np.zeros(count) for name in METRICS},
@@ -69,3 +73,19 @@ def test_words_are_counted_as_they_stand(missions):
     assert whole.counted.tolist() == [counts for _, counts in missions]
     known = {PAIRS.index(pair) for pair, counts in missions if counts}
     assert whole.pairs.tolist() == sorted(known)
+
+
+def test_faults_in_one_invocation_count_as_much_as_their_clusters_say():
+    """Of four clusters of five, one is lost whole, as if one of four missions were."""
+    whole = group([(pair, True) for pair in PAIRS for _ in range(5)])
+    lost = np.array([pair == "a" for pair in PAIRS for _ in range(5)])
+    share, chosen = whole.share(lost, np.ones(20, bool)), np.ones(4, bool)
+    alone = group([(pair, True) for pair in PAIRS]).share(lost[::5], chosen)
+    assert (share.count, share.total) == (5, 20)
+    assert share.low <= alone.low
+    assert share.high >= alone.high
+    mixed = np.arange(20) % 5 == 0
+    assert whole.share(mixed, np.ones(20, bool)).high < share.high
+    both = McNemar.of(~lost, np.ones(20, bool), clusters=whole.clusters)
+    assert McNemar.of(~lost, np.ones(20, bool)).p_value < 0.1 < both.p_value
+    assert group([(pair, True) for pair in PAIRS]).clusters is None

@@ -128,6 +128,32 @@ def test_a_node_struck_in_a_rehearsal_flies_as_if_struck_in_flight(short_config,
     assert effects >= {"masked", "ended"}
 
 
+@pytest.mark.slow
+@traced
+def test_faults_that_end_a_node_in_the_same_way_share_its_loss(short_config, tmp_path):
+    struck = [
+        InstructionConfig(target="control", seed=seed, invocation_seed=3) for seed in range(8)
+    ]
+    missions = [
+        PlannedMission(config=replace(short_config, instruction=fault)) for fault in (None, *struck)
+    ]
+    flown = {}
+    for whole in (False, True):
+        options = Options(jobs=2, keep=Keep.ALL, whole=whole)
+        with run_campaign(missions, tmp_path / str(whole), options) as ledger:
+            flown[whole] = list(ledger.results())
+    losses = []
+    for row, alone in zip(flown[False], flown[True], strict=True):
+        files, host = files_of(row.path)
+        assert files == files_of(alone.path)[0], row.number
+        if host.get("struck") == "ended":
+            losses.append(host["forked_s"])
+    assert len(losses) > 2
+    assert len(set(losses)) == 1  # at the end, and not at the strike
+    ends = [event["stamp_s"] for event in json.loads(files["result.json"])["events"]]
+    assert losses[0] >= ends[-1]
+
+
 class _KillsWorker(Spectator):
     struck = False
 

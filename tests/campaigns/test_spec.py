@@ -72,6 +72,31 @@ def test_a_fault_is_drawn_anew_for_each_repetition_and_place_and_for_nothing_els
     assert len({(seed, fault.target, fault.seed) for seed, fault in faults}) == 4
 
 
+def test_several_faults_share_an_invocation_and_everything_else_is_flown_once_for_them():
+    text = """
+    repetitions = 6
+    faults_per_invocation = 3
+    [[setting]]
+    name = "golden"
+    [[setting]]
+    name = "FI"
+    level = "instruction"
+    stage = ["perception", "control"]
+    """
+    missions = spec_of(text).missions()
+    assert [mission.config.seed for mission in missions if not mission.config.instruction] == [1, 2]
+    places = {}
+    for mission in missions:
+        if (fault := mission.config.instruction) is not None:
+            key = (fault.invocation_seed, mission.config.seed, fault.target, fault.node())
+            places.setdefault(key, set()).add(fault.seed)
+    assert [len(seeds) for seeds in places.values()] == [3] * 4
+    assert len({pair for mission in missions if (pair := mission.pair)}) == 2
+    assert spec_of(spec_of(text).to_toml()) == spec_of(text)
+    with pytest.raises(ConfigError, match="must be 1 with a stop rule"):
+        spec_of(f"{text}\n[stop]\nmargin = 0.1")
+
+
 def test_the_list_is_a_function_of_the_specification():
     assert spec_of(CROSSED).missions() == spec_of(CROSSED).missions()
     other = spec_of(CROSSED.replace("seed = 7", "seed = 8", 1)).missions()

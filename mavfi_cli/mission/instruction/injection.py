@@ -204,8 +204,11 @@ class _GoldenNode:
                 f"the golden flight never enters {self.kernel}, so nothing in it can be struck: "
                 "choose another world, seed or node"
             )
-        rng = Stream.FAULT.generator(request.seed, "instruction")
-        return draw_invocation(self.name, counts, rng), rng
+        rng = Stream.FAULT.generator(request.place_seed, "instruction")
+        drawn = draw_invocation(self.name, counts, rng)
+        if request.invocation_seed is not None:
+            rng = Stream.FAULT.generator(request.seed, "operand")
+        return drawn, rng
 
     def fault(
         self, request: InstructionConfig, drawn: KernelInvocation, rng: np.random.Generator
@@ -237,13 +240,13 @@ class _GoldenNode:
 
     def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
         """Return True if the process got the same orders in another flight, up to an invocation."""
-        mine, theirs = (
-            [pickle.dumps(order) for order in orders]
-            for orders in (self._orders, flown.of_process(self.process))
-        )
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
         until = own[drawn.order - 1] + 1
-        return mine[:until] == theirs[:until]
+        theirs = flown.of_process(self.process)[:until]
+        return len(theirs) == until and all(
+            pickle.dumps(mine) == pickle.dumps(other)
+            for mine, other in zip(self._orders, theirs, strict=False)
+        )
 
 
 def struck_nodes(
@@ -501,6 +504,7 @@ class StruckInjection(StruckNode):
         text = "" if written["corruption"] is None else record.describe(written)
         lost = None if struck.loss is None else LostNode(struck.loss)
         super().__init__(node, order, struck.effect.value, lost, text)
+        self.how = "" if struck.loss is None else struck.loss.how
 
     def begin(self, path: Path) -> None:
         """Write the record."""
