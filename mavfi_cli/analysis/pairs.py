@@ -23,7 +23,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
-from mavfi_cli.stats.paired import McNemar
+from mavfi_cli.stats.paired import OWN, McNemar, WorstCase
 from mavfi_cli.stats.shares import Share, design_effect, wilson
 
 STAGES = tuple(stage.value for stage in Stage)
@@ -32,7 +32,7 @@ PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
 LONGER = 1.10  # a flight is longer if it takes more than this times its own golden flight
 _COLUMNS: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("number", "seed", "fault_bits"), pa.int64()),
+    **dict.fromkeys(("number", "seed", "fault_seed", "fault_bits"), pa.int64()),
     **dict.fromkeys((
         "pair", "world", "planner", "platform", "stack", "level", "fault_target", "fault_field",
         "detector", "protect", "state", "outcome", "injected", "activation",
@@ -42,8 +42,9 @@ _COLUMNS: Mapping[str, pa.DataType] = {
     "struck_bits": BITS,
     **dict.fromkeys((
         "flight_time_s", "distance_m", "min_clearance_m", "goal_distance_m", "energy_regression_j",
-        "energy_propeller_j", "replans", *COSTS,
+        "energy_propeller_j", "replans", "response_median_s", "response_p95_s", *COSTS,
     ), pa.float64()),
+    "counted": pa.bool_(),
 }  # fmt: skip
 _STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
 _FAULTS = ("fault", "instruction")
@@ -88,9 +89,9 @@ class Balance:
 
 @dataclass(frozen=True, slots=True)
 class Flights:
-    """Flown missions, one per row, with the columns that items and claims read.
+    """Flown missions, one per row, with the columns that items, claims and comparisons read.
 
-    It has the columns of an export. A column that the export lacks is empty. Further columns:
+    A column that an export lacks is empty. Beside the columns of `analysis.flights`, it has:
         fault: the configured fault as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
         at: the trigger of a source-level fault; empty without one.
@@ -282,6 +283,15 @@ class Flights:
         return PERCENT * (self.ratios - 1.0)
 
     @property
+    def worst(self) -> WorstCase:
+        """The largest ratios of the same faults without and with a detector.
+
+        Only faults that were also flown with the detector count, because the longest of more
+        flights is longer.
+        """
+        return WorstCase.of(OWN, self.known("bare_over_own").tolist(), self.ratios.tolist())
+
+    @property
     def faults(self) -> list[tuple[str, str]]:
         """Mission and fault of each flight; two flights of one fault differ in their detector."""
         return list(zip(self["pair"], self["fault"], strict=True))
@@ -339,7 +349,8 @@ def _beside_golden(table: pa.Table) -> pa.Table:
     bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))
     own_lost, own_time = (table[name].take(own) for name in ("lost", "flight_time_s"))
     over_own, harmed = against_golden(own_lost, own_time, table["lost"], table["flight_time_s"])
-    added = pc.multiply(own_time, pc.subtract(over_own, 1.0))
+    longer = pc.subtract(table["flight_time_s"], own_time)
+    added = pc.if_else(pc.is_valid(over_own), longer, pa.scalar(None, longer.type))
     table = _with_columns(
         table,
         own_lost=own_lost,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
@@ -21,22 +22,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavfi_cli.analysis.flights import (
-    IntArray,
-    changed,
-    chosen,
-    flags,
-    flown,
-    known,
-    numbers,
-)
-from mavfi_cli.analysis.pairs import against_golden, paired
+from mavfi_cli.analysis.flights import IntArray, changed, flags, numbers
+from mavfi_cli.analysis.pairs import Flights, paired
 from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.core.types import FloatArray
 from mavfi_cli.spec.platform import load_platform
 from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_rows, median
-from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, sign_flips
-from mavfi_cli.stats.shares import Interval, Share, wilson
+from mavfi_cli.stats.paired import McNemar, WorstCase, sign_flips
+from mavfi_cli.stats.shares import Interval, Share
 
 LATE = 0.95  # quantile given with the worst case, which has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
@@ -73,15 +66,12 @@ SCHEMA = pa.schema(
 )  # fmt: skip
 
 
-def compared(flights: pa.Table) -> pa.Table:
-    """The columns of SCHEMA for the missions that ended; golden flights have an empty target."""
-    table = flown(flights)
+def compared(flights: pa.Table) -> Flights:
+    """The missions that ended, with the columns of SCHEMA; golden flights have an empty target."""
+    table = Flights.of(flights).table
     bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
-    setting = pc.coalesce(table["detector"].cast(pa.string()), bare)
-    target = pc.fill_null(table["fault_target"].cast(pa.string()), "")
-    for name, column in (("setting", setting), ("target", target)):
-        table = table.append_column(name, column)
-    return table.select(SCHEMA.names).cast(SCHEMA)
+    table = table.append_column("setting", pc.coalesce(table["detector"], bare))
+    return Flights(table.append_column("target", pc.fill_null(table["fault_target"], "")))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,41 +291,35 @@ class PlatformComparison:
     timeline: ComparedTimelines
 
 
-def figures(plan: ComparedPlan, flights: pa.Table, **about: Any) -> PlatformComparison:
+def figures(plan: ComparedPlan, flights: Flights, **about: Any) -> PlatformComparison:
     """Compute all numbers of the flights.
 
     Args:
-        flights: table with the columns of SCHEMA.
+        flights: flights with the columns of SCHEMA.
         about: the other fields of the comparison.
     """
     platforms, settings = [row.platform for row in plan.platforms], plan.settings
-    whole = flights.append_column("succeeded", pc.equal(flights["outcome"], "success"))
     first, *others = platforms
     faulty = [setting for setting in settings if setting != GOLDEN]
     every = {
-        (platform, setting): chosen(whole, platform=platform, setting=setting)
+        (platform, setting): flights.chosen(platform=platform, setting=setting)
         for platform, setting in itertools.product(platforms, (GOLDEN, NONE, *settings))
     }
-    counted = {place: chosen(table, counted=True) for place, table in every.items()}
-    won = {place: chosen(table, succeeded=True) for place, table in counted.items()}
-    costs = {
-        (platform, setting): FaultCosts.of(won[platform, GOLDEN], counted[platform, setting])
-        for platform, setting in itertools.product(platforms, faulty)
-    }
+    counted = {place: those.chosen(counted=True) for place, those in every.items()}
+    won = {place: those.chosen(lost=False) for place, those in counted.items()}
+    costs = {place: FaultCosts(those) for place, those in counted.items()}
     return PlatformComparison(
         plan=plan,
         **about,
         settings=[
-            _setting(p, s, every[p, s].num_rows, counted[p, s])
+            _setting(p, s, len(every[p, s]), counted[p, s])
             for s, p in itertools.product(settings, platforms)
         ],
         ratios=[
             _ratio(p, s, first, counted[first, s], counted[p, s])
             for p, s in itertools.product(others, settings)
         ],
-        costs=[
-            costs[p, s].row(p, s, costs[p, NONE]) for p, s in itertools.product(platforms, faulty)
-        ],
+        costs=[costs[p, s].row(p, s) for p, s in itertools.product(platforms, faulty)],
         cost_differences=[
             costs[p, s].beyond(costs[first, s], p, s, first)
             for p, s in itertools.product(others, faulty)
@@ -344,26 +328,24 @@ def figures(plan: ComparedPlan, flights: pa.Table, **about: Any) -> PlatformComp
             _longest(p, s, won[p, GOLDEN], won[p, NONE], won[p, s])
             for p, s in itertools.product(platforms, settings)
         ],
-        flights=flights.to_pylist(),
+        flights=flights.table.select(SCHEMA.names).cast(SCHEMA).to_pylist(),
     )
 
 
-def _setting(platform: str, setting: str, flown: int, counted: pa.Table) -> SettingFlights:
-    ends = pc.value_counts(counted["outcome"]).to_pylist()
+def _setting(platform: str, setting: str, flown: int, counted: Flights) -> SettingFlights:
     return SettingFlights(
         platform=platform,
         setting=setting,
         flown=flown,
-        counted=counted.num_rows,
-        outcomes=dict(sorted((end["values"], end["counts"]) for end in ends)),
-        success=wilson(int(flags(counted, "succeeded").sum()), counted.num_rows),
+        counted=len(counted),
+        outcomes=dict(sorted(Counter(counted["outcome"]).items())),
+        success=counted.share(value=False),
         quantities={own.name: _measured(own, counted) for own in QUANTITIES},
     )
 
 
-def _measured(quantity: _Quantity, counted: pa.Table) -> MeasuredQuantity:
-    flights = counted if quantity.any_end else chosen(counted, succeeded=True)
-    values = known(numbers(flights, quantity.name))
+def _measured(quantity: _Quantity, counted: Flights) -> MeasuredQuantity:
+    values = (counted if quantity.any_end else counted.chosen(lost=False)).known(quantity.name)
     return MeasuredQuantity(
         unit=quantity.unit,
         median=interval(values, median, resamples=TABLE_RESAMPLES),
@@ -373,10 +355,10 @@ def _measured(quantity: _Quantity, counted: pa.Table) -> MeasuredQuantity:
 
 
 def _ratio(
-    platform: str, setting: str, reference: str, first: pa.Table, second: pa.Table
+    platform: str, setting: str, reference: str, first: Flights, second: Flights
 ) -> RatioRow:
-    pairs = paired(second, first, MISSION)[::-1]
-    test = McNemar.of(*(flags(table, "succeeded") for table in pairs))
+    pairs = paired(second.table, first.table, MISSION)[::-1]
+    test = McNemar.of(*(~flags(table, "lost") for table in pairs))
     return RatioRow(
         platform=platform,
         setting=setting,
@@ -391,7 +373,7 @@ def _ratio(
 def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQuantity:
     """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
     if not quantity.any_end:
-        both = pa.array(flags(first, "succeeded") & flags(second, "succeeded"))
+        both = pa.array(~(flags(first, "lost") | flags(second, "lost")))
         first, second = first.filter(both), second.filter(both)
     before, after = (numbers(table, quantity.name).tolist() for table in (first, second))
     change = changed(
@@ -404,67 +386,50 @@ def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQ
 # Costs of faults -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class FaultCosts:
-    """The cost of the faults of a platform and setting, over their own golden flights.
+    """The cost of the faults of a platform and setting, over their own golden flights."""
 
-    Attributes:
-        costs: one row per pair that reached the goal: `seed`, `target`, `fault_seed`, `cost_s`,
-            `over_own`.
-        lost: flights that failed where the golden one reached the goal.
-        longest_s: longest flight that reached the goal, whether or not the golden one did.
-    """
+    counted: Flights
 
-    costs: pa.Table
-    lost: int
-    longest_s: float
+    @property
+    def costs(self) -> pa.Table:
+        """The flights that reached the goal as their golden flights did."""
+        return self.counted.timed.table
 
-    @classmethod
-    def of(cls, golden: pa.Table, counted: pa.Table) -> FaultCosts:
-        """Compare flights with the golden flights of the same missions."""
-        flights, own = paired(counted, golden, ["seed"])
-        own_lost, lost = (pc.invert(table["succeeded"]) for table in (own, flights))
-        time_s, own_s = flights["flight_time_s"], own["flight_time_s"]
-        over_own, _ = against_golden(own_lost, own_s, lost, time_s)
-        costs = flights.select([*MISSION, "fault_seed"])
-        costs = costs.append_column("cost_s", pc.subtract(time_s, own_s))
-        costs = costs.append_column("over_own", over_own)
-        longest = numbers(chosen(counted, succeeded=True), "flight_time_s")
-        return cls(
-            costs=costs.filter(pc.is_valid(over_own)),
-            lost=int(np.count_nonzero(pc.and_(pc.invert(own_lost), lost))),
-            longest_s=max(longest.tolist(), default=math.nan),
-        )
+    @property
+    def longest_s(self) -> float:
+        """Longest flight that reached the goal, whether or not the golden one did."""
+        times_s = self.counted.chosen(lost=False).numbers("flight_time_s")
+        return max(times_s.tolist(), default=math.nan)
 
     def _largest(self, measure: str) -> float:
         return max(numbers(self.costs, measure).tolist(), default=math.nan)
 
-    def row(self, platform: str, setting: str, bare: FaultCosts) -> CostRow:
+    def row(self, platform: str, setting: str) -> CostRow:
         """The cost of a setting's faults on a platform.
 
         Several faults of one mission are not independent, so the intervals resample missions.
-
-        Args:
-            bare: costs without a detector on this platform, the reference for recovery.
         """
-        cost_s, over_own = (_by_mission(self.costs, name) for name in ("cost_s", "over_own"))
-        worst, count = self._largest("over_own"), len(cost_s)
-        recovered = WorstCase.of(OWN, [bare._largest("over_own")], [worst]).recovered_share
+        cost_s, over_own = (_by_mission(self.costs, name) for name in ("added_s", "over_own"))
+        count = len(cost_s)
         rows = self.costs.sort_by([("over_own", "descending"), ("seed", "ascending")])
         flights = rows.select([*MISSION, "fault_seed"]).slice(0, 1).to_pylist()
         return CostRow(
             platform=platform,
             setting=setting,
             pairs=self.costs.num_rows,
-            lost=self.lost,
+            lost=len(self.counted.chosen(own_lost=False, lost=True)),
             cost_s=_CostInSeconds(
                 mean=_over(count, lambda drawn: _mean(cost_s[drawn])),
-                largest=self._largest("cost_s"),
+                largest=self._largest("added_s"),
             ),
             over_own=_CostRatio(
                 p95=_over(count, lambda drawn: _late(over_own[drawn])),
-                largest=worst,
-                recovered_share=math.nan if setting == NONE else recovered,
+                largest=self._largest("over_own"),
+                recovered_share=(
+                    math.nan if setting == NONE else self.counted.worst.recovered_share
+                ),
             ),
             worst_flight=WorstFault(**flights[0]) if flights else None,
         )
@@ -474,7 +439,7 @@ class FaultCosts:
     ) -> CostDifference:
         """The additional cost compared with the reference platform, `first`."""
         here, there = paired(self.costs, first.costs, MISSION)
-        extra = _by_mission(here, "cost_s") - _by_mission(there, "cost_s")
+        extra = _by_mission(here, "added_s") - _by_mission(there, "added_s")
         extra[np.abs(extra) < _SAME_S] = 0.0
         before, after = _by_mission(there, "over_own"), _by_mission(here, "over_own")
         count = len(extra)
@@ -493,10 +458,10 @@ class FaultCosts:
 
 
 def _longest(
-    platform: str, setting: str, golden: pa.Table, faulty: pa.Table, flights: pa.Table
+    platform: str, setting: str, golden: Flights, faulty: Flights, flights: Flights
 ) -> LongestFlight:
     golden_s, faulty_s, times_s = (
-        numbers(table, "flight_time_s").tolist() for table in (golden, faulty, flights)
+        those.numbers("flight_time_s").tolist() for those in (golden, faulty, flights)
     )
     own = WorstCase.of(golden_s, times_s)
     protected_s = () if setting in (GOLDEN, NONE) else times_s

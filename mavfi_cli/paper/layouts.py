@@ -23,7 +23,6 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.mission.run_folder import TRACE
 from mavfi_cli.paper.items import BY_NAME, FlightsPlan, Item, printed
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable, Printed
-from mavfi_cli.stats.paired import OWN, WorstCase
 
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
 _GOLDEN = "golden"  # begins the labels of rows of golden flights
@@ -425,12 +424,9 @@ def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> Paper
 def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
     """The part of the worst case that a protection recovers, in per cent or in points.
 
-    The worst case covers only the faults that were also flown with the protection, because the
-    longest of more flights is longer.
-
     Args:
         measure: attribute of `WorstCase`.
     """
-    bare, own = protected.known("bare_over_own"), protected.ratios
-    value = PERCENT * getattr(WorstCase.of(OWN, bare.tolist(), own.tolist()), measure)
-    return PaperCell(value=value, count=0 if math.isnan(value) else len(own), paper=paper)
+    value = PERCENT * getattr(protected.worst, measure)
+    count = 0 if math.isnan(value) else len(protected.ratios)
+    return PaperCell(value=value, count=count, paper=paper)

@@ -130,7 +130,7 @@ def compare(
         fly_missing(ledger, replace(options, keep=Keep.NONE), spectator)
         table = flights(ledger)
     flown = compared(table)
-    seed = timeline_seed(flown, plan.platforms) or plan.first_seed
+    seed = timeline_seed(flown.table, plan.platforms) or plan.first_seed
     return figures(
         plan.described(),
         flown,

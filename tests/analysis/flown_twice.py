@@ -1,10 +1,11 @@
 """Flights of a comparison, made up."""
 
-import pyarrow as pa
-import pyarrow.compute as pc
-import pytest
+import json
 
-from mavfi_cli.analysis.platforms import SCHEMA, ComparedTimelines, figures
+import pytest
+from made_flights import export_table
+
+from mavfi_cli.analysis.platforms import ComparedTimelines, compared, figures
 from mavfi_cli.analysis.timeline import Timeline
 from mavfi_cli.studies.compare import ComparePlan
 
@@ -35,9 +36,22 @@ def flight(platform, seed, time_s, setting="golden", **changes):
 
 
 def table(flights):
-    """Flights as columns, with whether they succeeded."""
-    found = pa.Table.from_pylist(list(flights), SCHEMA)
-    return found.append_column("succeeded", pc.equal(found["outcome"], "success"))
+    """The flights, each beside its golden one and the one with the same fault and no detector."""
+    return compared(export_table([{**own, **_configured(own)} for own in flights]))
+
+
+def _configured(own):
+    """What a ledger has of the mission of a flight."""
+    fault = {"target": own["target"], "seed": own["fault_seed"]}
+    faulty, setting = own["setting"] != "golden", own["setting"]
+    return {
+        "pair": f"{own['platform']} {own['seed']}",
+        "state": "flown",
+        "level": "source" if faulty else None,
+        "detector": setting if setting in ("gad", "aad") else None,
+        "fault_target": own["target"] or None,
+        "changes": json.dumps({"fault": fault} if faulty else {}),
+    }
 
 
 def figures_of(plan, flights):
@@ -85,7 +99,7 @@ def panel(platform, factor):
 def comparison(plan, flights, *, errors=(), timelines=()):
     """All that `mavfi compare` would compute of these flights."""
     return figures(
-        plan.described(), pa.Table.from_pylist(flights, SCHEMA), schema=1, versions={},
+        plan.described(), table(flights), schema=1, versions={},
         errors=[*errors], timeline=ComparedTimelines(seed=4, platforms=[*timelines]),
     )  # fmt: skip
 

@@ -70,12 +70,18 @@ def counted(flown, platform, setting):
     }
 
 
-def costs(flown, platform, setting):
-    """Of each mission the costs of its faults: over the golden flight of the platform, x."""
+def costs(flown, platform, setting, protected=None):
+    """Of each mission the costs of its faults: over the golden flight of the platform, x.
+
+    With `protected`, only of the faults that count in the flights with this detector.
+    """
     own = {seed: f for (seed, _), f in counted(flown, platform, "golden").items() if succeeded(f)}
+    faults = counted(flown, platform, protected or setting)
     return {
         (seed, target): f["flight_time_s"] / own[seed]["flight_time_s"]
-        for (seed, target), f in counted(flown, platform, setting).items()
+        for f in flown
+        for seed, target in [(f["seed"], f["target"])]
+        if (f["platform"], f["setting"]) == (platform, setting) and (seed, target) in faults
         if succeeded(f) and seed in own
     }
 
@@ -152,7 +158,7 @@ def test_costs(flown, told):
         assert row.over_own.largest == pytest.approx(max(over))
         assert row.over_own.p95.value == pytest.approx(np.percentile(over, 95.0))
         assert_interval(row.over_own.p95, by_mission(mine), lambda v: np.percentile(v, 95.0))
-        bare = max(costs(flown, row.platform, "none").values())
+        bare = max(costs(flown, row.platform, "none", row.setting).values())
         if row.setting != "none":
             assert row.over_own.recovered_share == pytest.approx(
                 1.0 - (max(over) - 1.0) / (bare - 1.0)

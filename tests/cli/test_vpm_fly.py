@@ -54,6 +54,9 @@ def test_model_and_flight_side_by_side(command_line, tmp_path, lawn):
     code, again, err = command_line(*LINE, "--quiet")
     assert (code, again, err) == (0, out, "")
     assert {path: path.read_bytes() for path in folder.glob("*.*")} == before
+    code, summary, err = command_line("campaign", "run", "out/flights", "--quiet")
+    assert (code, err) == (0, "")
+    assert "flights: 5 of 5 missions" in summary
     overhead = command_line("vpm", "--vehicle", "spark", "--overhead", "out")[1]
     assert re.search(r"measured in 1 flight of out on x86 x [\d.]+: checks ", overhead)
     assert "not scaled to the platform" in out

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import flown_twice
 import pytest
 from made_flights import flight, struck, table
 
@@ -10,6 +11,7 @@ from mavfi_cli.analysis.kernels import KernelSummary
 from mavfi_cli.paper.items import ITEMS, Source, printed
 from mavfi_cli.paper.layouts import OF_FLIGHTS, of_flights
 from mavfi_cli.paper.status import of_kernels, of_model
+from mavfi_cli.studies.compare import ComparePlan
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 
@@ -174,6 +176,21 @@ def test_fig_16_compares_platforms():
     assert (worst.value, worst.paper) == (pytest.approx(2.0), 2.8)
     assert cell(found, "tx2", "GAD recovers, %").value == pytest.approx(80.0)
     assert cell(found, "x86", "worst, x own golden").paper is None
+
+
+def test_fig_16_and_a_comparison_take_the_same_flights():
+    """The worst fault was not flown with the detector, so no detector recovers any of it."""
+    times_s = [("golden", 1, 20.0), ("golden", 2, 20.0), ("none", 1, 24.0), ("none", 2, 40.0),
+               ("gad", 1, 21.0)]  # fmt: skip
+    flights = [flown_twice.flight("tx2", seed, time_s, setting, world="sparse")
+               for setting, seed, time_s in times_s]  # fmt: skip
+    plan = ComparePlan(platforms=("tx2",), inject=("planning",), detectors=("gad",))
+    bare, protected = flown_twice.figures_of(plan, flights).costs
+    figure = of_flights("fig16", flown_twice.table(flights))
+    worst = cell(figure, "tx2", "worst, x own golden").value
+    recovered = cell(figure, "tx2", "GAD recovers, %").value
+    assert worst == bare.over_own.largest == pytest.approx(2.0)
+    assert recovered == 100.0 * protected.over_own.recovered_share == pytest.approx(75.0)
 
 
 @pytest.mark.parametrize("name", OF_FLIGHTS)

@@ -108,9 +108,10 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
         *(flight("tx2", seed, 21.0) for seed in (1, 2, 4)),
         flight("tx2", 3, 21.0, outcome="collision"),
     ]
-    assert timeline_seed(table(flights), plan.platforms) == 4
-    assert timeline_seed(table(f for f in flights if f["seed"] != 4), plan.platforms) == 1
-    assert timeline_seed(table([]), plan.platforms) is None
+    assert timeline_seed(table(flights).table, plan.platforms) == 4
+    rest = [f for f in flights if f["seed"] != 4]
+    assert timeline_seed(table(rest).table, plan.platforms) == 1
+    assert timeline_seed(table([]).table, plan.platforms) is None
 
 
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):
