@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 
@@ -142,16 +143,16 @@ def test_faults_that_end_a_node_in_the_same_way_share_its_loss(short_config, tmp
         options = Options(jobs=2, keep=Keep.ALL, whole=whole)
         with run_campaign(missions, tmp_path / str(whole), options) as ledger:
             flown[whole] = list(ledger.results())
-    losses = []
+    losses, ends = [], set()
     for row, alone in zip(flown[False], flown[True], strict=True):
         files, host = files_of(row.path)
         assert files == files_of(alone.path)[0], row.number
         if host.get("struck") == "ended":
             losses.append(host["forked_s"])
-    assert len(losses) > 2
-    assert len(set(losses)) == 1  # at the end, and not at the strike
-    ends = [event["stamp_s"] for event in json.loads(files["result.json"])["events"]]
-    assert losses[0] >= ends[-1]
+            ends.add(json.loads(files["result.json"])["events"][-1]["stamp_s"])
+    shared = Counter(losses).most_common(1)[0]
+    assert shared[1] > 1
+    assert shared[0] in ends  # they leave at the end, and not at the strike
 
 
 class _KillsWorker(Spectator):
