@@ -252,7 +252,7 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
         ),
         ("level = 'instruction'\nsites = ['flags']", r"sites: requires a stage or a site"),
         ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: is not a factor of faults at"),
-        ("stage = 'control'\nlevel = 'instruction'\nat = 'random'", r"at: is not a factor of"),
+        ("stage = 'control'\nlevel = 'instruction'\neffect = 'zero'", r"effect: is not a factor of"),
         ("stage = 'control'\nbits = ['one']", r"bits: must be a whole number"),
         ("stage = 'control'\nat = 'time=301'", r"at time=301: must be within the mission's"),
         (
