@@ -28,8 +28,7 @@ from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 from sitl.camera.component import COMPONENT_ID, Camera
 
-for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
-    sys.path.insert(0, str(Path(__file__).parent / _folder))
+sys.path.insert(0, str(Path(__file__).parent / "link"))  # scripted autopilots
 settings.register_profile("no clock", deadline=None)  # no test asserts speed by the clock
 settings.load_profile("no clock")
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer

@@ -10,7 +10,7 @@ from mavfi_cli.analysis.failures import setting_failures
 from mavfi_cli.analysis.kernels import OUTCOMES
 from mavfi_cli.analysis.summary import METRICS, groups, qualities
 from mavfi_cli.campaigns.begin import stopped
-from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
@@ -66,11 +66,7 @@ def test_a_campaign_that_was_killed_before_it_had_a_list_has_no_row(book):
 
 def test_errors_are_counted_nowhere_else(book):
     fill(book)
-    book.ledger.plan([PlannedMission(config=MissionConfig(seed=99), labels={"setting": "golden"})])
-    book.ledger.add(
-        30, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
-        attempts=1, path=None,
-    )  # fmt: skip
+    book.fail({"setting": "golden"}, 99)
     golden = summary(book.ledger).cells[0]
     assert (golden.planned, golden.errors, golden.every.total) == (11, 1, 10)
 
@@ -240,7 +236,7 @@ def test_the_text_tells_the_numbers_and_json_has_no_nan(book):
 
 
 def test_a_campaign_that_has_just_begun_has_a_table(book):
-    book.ledger.plan([PlannedMission(config=MissionConfig(), labels={})])
+    book.plan({}, 1)
     assert "all missions" in "\n".join(CampaignReport.of(book.ledger).lines())
 
 
@@ -351,7 +347,7 @@ def test_settings_that_their_rule_has_stopped_are_named(book):
         book.add(FI, seed, 20.0)
         book.add({"setting": "golden"}, seed, 20.0, injected=GOLDEN,
                  outcome="collision" if seed % 2 else "success")  # fmt: skip
-    for labels in (FI, {"setting": "golden"}):
-        left = [PlannedMission(config=MissionConfig(seed=s), labels=labels) for s in range(20, 40)]
-        book.ledger.plan(left)
+    for seed in range(20, 40):
+        book.plan(FI, seed)
+        book.plan({"setting": "golden"}, seed)
     assert stopped(book.ledger) == ["setting=FI stage=control"]

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
+from made_flights import watched
 
 from mavfi_cli.analysis.overhead import ComputeOverhead, recorded_overheads
 from mavfi_cli.cli.vpm import vpm
@@ -11,32 +12,9 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.mission.measures import FlightRecord
 
 
-def flight(detector="gad", *, gate_s=0.02, alarms=(), counted=None, fault=None, platform="x86"):
-    listed = [{"stage": stage, "response": response} for stage, response in alarms]
-    counts = {"recompute": 0, "hold": 0, "accept": 0}
-    for _, response in alarms:
-        counts[response] += 1
-    result = {
-        "detection": detector
-        and {
-            "detector": detector,
-            "alarms": listed,
-            "responses": counts | (counted or {}),
-            "checks": {"tick": 1000},
-        },
-        "quality_of_flight": {"flight_time_s": 20.0},
-        "fault": fault,
-        "config": {"platform": platform},
-        "kernels": {
-            "point_cloud": {"invocations": 100, "busy_s": 1.0},
-            "octomap": {"invocations": 20, "busy_s": 6.0},
-            "collision_check": {"invocations": 10, "busy_s": 0.5},
-            "planner": {"invocations": 5, "busy_s": 1.0},
-            "control": {"invocations": 1000, "busy_s": 0.5},
-        },
-        "host": {"stage_wall_s": {"gate": gate_s, "octomap": 0.15, "planner": 0.05, "link": 9.0}},
-    }
-    return FlightRecord.of(result)
+def flight(detector="gad", alarms=(), *, gate_s=0.02, platform="x86", **changes):
+    told = {"quality_of_flight": {"flight_time_s": 20.0}, "config": {"platform": platform}}
+    return FlightRecord.of(watched(detector, gate_s, alarms) | told | changes)
 
 
 def test_checks_alone():
@@ -48,10 +26,9 @@ def test_checks_alone():
 
 
 def test_recomputation_costs_a_run_of_the_stage():
-    """0.01 + 0.3 + 0.05 s for perception, 0.2 s for planning, 0.5 ms for control."""
     alarms = [("perception", "recompute"), ("planning", "hold"), ("control", "recompute"),
               ("control", "accept")]  # fmt: skip
-    found = ComputeOverhead.of([flight(alarms=alarms)])["gad"]
+    found = ComputeOverhead.of([flight("gad", alarms)])["gad"]
     again_s = 0.36 + 0.2 + 0.0005
     assert found.recompute_s == pytest.approx(again_s)
     assert found.share == pytest.approx((0.02 + again_s) / (9.0 - again_s))
@@ -61,16 +38,15 @@ def test_recomputation_costs_a_run_of_the_stage():
 
 def test_alarms_beyond_the_listed_ones_are_counted():
     alarms = [("planning", "recompute")] * 3 + [("control", "recompute")]
-    found = ComputeOverhead.of([flight(alarms=alarms, counted={"recompute": 8})])["gad"]
+    detection = watched("gad", 0.02, alarms, responses={"recompute": 8})["detection"]
+    found = ComputeOverhead.of([flight(detection=detection)])["gad"]
     assert found.recompute_s == pytest.approx(6 * 0.2 + 2 * 0.0005)
     assert found.alarms == 8
 
 
 def test_flights_are_taken_together_and_faulty_ones_left_out():
-    found = ComputeOverhead.of(
-        [flight(), flight(gate_s=0.04), flight("aad"), flight(None), flight(fault={"state": "x"}),
-         FlightRecord(outcome="crash")]
-    )  # fmt: skip
+    left_out = [flight(detection=None), flight(fault={"state": "x"}), FlightRecord(outcome="crash")]
+    found = ComputeOverhead.of([flight(), flight(gate_s=0.04), flight("aad"), *left_out])
     assert set(found) == {"gad", "aad"}
     assert found["gad"].flights == 2
     assert found["gad"].share == pytest.approx(0.06 / 18.0)

@@ -6,7 +6,7 @@ import pytest
 from mavfi_cli.analysis.flights import exported
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.begin import chosen, opened
-from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.detector import DetectorConfig
@@ -87,14 +87,9 @@ def test_without_a_number_the_pair_is_drawn_in_which_a_fault_costs_most_time(boo
 def test_what_is_not_in_the_picture_is_told(book):
     fly(book, 1, (20.0,) * 5)
     labels = {"setting": "FI", "world": "dense", "stage": "control"}
-    for target in ("command_vx", "command_vy"):
-        fault = FaultConfig(target=target, seed=1)
-        book.ledger.plan([PlannedMission(config=MissionConfig(seed=1, fault=fault), labels=labels)])
-    book.ledger.add(
-        5, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
-        attempts=1, path=None,
-    )  # fmt: skip
-    drawn = pair(book.ledger, 6)
+    for target, write in (("command_vx", book.fail), ("command_vy", book.plan)):
+        number = write(labels, 1, MissionConfig(seed=1, fault=FaultConfig(target=target, seed=1)))
+    drawn = pair(book.ledger, number)
     assert drawn.absent == ["mission 5 could not begin: blocked", "mission 6 not flown yet"]
     assert len(drawn.panels) == 2
 
@@ -144,7 +139,7 @@ def test_a_pair_that_cannot_be_drawn_is_refused(book):
         pair(book.ledger, 2)
     with pytest.raises(ConfigError, match="no mission 5; the list has missions 0 to 4"):
         pair(book.ledger, 5)
-    book.ledger.plan([PlannedMission(config=MissionConfig(seed=9), labels=GOLDEN)])
+    book.plan(GOLDEN, 9)
     with pytest.raises(RecordError, match="no flight of mission 5's pair"):
         pair(book.ledger, 5)
 

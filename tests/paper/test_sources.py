@@ -5,17 +5,16 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from made_flights import export_table, row
+from made_flights import Book, export_table, row
 
 from mavfi_cli.analysis.flights import exported
 from mavfi_cli.campaigns.ledger import Ledger
-from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.paper.document import document
 from mavfi_cli.paper.sources import Evidence
 from mavfi_cli.report.campaign import flights_file
-from mavfi_cli.spec.mission import MissionConfig
 
 KERNELS = Path(__file__).parents[2] / "docs/results/kernels.json"
 
@@ -25,19 +24,15 @@ def campaign(tmp_path):
     """Make the folder of a campaign with planned and flown golden missions."""
 
     def make(name, planned, flown, versions=None):
-        with Ledger(tmp_path / name, writing=True) as ledger:
-            told = json.dumps(installed_versions() | (versions or {}))
-            ledger.set_meta({"name": name, "versions": told})
-            ledger.plan(
-                PlannedMission(config=MissionConfig(seed=seed), labels={"setting": "golden"})
-                for seed in range(planned)
-            )
-            for number in range(flown):
-                ledger.add(
-                    number, state=ResultState.FLOWN, reason="", injected=Injected.GOLDEN,
-                    wall_s=1.0, attempts=1, path=None,
-                    result={"outcome": "success", "host": {"machine": "x86_64", "cores": 4}},
-                )  # fmt: skip
+        book, golden = Book(tmp_path / name), {"setting": "golden"}
+        told = json.dumps(installed_versions() | (versions or {}))
+        book.ledger.set_meta({"name": name, "versions": told})
+        for seed in range(flown):
+            host = {"host": {"machine": "x86_64", "cores": 4}}
+            book.add(golden, seed, injected=Injected.GOLDEN, record=host)
+        for seed in range(flown, planned):
+            book.plan(golden, seed)
+        book.ledger.close()
         return tmp_path / name
 
     return make

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 
 import matplotlib as mpl
 import pytest
-from flown_twice import PLAN, comparison
+from made_flights import PLAN, comparison
 from matplotlib.patches import Rectangle
 
 from mavfi_cli.report.compare_plot import PICTURES

@@ -4,7 +4,7 @@ from collections import defaultdict
 from dataclasses import replace
 
 import pytest
-from flown_twice import flight, table
+from made_flights import compared, on
 
 from mavfi_cli.analysis.platforms import titles
 from mavfi_cli.analysis.timeline import timeline_seed
@@ -103,14 +103,14 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
     plan = ComparePlan(missions=4)
     straight = {"replans": 0.0}
     flights = [
-        *(flight("x86", seed, 20.0, **straight) for seed in (1, 2)),
-        *(flight("x86", seed, 20.0) for seed in (3, 4)),
-        *(flight("tx2", seed, 21.0) for seed in (1, 2, 4)),
-        flight("tx2", 3, 21.0, outcome="collision"),
+        *(on("x86", seed, 20.0, **straight) for seed in (1, 2)),
+        *(on("x86", seed, 20.0) for seed in (3, 4)),
+        *(on("tx2", seed, 21.0) for seed in (1, 2, 4)),
+        on("tx2", 3, 21.0, outcome="collision"),
     ]
-    assert timeline_seed(table(flights), plan.platforms) == 4
-    assert timeline_seed(table(f for f in flights if f["seed"] != 4), plan.platforms) == 1
-    assert timeline_seed(table([]), plan.platforms) is None
+    assert timeline_seed(compared(flights), plan.platforms) == 4
+    assert timeline_seed(compared(f for f in flights if f["seed"] != 4), plan.platforms) == 1
+    assert timeline_seed(compared([]), plan.platforms) is None
 
 
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):
