@@ -1,6 +1,7 @@
 """The overhead of detection and recovery, from records of flights."""
 
 import json
+import re
 
 import pytest
 from click.testing import CliRunner
@@ -9,7 +10,7 @@ from made_flights import watched
 from mavfi_cli.analysis.overhead import ComputeOverhead, recorded_overheads
 from mavfi_cli.cli.vpm import vpm
 from mavfi_cli.core.errors import RecordError
-from mavfi_cli.mission.measures import FlightRecord
+from mavfi_cli.mission.measures import HOST_CHECKS, FlightRecord
 
 
 def flight(detector="gad", alarms=(), *, gate_s=0.02, platform="x86", **changes):
@@ -50,12 +51,8 @@ def test_flights_are_taken_together_and_faulty_ones_left_out():
     assert set(found) == {"gad", "aad"}
     assert found["gad"].flights == 2
     assert found["gad"].share == pytest.approx(0.06 / 18.0)
-    assert (
-        found["gad"]
-        .describe("here")
-        .startswith("measured in 2 flights of here on x86: checks 0.3333 %")
-    )
-    assert found["aad"].describe("here").startswith("measured in 1 flight of here on x86: ")
+    assert re.search("2 flights of here on x86: .* 0.3333 %", found["gad"].describe("here"))
+    assert "1 flight of here on x86: " in found["aad"].describe("here")
 
 
 def test_flights_on_another_platform_do_not_count():
@@ -66,8 +63,8 @@ def test_flights_on_another_platform_do_not_count():
     assert set(found) == {"gad"}
     assert found["gad"].share == pytest.approx(0.04 / 9.0)
     told = found["gad"].describe("here")
-    assert told.startswith("measured in 1 flight of here on tx2 (1 on other platforms left out): ")
-    assert told.endswith("; checks take the time of the host that flew, not scaled to the platform")
+    assert re.search(r"1 flight of here on tx2 \(1 .* left out\): ", told)
+    assert told.endswith(HOST_CHECKS)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +103,7 @@ def measured(path, platform=None):
 @pytest.mark.slow
 def test_the_command_takes_a_run_folder(guarded, tmp_path):
     found = measured(guarded.path)
-    assert found.describe("here").startswith("measured in 1 flight of here on x86: checks ")
+    assert "1 flight of here on x86: " in found.describe("here")
     assert measured(guarded.result) == measured(guarded.path, "x86") == found
     assert measured(guarded.path.parent).share > 0.0  # the folder of runs
     asked = ["--overhead", str(guarded.path), "--overhead", "aad=0.5", "--json"]
@@ -114,11 +111,9 @@ def test_the_command_takes_a_run_folder(guarded, tmp_path):
     given = {row["scheme"]: (row["overhead_percent"], row["source"]) for row in told}
     assert given["aad"] == (0.5, "--overhead")
     assert given["gad"] == (pytest.approx(100.0 * found.share), found.describe(str(guarded.path)))
-    with pytest.raises(
-        RecordError, match=r"on tx2 \(--platform\) is recorded there, only gad on x86; "
-    ):
+    with pytest.raises(RecordError, match=r"tx2 \(--platform\) .* gad on x86"):
         measured(guarded.path, "tx2")
-    with pytest.raises(RecordError, match="no error-free flight with gad or aad is recorded"):
+    with pytest.raises(RecordError, match="gad or aad"):
         measured(tmp_path)
     refused = CliRunner().invoke(vpm, ["--overhead", str(tmp_path / "nowhere")])
-    assert "folder; for a percentage write aad=0.0062" in refused.stderr
+    assert "aad=0.0062" in refused.stderr
