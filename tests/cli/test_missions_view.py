@@ -1,5 +1,6 @@
 """What a person sees while a campaign flies."""
 
+import re
 from collections import Counter
 
 import pytest
@@ -59,11 +60,6 @@ def test_plain_lines_come_every_ten_seconds_and_at_the_end(capsys):
             )
         spectator.on_end(progress(100, {"golden": Counter(success=100)}, elapsed_s=25.0))
     lines = capsys.readouterr().err.splitlines()
-    assert [line.partition(" ")[0] for line in lines] == [
-        "0/100",
-        "40/100",
-        "80/100",
-        "100/100",
-        "100",
-    ]
-    assert lines[-1] == "100 missions in 0:25 min, 14400 an hour, 0.0 % of it outside missions"
+    begins = ["0/100", "40/100", "80/100", "100/100", "100"]
+    assert [line.partition(" ")[0] for line in lines] == begins
+    assert re.match("100 missions in 0:25 min, 14400 an hour, 0.0 % ", lines[-1])
