@@ -170,14 +170,14 @@ def test_each_stack_has_its_own_folder(tmp_path):
     flown(ours)
     assert ours.folder == tmp_path / "mavbench-guards_tracking=true"
     shutil.copytree(ours.folder, tmp_path / "mavbench")
-    with pytest.raises(ConfigError, match="flies the stack mavbench:guards_tracking=true, not"):
+    with pytest.raises(ConfigError, match="stack mavbench:guards_tracking=true"):
         flown(plan(tmp_path, "fig9"))
 
 
 def test_another_campaign_is_refused(tmp_path):
     missions = [PlannedMission(config=MissionConfig(world="flat"), labels={})]
     run_campaign(missions, tmp_path / "mavbench", TASK).close()
-    with pytest.raises(ConfigError, match="holds a campaign that is not a reproduction"):
+    with pytest.raises(ConfigError, match="not a reproduction"):
         flown(plan(tmp_path, "fig9"))
 
 
@@ -217,7 +217,7 @@ def test_an_export_has_the_items_whose_flights_it_holds(tmp_path):
         table, flights = shown(ledger, "table4")
         assert len(flights) == 2
         assert [line.count for line in table.rows] == ["1", "1", "0", "0"]
-        with pytest.raises(RecordError, match="holds no flight like those of Table III"):
+        with pytest.raises(RecordError, match=r"no flight .*Table III"):
             shown(ledger, "table3")
 
 
@@ -225,14 +225,14 @@ def test_an_export_without_pairs_has_a_note_and_no_effect(tmp_path):
     rows = [in_dense("planning", instruction=True, seed=seed) for seed in (1, 2)]
     with exported(tmp_path, rows) as ledger:
         table, _ = shown(ledger, "fig12")
-    assert table.notes[-2].startswith("2 of 2 flights with a fault: no golden flight")
+    assert table.notes[-2].startswith("2 of 2 flights")
     assert {line.count for line in table.rows} == {"0"}
 
 
 def test_golden_flights_alone_are_no_item_with_faults(tmp_path):
     with (
         exported(tmp_path, [in_dense()]) as ledger,
-        pytest.raises(RecordError, match=r"holds no flight like those of Fig\. 14"),
+        pytest.raises(RecordError, match=r"no flight .*Fig\. 14"),
     ):
         shown(ledger, "fig14")
 
@@ -242,6 +242,6 @@ def test_an_item_of_two_stacks_is_refused(tmp_path):
     rows = [row("planning", instruction=True, config=config) for config in stacks]
     with (
         exported(tmp_path, rows) as ledger,
-        pytest.raises(RecordError, match="Table IV on several stacks"),
+        pytest.raises(RecordError, match=r"Table IV .*stacks"),
     ):
         shown(ledger, "table4")

@@ -69,25 +69,24 @@ def test_a_bit_field_reaches_every_fault():
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"missions": 0}, "missions: must be at least 1, got 0"),
-        ({"platforms": ()}, "platform: must name at least one, got none"),
-        ({"detectors": ()}, "detector: must name at least one, got none"),
-        ({"platforms": ("x86", "x86")}, "platform: must not name x86 twice"),
-        ({"detectors": ("gad", "none", "gad")}, "detector: must not name gad twice"),
-        ({"inject": ("control", "control")}, "inject: must not name control twice"),
-        ({"first_seed": -1}, "first_seed: must be at least 0, got -1"),
-        ({"seed": -3}, "seed: must be at least 0, got -3"),
-        ({"inject": (), "field": "sign"}, "field: has no effect without a fault, got sign"),
+        ({"missions": 0}, "missions: .*at least 1, got 0"),
+        ({"platforms": ()}, "platform: .*at least one"),
+        ({"detectors": ()}, "detector: .*at least one"),
+        ({"platforms": ("x86", "x86")}, "platform: .*x86 twice"),
+        ({"detectors": ("gad", "none", "gad")}, "detector: .*gad twice"),
+        ({"inject": ("control", "control")}, "inject: .*control twice"),
+        ({"first_seed": -1}, "first_seed: .*at least 0, got -1"),
+        ({"seed": -3}, "seed: .*at least 0, got -3"),
+        ({"inject": (), "field": "sign"}, "field: .*without a fault, got sign"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(changes, told):
-    with pytest.raises(ConfigError) as refused:
+    with pytest.raises(ConfigError, match=f"^{told}"):
         ComparePlan(**changes)
-    assert str(refused.value) == told
 
 
 def test_two_spellings_of_one_file_are_one_platform():
-    with pytest.raises(ConfigError, match=r"^platform: must not name .*/a\.toml twice$"):
+    with pytest.raises(ConfigError, match=r"^platform: .*/a\.toml twice$"):
         ComparePlan(platforms=("a.toml", "./a.toml"))
 
 
