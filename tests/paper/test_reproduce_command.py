@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shutil
 
 import pytest
 from test_reproductions import TASK, flown, plan
@@ -16,19 +17,19 @@ from mavfi_cli.paper.flying import Forecast
 pytestmark = pytest.mark.usefixtures("no_vehicle")
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """The folder of a reproduction of fig9."""
-    asked = plan(tmp_path, "fig9")
+@pytest.fixture(scope="module")
+def folder(no_vehicle, tmp_path_factory):
+    """The folder of a reproduction of fig9; do not change it."""
+    asked = plan(tmp_path_factory.mktemp("reproduction"), "fig9")
     flown(asked)
     return asked.folder
 
 
-@pytest.fixture
-def table3(tmp_path, mavfi):
-    """The folder of a campaign of a preset."""
+@pytest.fixture(scope="module")
+def table3(no_vehicle, tmp_path_factory):
+    """The folder of a campaign of a preset; do not change it."""
     missions = load_spec("table3").scaled(0.02).missions()
-    folder = tmp_path / "campaigns/table3"
+    folder = tmp_path_factory.mktemp("home") / "campaigns/table3"
     run_campaign(missions, folder, TASK).close()
     with Ledger(folder, writing=True) as ledger:
         ledger.set_meta({"name": "table3"})  # as `begin` does
@@ -155,16 +156,17 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
         assert told in run.stderr
 
 
-def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi):
+def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi, tmp_path):
     """What all settings share is said once, below the table."""
-    with Ledger(table3, writing=True) as ledger:
+    mine = shutil.copytree(table3, tmp_path / "mine")
+    with Ledger(mine, writing=True) as ledger:
         ledger.set_meta({"name": "mine"})
-    lines = mavfi("campaign", "status", table3).stdout.splitlines()
+    lines = mavfi("campaign", "status", mine).stdout.splitlines()
     (shared,) = [line for line in lines if "site=waypoint_acceleration" in line]
     assert shared.startswith("in all settings")
     assert any(line.startswith("mavfi campaign report ") for line in lines)
     heads = [line for line in lines if line.startswith("setting")]
     assert [head.split()[:3] for head in heads] == [["setting", "bits", "n"]]
-    whole = mavfi("campaign", "report", table3).stdout
+    whole = mavfi("campaign", "report", mine).stdout
     assert whole.count("site=waypoint_acceleration") == 1
     assert "energy, kJ" in whole
