@@ -19,16 +19,16 @@ from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.report.campaign import flights_file
 from mavfi_cli.spec.fault import FaultConfig
 
-FAULT = FaultConfig(target="waypoint_position", together=True, field="sign", seed=3)
+FAULT = FaultConfig(target="waypoint_position", together=True, field="sign", at="time=0.5", seed=3)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, short_config):
-    """A campaign of a golden and a faulty mission."""
-    made = tmp_path_factory.mktemp("campaign")
+    """A campaign of a golden and a faulty mission, each of a second."""
+    made, golden = tmp_path_factory.mktemp("campaign"), replace(short_config, time_limit_s=1.0)
     missions = [
         PlannedMission(config=config, labels={"n": n})
-        for n, config in enumerate((short_config, replace(short_config, fault=FAULT)))
+        for n, config in enumerate((golden, replace(golden, fault=FAULT)))
     ]
     run_campaign(missions, made).close()
     return made

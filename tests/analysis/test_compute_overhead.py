@@ -80,16 +80,9 @@ def test_a_platform_scaled_for_a_detector_s_share_is_the_platform(tmp_path, name
     assert ComputeOverhead.of([flight(platform=str(path))])["gad"].platforms == ("flown",)
 
 
-@pytest.fixture(scope="module")
-def guarded(fly_short):
-    from mavfi_cli.spec.detector import DetectorConfig
-
-    return fly_short(detector=DetectorConfig(name="gad"))
-
-
 @pytest.mark.slow
-def test_a_real_record_has_what_it_takes(guarded):
-    result = json.loads(guarded.result.read_text())
+def test_a_real_record_has_what_it_takes(watched_flight):
+    result = json.loads(watched_flight.result.read_text())
     found = ComputeOverhead.of([FlightRecord.of(result)])["gad"]
     assert found.detection_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert found.compute_s == pytest.approx(sum(k["busy_s"] for k in result["kernels"].values()))
@@ -101,18 +94,19 @@ def measured(path, platform=None):
 
 
 @pytest.mark.slow
-def test_the_command_takes_a_run_folder(guarded, tmp_path):
-    found = measured(guarded.path)
+def test_the_command_takes_a_run_folder(watched_flight, tmp_path):
+    folder = watched_flight.path
+    found = measured(folder)
     assert "1 flight of here on x86: " in found.describe("here")
-    assert measured(guarded.result) == measured(guarded.path, "x86") == found
-    assert measured(guarded.path.parent).share > 0.0  # the folder of runs
-    asked = ["--overhead", str(guarded.path), "--overhead", "aad=0.5", "--json"]
+    assert measured(watched_flight.result) == measured(folder, "x86") == found
+    assert measured(folder.parent).share > 0.0  # the folder of runs
+    asked = ["--overhead", str(folder), "--overhead", "aad=0.5", "--json"]
     told = json.loads(CliRunner().invoke(vpm, asked).stdout)["vehicles"][0]["schemes"]
     given = {row["scheme"]: (row["overhead_percent"], row["source"]) for row in told}
     assert given["aad"] == (0.5, "--overhead")
-    assert given["gad"] == (pytest.approx(100.0 * found.share), found.describe(str(guarded.path)))
+    assert given["gad"] == (pytest.approx(100.0 * found.share), found.describe(str(folder)))
     with pytest.raises(RecordError, match=r"tx2 \(--platform\) .* gad on x86"):
-        measured(guarded.path, "tx2")
+        measured(folder, "tx2")
     with pytest.raises(RecordError, match="gad or aad"):
         measured(tmp_path)
     refused = CliRunner().invoke(vpm, ["--overhead", str(tmp_path / "nowhere")])

@@ -6,7 +6,6 @@ import pytest
 from made_flights import watched
 
 from mavfi_cli.mission.measures import DetectionCost, FlightRecord
-from mavfi_cli.spec.detector import DetectorConfig
 
 ALARMS = [
     ("perception", "recompute"), ("planning", "recompute"), ("planning", "hold"),
@@ -63,8 +62,8 @@ def test_a_flight_in_which_nothing_was_checked_has_no_cost(changes):
     assert DetectionCost.of(FlightRecord.of({"outcome": "hang"})) is None
 
 
-def test_a_real_record_has_what_it_takes(fly_short):
-    result = json.loads(fly_short(detector=DetectorConfig(name="aad")).result.read_text())
+def test_a_real_record_has_what_it_takes(watched_flight):
+    result = json.loads(watched_flight.result.read_text())
     cost = DetectionCost.of(FlightRecord.of(result))
     assert cost.checks_host_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert cost.flight_s == result["quality_of_flight"]["flight_time_s"]

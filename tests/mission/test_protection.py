@@ -278,6 +278,9 @@ def test_a_golden_flight_is_the_same_with_a_silent_gate(guarded, short_flight):
     assert run.result["detection"]["checks"]["tick"] == run.trace.num_rows
     assert run.folder.trace.read_bytes() == golden.folder.trace.read_bytes()
     assert run.folder.tlog.read_bytes() == golden.folder.tlog.read_bytes()
+    assert run.mission().detector == DetectorConfig(name="limit", alarms_max=3)
+    asked = json.loads(run.folder.result.read_text())["config"]["detector"]
+    assert asked["protect"] == [stage.value for stage in Stage]
 
 
 def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
@@ -388,8 +391,8 @@ def test_a_flip_in_a_number_of_the_flown_plan_is_undone_before_the_check_reads_i
     assert result["outcome"] == "success"
 
 
-def test_a_golden_flight_is_the_same_with_the_extended_watch(fly_short, short_flight):
-    golden, run = load_run(short_flight.path), load_run(fly_short(detector=EXTENDED).path)
+def test_a_golden_flight_is_the_same_with_the_extended_watch(watched_flight, short_flight):
+    golden, run = load_run(short_flight.path), load_run(watched_flight.path)
     assert run.result["detection"]["alarm_count"] == 0
     assert run.folder.trace.read_bytes() == golden.folder.trace.read_bytes()
     assert run.folder.tlog.read_bytes() == golden.folder.tlog.read_bytes()
@@ -436,10 +439,3 @@ def test_a_campaign_refuses_a_model_of_another_stack_before_it_flies(mavfi, tmp_
 def test_a_fault_in_no_detector_is_refused(fly_short):
     with pytest.raises(FaultSpecError, match="--detector"):
         fly_short(fault=FaultConfig(target="detector"))
-
-
-def test_the_record_of_a_guarded_run_can_be_read_back(guarded):
-    run = guarded()
-    asked = json.loads(run.folder.result.read_text())["config"]["detector"]
-    assert run.mission().detector == DetectorConfig(name="limit", alarms_max=3)
-    assert asked["protect"] == [stage.value for stage in Stage]
