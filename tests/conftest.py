@@ -24,12 +24,12 @@ from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
 from mavfi_cli.mission.vehicle import Vehicle
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.spec.platform import load_platform
 from sitl.camera.component import COMPONENT_ID, Camera
 
-for _folder in ("link", "analysis"):  # scripted autopilots, and flights that were made up
-    sys.path.insert(0, str(Path(__file__).parent / _folder))
+sys.path.insert(0, str(Path(__file__).parent / "link"))  # scripted autopilots
 settings.register_profile("no clock", deadline=None)  # no test asserts speed by the clock
 settings.load_profile("no clock")
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
@@ -58,6 +58,12 @@ def fly_short(tmp_path_factory):
 def short_flight(fly_short):
     """Run folder of one successful flight; do not change it."""
     return fly_short()
+
+
+@pytest.fixture(scope="session")
+def watched_flight(fly_short):
+    """Run folder of the same flight with a detector that also watches numbers of plans."""
+    return fly_short(detector=DetectorConfig(name="gad", watch="extended"))
 
 
 @pytest.fixture(scope="session")

@@ -169,7 +169,7 @@ def test_the_action_ends_with_the_first_command_that_fails(tmp_path):
     done = run_step("Run mavfi", tmp_path, mavfi, COMMANDS=commands)
     assert done.returncode != 0
     assert done.stdout.startswith("mavfi platforms x86\nx86")
-    assert "error: no such folder; touch harm: no such run folder" in done.stderr
+    assert "error: no such folder; touch harm: " in done.stderr
     assert "--version" not in done.stdout
     assert not (tmp_path / "harm").exists()
     assert run_step("Run mavfi", tmp_path, mavfi, COMMANDS="--version").returncode == 0

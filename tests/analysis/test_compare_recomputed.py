@@ -5,7 +5,7 @@ from types import SimpleNamespace as Namespace
 
 import numpy as np
 import pytest
-from flown_twice import figures_of, flight
+from made_flights import comparison, on
 from scipy import stats
 
 from mavfi_cli.studies.compare import ComparePlan
@@ -25,7 +25,7 @@ def flights():
     def fly(platform, slower, seed, setting, target, rate):
         cost = rng.exponential(1.5) if setting != "golden" and rng.random() < 0.3 else 0.0
         found.append(
-            flight(
+            on(
                 platform,
                 seed,
                 slower * length_s[seed] + cost,
@@ -55,7 +55,7 @@ def flown():
 
 @pytest.fixture(scope="module")
 def told(flown):
-    return figures_of(PLAN, flown)
+    return comparison(PLAN, flown)
 
 
 def succeeded(each):

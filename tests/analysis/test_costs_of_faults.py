@@ -5,14 +5,14 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from flown_twice import SEEDS, flight, table
+from made_flights import SEEDS, compared, on
 
 from mavfi_cli.analysis.platforms import FaultCosts, WorstFault
 from mavfi_cli.stats.shares import Interval
 
 
 def struck(golden, counted, setting="none"):
-    return FaultCosts(table([*golden, *counted]).chosen(setting=setting))
+    return FaultCosts(compared([*golden, *counted]).chosen(setting=setting))
 
 
 def cost_row(setting, found):
@@ -25,15 +25,15 @@ def beyond(found, first):
 
 def of(platform, costs, *, golden_s=20.0, target="planning", lost=()):
     """Flights whose faults cost so many seconds, by seed, beside their golden ones."""
-    golden = [flight(platform, seed, golden_s) for seed in {*costs, *lost}]
-    counted = [flight(platform, s, golden_s + c, "none", target=target) for s, c in costs.items()]
-    counted += [flight(platform, s, 5.0, "none", target=target, outcome="collision") for s in lost]
+    golden = [on(platform, seed, golden_s) for seed in {*costs, *lost}]
+    counted = [on(platform, s, golden_s + c, "none", target=target) for s, c in costs.items()]
+    counted += [on(platform, s, 5.0, "none", target=target, outcome="collision") for s in lost]
     return struck(golden, counted)
 
 
 def test_the_cost_is_held_against_the_own_golden_flight():
-    golden = [flight("x86", 1, 20.0), flight("x86", 2, 40.0), flight("x86", 5, 40.0)]
-    counted = [flight("x86", 1, 25.0, "none"), flight("x86", 2, 44.0, "none")]
+    golden = [on("x86", 1, 20.0), on("x86", 2, 40.0), on("x86", 5, 40.0)]
+    counted = [on("x86", 1, 25.0, "none"), on("x86", 2, 44.0, "none")]
     bare = struck(golden, counted)
     told = cost_row("none", bare)
     assert told.pairs == 2
@@ -48,17 +48,15 @@ def test_a_flight_that_only_the_fault_lost_is_counted_as_lost_and_costs_nothing(
     found = of("x86", {1: 0.0, 2: 1.0}, lost=(3, 4))
     told = cost_row("none", found)
     assert (told.pairs, told.lost) == (2, 2)
-    golden_lost = struck([flight("x86", 1, 20.0)], [flight("x86", 2, 5.0, "none", outcome="crash")])
+    golden_lost = struck([on("x86", 1, 20.0)], [on("x86", 2, 5.0, "none", outcome="crash")])
     assert cost_row("none", golden_lost).lost == 0
 
 
 def recovered(bare, protected):
     """The share that a detector recovers of costs by seed, s, over golden flights of 20 s."""
-    golden = [flight("x86", seed, 20.0) for seed in {*bare, *protected}]
+    golden = [on("x86", seed, 20.0) for seed in {*bare, *protected}]
     costs = {"none": bare, "gad": protected}
-    faulty = [
-        flight("x86", seed, 20.0 + c, name) for name in costs for seed, c in costs[name].items()
-    ]
+    faulty = [on("x86", seed, 20.0 + c, name) for name in costs for seed, c in costs[name].items()]
     return cost_row("gad", struck(golden, faulty, "gad")).over_own.recovered_share
 
 
@@ -85,9 +83,9 @@ def test_the_95th_percentile_is_numpys_and_lies_in_its_interval():
 def test_faults_of_one_mission_are_drawn_together():
     """Twice the same costs under another target are no more missions, and no narrower interval."""
     costs = {seed: 0.3 * (seed % 4) for seed in SEEDS}
-    golden = [flight("x86", seed, 20.0) for seed in SEEDS]
-    once = [flight("x86", s, 20.0 + c, "none", target="planning") for s, c in costs.items()]
-    again = [flight("x86", s, 20.0 + c, "none", target="control") for s, c in costs.items()]
+    golden = [on("x86", seed, 20.0) for seed in SEEDS]
+    once = [on("x86", s, 20.0 + c, "none", target="planning") for s, c in costs.items()]
+    again = [on("x86", s, 20.0 + c, "none", target="control") for s, c in costs.items()]
     one, two = struck(golden, once), struck(golden, once + again)
     single, double = (cost_row("none", each).cost_s.mean for each in (one, two))
     assert astuple(single) == pytest.approx(astuple(double))
@@ -95,9 +93,9 @@ def test_faults_of_one_mission_are_drawn_together():
 
 
 def test_missing_flights_of_a_mission_leave_the_others():
-    golden = [flight("x86", seed, 20.0) for seed in SEEDS]
-    counted = [flight("x86", s, 21.0, "none", target="planning") for s in SEEDS]
-    counted += [flight("x86", s, 23.0, "none", target="control") for s in (2, 5)]
+    golden = [on("x86", seed, 20.0) for seed in SEEDS]
+    counted = [on("x86", s, 21.0, "none", target="planning") for s in SEEDS]
+    counted += [on("x86", s, 23.0, "none", target="control") for s in (2, 5)]
     found = struck(golden, counted)
     told = cost_row("none", found)
     values = [1.0] * 10 + [3.0] * 2
@@ -124,8 +122,8 @@ def test_platforms_are_compared_over_the_faults_that_both_have_a_cost_of():
 
 
 def test_the_longest_flight_counts_where_its_golden_one_failed_too():
-    first = struck([flight("x86", 1, 20.0)], [flight("x86", s, 20.0 * s, "none") for s in (1, 2)])
-    second = struck([flight("tx2", 1, 20.0)], [flight("tx2", s, 30.0 * s, "none") for s in (1, 2)])
+    first = struck([on("x86", 1, 20.0)], [on("x86", s, 20.0 * s, "none") for s in (1, 2)])
+    second = struck([on("tx2", 1, 20.0)], [on("tx2", s, 30.0 * s, "none") for s in (1, 2)])
     assert (second.costs.num_rows, second.longest_s) == (1, 60.0)
     told = beyond(second, first)
     assert (told.pairs, told.longest_ratio) == (1, 1.5)
@@ -149,11 +147,11 @@ def test_three_faults_that_cost_more_are_no_difference_whatever_the_interval():
 
 
 def test_the_chance_takes_the_faults_of_one_mission_as_one():
-    golden = [flight(p, seed, 20.0) for p in ("x86", "tx2") for seed in SEEDS]
+    golden = [on(p, seed, 20.0) for p in ("x86", "tx2") for seed in SEEDS]
 
     def found(platform, cost_s):
         own = [each for each in golden if each["platform"] == platform]
-        return struck(own, [flight(platform, s, 20.0 + cost_s, "none", target=target)
+        return struck(own, [on(platform, s, 20.0 + cost_s, "none", target=target)
                             for s in (1, 2, 3) for target in ("planning", "control")])  # fmt: skip
 
     told = beyond(found("tx2", 1.0), found("x86", 0.0))

@@ -4,19 +4,18 @@ import math
 
 import pyarrow as pa
 import pytest
-from evaluation_flights import error_free, flown, pair, struck, table
+from made_flights import error_free, flight, pair, pairs_table, struck
 
 from mavfi_cli.analysis import detectors as question
-from mavfi_cli.campaigns.missions import Injected
 
 NO_SCORES = pa.table({"stage": [], "field": [], "score": []})
 
 
 def answers(error_free, faults, *detectors):
     """What is found of pairs whose flights have no score."""
-    free, struck = table(error_free), table(faults)
+    free, hit = pairs_table(error_free), pairs_table(faults)
     about = {"schema": 2, "plan": None, "versions": {}, "errors": []}
-    return question.results(detectors, free, struck, lambda _: (NO_SCORES, []), **about)
+    return question.results(detectors, free, hit, lambda _: (NO_SCORES, []), **about)
 
 
 def row(rows):
@@ -34,7 +33,7 @@ def fault_metrics(bare, pairs):
 
 def test_false_alarms_a_flight_hour():
     quiet = [error_free(seed=seed) for seed in range(8)]
-    loud = error_free(watched=flown(time_s=1000.0, alarms_s=(1.0, 2.0, 3.0)), seed=8)
+    loud = error_free(watched=flight(1000.0, alarms_s=(1.0, 2.0, 3.0)), seed=8)
     found = error_free_metrics([*quiet, loud])
     assert found.hours == pytest.approx(1800 / 3600)
     assert (found.alarms, found.episodes) == (3, 1)
@@ -51,19 +50,19 @@ def test_no_alarm_at_all_still_has_an_upper_limit():
 
 
 def test_missions_without_a_flight_time_have_no_part_in_the_rate():
-    cut_off = error_free(watched=flown("crash", None))
-    found = error_free_metrics([error_free(seed=2, watched=flown(alarms_s=(1.0,))), cut_off])
+    cut_off = error_free(watched=flight(None, outcome="crash"))
+    found = error_free_metrics([error_free(seed=2, watched=flight(alarms_s=(1.0,))), cut_off])
     assert (found.alarms_per_hour.value, found.alarms_per_hour.count) == (36.0, 1)
     assert math.isnan(error_free_metrics([cut_off]).alarms_per_hour.value)
 
 
 def test_missions_lost_and_lengthened_by_false_alarms():
     pairs = [
-        error_free(flown(), flown(time_s=102.0), seed=0),
-        error_free(flown(), flown(time_s=104.0), seed=1),
-        error_free(flown(), flown(time_s=100.0), seed=2),
-        error_free(flown(), flown("collision", 30.0), seed=3),
-        error_free(flown("timeout"), flown(time_s=250.0), seed=4),
+        error_free(flight(), flight(102.0), seed=0),
+        error_free(flight(), flight(104.0), seed=1),
+        error_free(flight(), flight(100.0), seed=2),
+        error_free(flight(), flight(None), seed=3),
+        error_free(flight(outcome="timeout"), flight(250.0), seed=4),
     ]
     found = error_free_metrics(pairs)
     assert (found.lost.count, found.lost.total, found.gained) == (1, 4, 1)
@@ -72,17 +71,17 @@ def test_missions_lost_and_lengthened_by_false_alarms():
 
 
 # Unprotected and protected flights of six faults; golden flights take 100 s and succeed.
-LOST, LONGER, HARMLESS = struck("collision", 40.0), struck(time_s=150.0), struck(time_s=101.0)
-UNREAD = struck(injected=Injected.NOT_ACTIVATED)
-ABSENT = flown(injected=Injected.NOT_INJECTED.value)
+LOST, LONGER, HARMLESS = struck(None), struck(150.0), struck(101.0)
+UNREAD = struck(injected="not_activated")
+ABSENT = flight(injected="not_injected")
 CASES = [
-    (LOST, struck(time_s=103.0, alarms_s=(20.0,))),  # recovered, seen at once
-    (LOST, struck("collision", 45.0, alarms_s=(20.4,))),  # seen, but lost all the same
-    (LONGER, struck(time_s=120.0, alarms_s=(10.0, 20.2))),  # better, yet not undone
-    (HARMLESS, struck(time_s=101.0)),  # not seen, not needed
-    (HARMLESS, struck("timeout", 300.0, alarms_s=(30.0,))),  # made worse
+    (LOST, struck(103.0, alarms_s=(20.0,))),  # recovered, seen at once
+    (LOST, struck(None, alarms_s=(20.4,))),  # seen, but lost all the same
+    (LONGER, struck(120.0, alarms_s=(10.0, 20.2))),  # better, yet not undone
+    (HARMLESS, struck(101.0)),  # not seen, not needed
+    (HARMLESS, struck(300.0, outcome="timeout", alarms_s=(30.0,))),  # made worse
     (UNREAD, struck(alarms_s=(20.0,))),
-    (ABSENT, flown(alarms_s=(50.0,))),
+    (ABSENT, flight(alarms_s=(50.0,))),
 ]
 
 
@@ -127,7 +126,7 @@ def test_worst_case_and_its_recovery(found):
 
 
 def test_a_worst_flight_that_is_no_harm_needs_no_recovery():
-    worst = fault_metrics([pair(HARMLESS)], [pair(HARMLESS, struck(time_s=90.0))]).worst
+    worst = fault_metrics([pair(HARMLESS)], [pair(HARMLESS, struck(90.0))]).worst
     assert (worst.faulty, worst.protected) == pytest.approx((0.01, -0.1))
     assert math.isnan(worst.recovered_share)
 
@@ -137,7 +136,7 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
     bare = [pair(HARMLESS, seed=seed) for seed in range(4)] + [pair(LOST, seed=4)]
     flown_too = [
         pair(HARMLESS, struck(), seed=0),
-        pair(HARMLESS, struck("collision", 50.0), seed=1),
+        pair(HARMLESS, struck(None), seed=1),
         pair(LOST, struck(alarms_s=(20.0,)), seed=4, complete=False),
     ]
     found = fault_metrics(bare, flown_too)
@@ -150,8 +149,8 @@ def test_harmless_faults_of_incomplete_missions_count_by_their_number_only():
 
 
 def test_a_mission_that_fails_without_the_fault_cannot_be_harmed():
-    doomed = [pair(LOST, golden=flown("timeout"), seed=1)]
-    protected = [pair(LOST, struck(), golden=flown("timeout"), seed=1)]
+    doomed = [pair(LOST, golden=flight(outcome="timeout"), seed=1)]
+    protected = [pair(LOST, struck(), golden=flight(outcome="timeout"), seed=1)]
     found = fault_metrics([pair(LOST), *doomed], [pair(LOST, struck()), *protected])
     assert (found.planned, found.golden_failed, found.active) == (2, 1, 1)
     assert (found.harmful.count, found.harmful.total, found.recovered.total) == (1, 1, 1)
@@ -169,8 +168,8 @@ def test_without_an_active_fault_nothing_is_known():
 
 def test_two_detectors_on_the_same_faults():
     first = [pair(LOST, struck(), seed=seed) for seed in range(3)]
-    second = [pair(LOST, struck("collision"), seed=seed, detector="aad") for seed in (2, 1, 5)]
-    first.append(pair(LONGER, struck(time_s=150.0), seed=9))
+    second = [pair(LOST, struck(None), seed=seed, detector="aad") for seed in (2, 1, 5)]
+    first.append(pair(LONGER, struck(150.0), seed=9))
     second.append(pair(LONGER, struck(), seed=9, detector="aad"))
     (compared,) = answers([], [*first, *second], "gad", "aad").comparisons
     kinds = ("both", "only_first", "only_second", "neither")

@@ -1,10 +1,9 @@
 """What a fault did, and whether it was seen."""
 
 import pytest
-from evaluation_flights import flown, labelled, pair, paired, struck
+from made_flights import flight, labelled, pair, paired, struck
 
 from mavfi_cli.analysis.detectors import WANTED
-from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.mission.measures import FlightRecord, measures_of
 
 GOLDEN = {"kind": "error-free", "world": "farm", "seed": 7}
@@ -17,13 +16,13 @@ FAULT = {
 @pytest.mark.parametrize(
     ("golden", "treated", "harm"),
     [
-        (flown(), struck(time_s=109.9), "none"),
-        (flown(), struck(time_s=110.1), "longer"),
-        (flown(), struck(time_s=90.0), "none"),
-        (flown(), struck("collision", 10.0), "lost"),
-        (flown(), struck("crash", None), "lost"),
-        (flown("collision"), struck("timeout", 300.0), ""),  # nothing can harm this mission
-        (flown("collision"), struck(), ""),
+        (flight(), struck(109.9), "none"),
+        (flight(), struck(110.1), "longer"),
+        (flight(), struck(90.0), "none"),
+        (flight(), struck(10.0, outcome="collision"), "lost"),
+        (flight(), struck(None, outcome="crash"), "lost"),
+        (flight(None), struck(300.0, outcome="timeout"), ""),  # nothing can harm this mission
+        (flight(None), struck(), ""),
     ],
 )
 def test_harm_is_a_lost_mission_or_more_than_ten_per_cent(golden, treated, harm):
@@ -40,38 +39,33 @@ def test_an_alarm_before_the_strike_detects_nothing():
 
 
 def test_a_protected_flight_that_was_never_struck_has_nothing_to_detect():
-    parted = pair(struck(), flown(alarms_s=(25.0,), injected="not_injected"))
+    parted = pair(struck(), flight(alarms_s=(25.0,), injected="not_injected"))
     assert not parted["struck"]
     assert not parted["seen"]
 
 
 def test_what_the_detector_does_anyway_is_by_chance():
-    assert pair(struck(), struck(alarms_s=(21.0,)), watched=flown(alarms_s=(50.0,)))["by_chance"]
-    assert not pair(struck(), struck(), watched=flown(alarms_s=(10.0,)))["by_chance"]
+    assert pair(struck(), struck(alarms_s=(21.0,)), watched=flight(alarms_s=(50.0,)))["by_chance"]
+    assert not pair(struck(), struck(), watched=flight(alarms_s=(10.0,)))["by_chance"]
 
 
 @pytest.mark.parametrize(
     ("injected", "active"),
-    [
-        (Injected.ACTIVE, True),
-        (Injected.UNREAD, True),
-        (Injected.NOT_ACTIVATED, False),
-        (Injected.NOT_INJECTED, False),
-    ],
+    [("active", True), ("unread", True), ("not_activated", False), ("not_injected", False)],
 )
 def test_activity_is_that_of_the_unprotected_flight(injected, active):
-    withheld = struck(injected=Injected.NOT_ACTIVATED)  # the gate kept anybody from reading it
+    withheld = struck(injected="not_activated")  # the gate kept anybody from reading it
     assert pair(struck(injected=injected), withheld)["active"] is active
 
 
 def test_pairs_need_all_of_their_flights():
     rows = [
         labelled(struck(), **FAULT, detector="gad"),
-        labelled(struck("collision"), **FAULT, detector="none"),
-        labelled(flown(), **GOLDEN, detector="none"),
+        labelled(struck(None), **FAULT, detector="none"),
+        labelled(flight(), **GOLDEN, detector="none"),
     ]
     assert paired(rows, "gad")[1] == []
-    rows.append(labelled(flown(alarms_s=(3.0,)), **GOLDEN, detector="gad"))
+    rows.append(labelled(flight(alarms_s=(3.0,)), **GOLDEN, detector="gad"))
     (free,), (found,) = paired(rows, "gad", complete=lambda seed: seed != 7)
     told = [found[name] for name in ("world", "seed", "stage", "field")]
     assert told == ["farm", 7, "planning", "sign"]

@@ -34,7 +34,7 @@ def test_a_damaged_time_table_is_one_line(tmp_path, bad):
     folder = RunFolder(tmp_path)
     if bad is not None:
         folder.kernels.write_bytes(bad)
-    with pytest.raises(RecordError, match="the time table cannot be read"):
+    with pytest.raises(RecordError, match="cannot be read"):
         folder.read_timetable()
 
 

@@ -6,7 +6,7 @@ import pytest
 from mavfi_cli.analysis.flights import exported
 from mavfi_cli.analysis.trajectories import pair
 from mavfi_cli.campaigns.begin import chosen, opened
-from mavfi_cli.campaigns.missions import Injected, PlannedMission, ResultState
+from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.spec.detector import DetectorConfig
@@ -87,15 +87,11 @@ def test_without_a_number_the_pair_is_drawn_in_which_a_fault_costs_most_time(boo
 def test_what_is_not_in_the_picture_is_told(book):
     fly(book, 1, (20.0,) * 5)
     labels = {"setting": "FI", "world": "dense", "stage": "control"}
-    for target in ("command_vx", "command_vy"):
-        fault = FaultConfig(target=target, seed=1)
-        book.ledger.plan([PlannedMission(config=MissionConfig(seed=1, fault=fault), labels=labels)])
-    book.ledger.add(
-        5, state=ResultState.ERROR, result={}, reason="blocked", injected=None, wall_s=0.1,
-        attempts=1, path=None,
-    )  # fmt: skip
-    drawn = pair(book.ledger, 6)
-    assert drawn.absent == ["mission 5 could not begin: blocked", "mission 6 not flown yet"]
+    for target, write in (("command_vx", book.fail), ("command_vy", book.plan)):
+        number = write(labels, 1, MissionConfig(seed=1, fault=FaultConfig(target=target, seed=1)))
+    drawn = pair(book.ledger, number)
+    assert [text[:9] for text in drawn.absent] == ["mission 5", "mission 6"]
+    assert drawn.absent[0].endswith(": blocked")
     assert len(drawn.panels) == 2
 
 
@@ -108,10 +104,11 @@ def test_a_flight_that_was_cut_off_is_told_and_the_others_are_drawn(book):
             (runs / f"{number:06d}-dense-1" / "result.json").write_text("{}")
     drawn = pair(book.ledger)
     assert [each.number for each in drawn.panels[1].flights] == [0, 4]
-    assert drawn.absent == ["mission 2: success, cut off before its record"]
+    (absent,) = drawn.absent
+    assert absent.startswith("mission 2: success, ")
     for left in runs.glob("*/result.json"):
         left.unlink()
-    with pytest.raises(RecordError, match="missions 0, 1, 2, 3, 4 left no record to draw"):
+    with pytest.raises(RecordError, match=r"missions 0, 1, 2, 3, 4 .*record"):
         pair(book.ledger)
 
 
@@ -135,17 +132,17 @@ def test_without_faults_there_is_one_panel(book):
 
 
 def test_a_pair_that_cannot_be_drawn_is_refused(book):
-    with pytest.raises(RecordError, match="no pair has all its run folders"):
+    with pytest.raises(RecordError, match="no pair"):
         pair(book.ledger)
     fly(book, 1, (20.0,) * 5, kept=False)
-    with pytest.raises(RecordError, match=r"no pair has .* --keep all. into another folder"):
+    with pytest.raises(RecordError, match="--keep all"):
         pair(book.ledger)
-    with pytest.raises(RecordError, match="no run folder of missions 0, 1, 2, 3, 4 was kept"):
+    with pytest.raises(RecordError, match="no run folder of missions 0, 1, 2, 3, 4"):
         pair(book.ledger, 2)
-    with pytest.raises(ConfigError, match="no mission 5; the list has missions 0 to 4"):
+    with pytest.raises(ConfigError, match=r"mission 5; .* 0 to 4"):
         pair(book.ledger, 5)
-    book.ledger.plan([PlannedMission(config=MissionConfig(seed=9), labels=GOLDEN)])
-    with pytest.raises(RecordError, match="no flight of mission 5's pair"):
+    book.plan(GOLDEN, 9)
+    with pytest.raises(RecordError, match="mission 5's pair"):
         pair(book.ledger, 5)
 
 

@@ -68,7 +68,7 @@ def test_callgrind_counts_what_is_stepped(
 def test_code_that_callgrind_cannot_name_is_refused_with_the_reason(place, monkeypatch):
     where = place("counting", "300")
     unnamed = {callgrind.UNNAMED: {0x109100: 70_000}, "/elsewhere": {0x100: 1}}
-    with pytest.raises(TargetError, match=r"callgrind cannot name: .* no writable data"):
+    with pytest.raises(TargetError, match="no writable data"):
         profiles.profile_counted(where, np.random.default_rng(1), unnamed, begun=0.0)
 
 
@@ -88,7 +88,7 @@ def test_a_long_program_is_attacked_whole(native_program):
     summary = summarise(plan, [runs])
     assert summary.as_dict()["counted"]
     assert summary.as_dict()["not_reached"] < 0.02
-    assert "counted by callgrind; 0 % of the executions are not reached" in summary.text()
+    assert "callgrind; 0 % of the executions" in summary.text()
 
 
 def test_it_tells_how_fast_callgrind_counts_and_when_it_ends(native_program, monkeypatch):
@@ -100,13 +100,8 @@ def test_it_tells_how_fast_callgrind_counts_and_when_it_ends(native_program, mon
     run_campaign(Plan(runs=1, seed=1), [target], stage=told.append)
     waiting = [text for text in told if "callgrind" in text]
     assert len(waiting) > 5
-    form = re.compile(
-        r"profile, counted by callgrind, \d+ s of at most (\d+) s"
-        r"(; [\d.e+]+ million instructions a second(; about \d+ s left)?)?"
-    )
-    matches = [form.fullmatch(text) for text in waiting]
-    assert len({match[1] for match in matches}) == 1
-    assert matches[-1][3]
+    assert len({re.search(r" \d+ s of at most (\d+) s", text)[1] for text in waiting}) == 1
+    assert re.search(r"; [\d.e+]+ million .*; about \d+ s left$", waiting[-1])
     stepped = next(text for text in told if text.endswith("instructions stepped"))
     assert told.index(stepped) < told.index(waiting[0])
 
@@ -130,11 +125,9 @@ def test_the_time_left_follows_from_the_native_time(tmp_path, monkeypatch):
     )
     (tmp_path / "counts.1").write_text("ob=/a\n0x10 0 30000000\n0x14 0 5000000\ntotals: 35000000\n")
     (tmp_path / "counts.2").write_text("ob=/a\n0x10 0 30000000\n")  # not finished
-    assert count.update() == (
-        "counted by callgrind, 12 s of at most 1860 s; 3.5 million instructions a second; "
-        "about 28 s left"
-    )
-    assert count.update().endswith("; about 25 s left")
+    told = count.update()
+    assert re.findall(r"[\d.]+", told) == ["12", "1860", "3.5", "28"]  # s, s, million a second, s
+    assert " 25 s left" in count.update()
 
 
 @pytest.mark.slow
@@ -149,7 +142,7 @@ def test_counts_that_are_not_those_of_a_run_are_refused(place, monkeypatch):
             for path, found in true_counts(*given).items()
         },
     )
-    with pytest.raises(TargetError, match="more often than the 59999 times that callgrind counts"):
+    with pytest.raises(TargetError, match=r"59999 times .*callgrind"):
         where.profile(np.random.default_rng(1))
 
 
@@ -158,5 +151,5 @@ def test_without_valgrind_a_long_program_is_refused_by_advice(place, monkeypatch
     monkeypatch.setattr(profiles, "STEPS", 1000)
     where = place("counting", "60000")
     where.limits = programs.RunLimits(profile_steps=1000)
-    with pytest.raises(TargetError, match="is counted if valgrind is installed"):
+    with pytest.raises(TargetError, match="if valgrind is installed"):
         where.profile(np.random.default_rng(1))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -46,7 +47,7 @@ def test_one_that_prints_100_mb(attack):
 
 def test_one_that_needs_more_memory_than_it_gets(attack):
     text = refused(attack("eats", "--memory", "0.5"))
-    assert "ends with exit code 9 without a fault: it needs more than 0.5 GB; --memory" in text
+    assert re.search(r"exit code 9 .* 0\.5 GB; --memory", text)
     assert "more than 2 GB" in refused(attack("eats"))
     done = attack("eats", "--memory", "4")
     assert done.exit_code == 0, done.output
@@ -55,20 +56,20 @@ def test_one_that_needs_more_memory_than_it_gets(attack):
 def test_one_that_writes_outside_its_folder_is_attacked_with_a_warning(attack, tmp_path):
     done = attack(f"writes {tmp_path}/mine")
     assert done.exit_code == 0, done.output
-    assert f"warning: guest writes outside its folder: {tmp_path}/mine" in done.stderr
+    assert f"outside its folder: {tmp_path}/mine" in done.stderr
     assert (tmp_path / "mine").read_text() == "x"
 
 
 def test_one_that_ends_with_an_exit_code_is_attacked_with_a_warning(native_program):
     line = ["--program", str(native_program("writing")), "--args", "nowhere/file", "--runs", "1"]
     done = CliRunner().invoke(kernels, [*line, "--ignore-lines", "^Time"])
-    assert "warning: writing ends with exit code 3 without a fault; a run that" in done.stderr
+    assert "warning: writing ends with exit code 3" in done.stderr
 
 
 def test_one_that_writes_a_file_that_is_not_compared_is_attacked_with_a_warning(attack):
     done = attack("writes here")
     assert done.exit_code == 0, done.output
-    assert "warning: guest writes here, which is not compared" in done.stderr
+    assert "warning: guest writes here, " in done.stderr
     assert "--compare file:here compares it" in done.stderr
     assert not Path("here").exists()
     done = attack("writes here", "--compare", "file:here")
@@ -81,9 +82,7 @@ def test_a_script(attack, tmp_path):
     script.write_text("#!/bin/sh\necho 1\n")
     script.chmod(0o755)
     text = refused(attack(program=script))
-    assert (
-        f"run.sh: is a script; attack its interpreter: --program /bin/sh --args '{script}'" in text
-    )
+    assert f"--program /bin/sh --args '{script}'" in text
     script.write_text("#!/usr/bin/env python3\n")
     assert f"--program python3 --args '{script}'" in refused(attack(program=script))
 
@@ -120,15 +119,15 @@ def test_a_statically_linked_program_works(attack, native_program, length):
 
 def test_one_that_needs_a_terminal(attack):
     text = refused(attack("asks"))
-    assert "without a fault (no terminal here)" in text
+    assert "(no terminal here)" in text
 
 
 @pytest.mark.parametrize(
     ("args", "program", "what"),
     [
-        ("", "threads", "starts a thread (system call clone"),
-        ("", "parent", "starts a child process (system call clone)"),
-        ("execs", "guest", "replaces itself by another program (system call execve)"),
+        ("", "threads", "(system call clone"),
+        ("", "parent", "child process (system call clone)"),
+        ("execs", "guest", "(system call execve)"),
     ],
 )
 def test_threads_and_children_are_refused_by_name(attack, native_program, args, program, what):
@@ -143,7 +142,7 @@ def test_one_that_never_ends(native_program, what):
     command = Program.of([str(native_program("guest")), what])
     limits = RunLimits(golden_s=1.0)
     where = ProgramTarget(command=command, comparison=OutputComparison(), limits=limits).open()
-    with pytest.raises(TargetError, match="does not end within 1 s without a fault"):
+    with pytest.raises(TargetError, match="within 1 s"):
         where.fault_free()
     where.close()
 

@@ -192,9 +192,9 @@ def test_what_cannot_be_copied_is_refused(made, home, monkeypatch, name):
     else:
         path.symlink_to({"up": "..", "zero": "/dev/zero", "gone": "/gone/away"}[name])
     expected = {
-        "up": f"{path}/data cannot be copied: it is a cycle or too deep",
-        "zero": f"{path} cannot be copied: it is neither a file nor a folder",
-        "pipe": f"{path} cannot be copied: it is neither a file nor a folder",
+        "up": f"{path}/data cannot be copied: .* cycle",
+        "zero": f"{path} cannot be copied: .* neither a file nor a folder",
+        "pipe": f"{path} cannot be copied: .* neither a file nor a folder",
         "gone": f"its files cannot be copied: .*'{path}'",
     }
     with pytest.raises(TargetError, match=expected.get(name, "name large inputs by absolute")):
@@ -207,7 +207,7 @@ def test_what_cannot_be_copied_is_refused(made, home, monkeypatch, name):
 def test_a_file_that_was_there_before_does_not_count_as_written(attack, home):
     done = attack("", "--folder", "data", "--compare", "file:in.txt")
     assert done.exit_code == 1
-    assert "writes no file in.txt, which was there before, in the folder" in str(done.exception)
+    assert "writes no file in.txt" in str(done.exception)
     done = attack("in.txt", "--folder", "data", "--compare", "file:in.txt")
     assert done.exit_code == 0, done.output
 

@@ -62,7 +62,7 @@ def test_a_map_whose_obstacles_lie_too_far_apart_gives_no_plan():
     ends = MapSnapshot.of_points(np.array([[-900.0, -900.0, 0.0], [900.0, 900.0, 10.0]]))
     huge = np.array([-1e3, -1e3, -10.0, 1e3, 1e3, 20.0])
     refused = plan("rrtstar", request(), snapshot=ends, bounds=huge)
-    assert refused.reason == "obstacles too far apart for a map"
+    assert "too far apart" in refused.reason
 
 
 def test_a_blocked_goal_is_refused_with_its_reason():

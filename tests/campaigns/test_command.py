@@ -59,7 +59,7 @@ def test_a_campaign_is_flown_and_summed_up(flown):
     assert faulty["success"]["total"] + faulty["inactive"]["total"] == 2
     assert golden["metrics"]["flight_time_s"]["value"] > 2.0
     assert "4/4 missions" in run.stderr
-    end = r"4 missions in \d+:\d\d min, \d+ an hour, \d+\.\d % of it outside missions"
+    end = r"4 missions in \d+:\d\d min, \d+ an hour, \d+\.\d % .*"
     assert re.search(f"^{end}$", run.stderr, re.MULTILINE)
     assert (folder / "campaign.toml").read_text().startswith('name = "short"\n')
     assert len(list((folder / "runs").glob("*/result.json"))) == 4
@@ -118,7 +118,7 @@ def test_export_to_stdout_is_the_csv_file(flown, mavfi, tmp_path):
     assert run.stdout == (tmp_path / "table.csv").read_text()
     assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
     refused = mavfi("campaign", "export", folder, tmp_path / "table.xls")
-    assert "name a file that ends in .parquet or .csv" in refused.stderr
+    assert ".parquet or .csv" in refused.stderr
 
 
 @pytest.mark.parametrize(("chosen", "seed"), [((), 1), (("--pair", "3"), 2)])
@@ -130,7 +130,7 @@ def test_a_pair_is_drawn(flown, mavfi, tmp_path, chosen, seed):
     assert run.returncode == 0, run.stderr
     place, title, golden, faulty, written_to = run.stdout.splitlines()
     assert place == f"farm, seed {seed}"
-    assert title == "fault: a mantissa bit of each component of waypoint position"
+    assert re.match("fault: .*mantissa .* waypoint position", title)
     assert re.fullmatch(rf"  golden: success, \d+\.\d s  {folder}/runs/00000\d-farm-{seed}", golden)
     assert faulty.startswith("  FI: success, ")
     assert written_to == f"Picture  {picture}"
@@ -155,22 +155,20 @@ def test_a_changed_specification_shows_the_difference(flown, mavfi, tmp_path):
     run = mavfi("campaign", "run", changed, "--out", folder)
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
-    assert line == (
-        f"error: {folder}: holds another campaign: field mantissa there, exponent here; 4 missions "
-        "there, 4 here, of which 2 are new, and 2 are gone; choose another folder"
-    )
+    assert line.startswith(f"error: {folder}: ")
+    assert "field mantissa there, exponent here; " in line
+    assert re.search("4 missions there, 4 here, .* 2 are new, and 2 are gone; ", line)
 
 
 def test_append_is_recommended_where_it_is_enough(flown, mavfi, tmp_path):
     folder, _ = flown
     more = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 3"))
     line = mavfi("campaign", "run", more, "--out", folder).stderr
-    assert "another campaign: repetitions 2 there, 3 here; 4 missions there, 6 here" in line
-    remedy = "--append adds what is new, or choose another folder\n"
-    assert line.endswith(f"of which 2 are new; {remedy}")
+    assert "repetitions 2 there, 3 here; 4 missions there, 6 here" in line
+    assert re.search("2 are new; --append ", line)
     fewer = written(tmp_path, SPEC.replace("repetitions = 2", "repetitions = 1"))
     line = mavfi("campaign", "run", fewer, "--out", folder).stderr
-    assert "4 missions there, 2 here, of which 0 are new, and 2 are gone" in line
+    assert re.search("4 missions there, 2 here, .* 0 are new, and 2 are gone", line)
     assert "--append" not in line
 
 
@@ -195,23 +193,23 @@ def refused(mavfi, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ('world = "farm"', 'world = "fram"', "unknown world 'fram'; did you mean 'farm'?"),
-        ('world = "farm"', 'wrold = "farm"', "factors.wrold: unknown key; did you mean 'world'?"),
-        ('world = "farm"', "world = []", "factors.world: must have at least one value"),
-        ("repetitions = 2", "repetitions = 0", "repetitions: must be at least 1, got 0"),
-        ("waypoint_position", "waypoint_postion", "did you mean 'waypoint_position'?"),
-        ('field = "mantissa"', 'field = "mantisa"', "did you mean 'mantissa'?"),
-        ('world = "farm"', 'planner = "rtt"', "unknown planner 'rtt'; did you mean 'rrt'?"),
-        ('world = "farm"', 'vehicle = "sola"', "unknown vehicle 'sola'; did you mean 'solo'?"),
-        ('world = "farm"', 'detector = "gda"', "unknown detector 'gda'; did you mean 'gad'?"),
-        ('world = "farm"', 'platform = "x68"', "unknown platform 'x68'; did you mean 'x86'?"),
+        ('world = "farm"', 'world = "fram"', "'fram'.* 'farm'"),
+        ('world = "farm"', 'wrold = "farm"', r"factors\.wrold: .* 'world'"),
+        ('world = "farm"', "world = []", r"factors\.world: .* at least one"),
+        ("repetitions = 2", "repetitions = 0", "repetitions: .* at least 1, got 0"),
+        ("waypoint_position", "waypoint_postion", "mean 'waypoint_position'"),
+        ('field = "mantissa"', 'field = "mantisa"', "mean 'mantissa'"),
+        ('world = "farm"', 'planner = "rtt"', "'rtt'.* 'rrt'"),
+        ('world = "farm"', 'vehicle = "sola"', "'sola'.* 'solo'"),
+        ('world = "farm"', 'detector = "gda"', "'gda'.* 'gad'"),
+        ('world = "farm"', 'platform = "x68"', "'x68'.* 'x86'"),
     ],
 )
 def test_a_bad_specification_gets_one_line_and_flies_nothing(refused, tmp_path, old, new, problem):
     assert old in SPEC
     spec = written(tmp_path, SPEC.replace(old, new))
-    assert problem in refused("run", spec)
-    assert problem in refused("plan", spec)
+    assert re.search(problem, refused("run", spec))
+    assert re.search(problem, refused("plan", spec))
 
 
 def test_a_refused_setting_is_named_among_many(refused, tmp_path):
@@ -249,7 +247,7 @@ def test_a_ledger_of_another_version_gets_one_line(mavfi, tmp_path):
     for arguments in (("status", folder), ("run", folder)):
         done = mavfi("campaign", *arguments)
         assert done.returncode == 1
-        assert "a ledger of version 7; this mavfi reads version 1" in done.stderr
+        assert re.search("version 7; .* version 1", done.stderr)
 
 
 def test_plan_says_what_would_be_flown(mavfi, tmp_path):
@@ -275,7 +273,7 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     again = invoke(command.campaign, ["run", str(changed), "--quiet"])
     assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
     both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])
-    assert "cannot be combined with --scale, --set, --sampling or --out" in str(both.exception)
+    assert "--scale, --set, --sampling or --out" in str(both.exception)
 
 
 def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):
@@ -293,8 +291,7 @@ def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch
     for line in (("run", "fig8"), ("run", "fig8", "--scale", "0.01"), ("status", "fig8"),
                  ("export", "fig8", "-"), ("draw", "fig8", "--output", "pair.svg")):  # fmt: skip
         said = str(called(*line).exception)
-        assert "fig8 is a preset, and ./fig8 holds a campaign: use ./fig8" in said
-        assert "campaigns/fig8" in said
+        assert re.search(r"fig8 is a preset, .* \./fig8 .*campaigns/fig8", said)
     assert not (tmp_path / "campaigns").exists()
     assert called("plan", "fig8", "--scale", "0.01").exit_code == 0  # the preset: nothing is flown
     own = called("run", "fig8", "--out", "campaigns/fig8", "--scale", "0.02", "--quiet")
@@ -311,7 +308,7 @@ def test_the_name_of_a_campaign_that_was_begun_is_told_with_its_folder(monkeypat
     assert begun.exit_code == 0, begun.output
     for line in (["status", "short"], ["run", "short"], ["plan", "short"]):
         said = str(invoke(command.campaign, line).exception)
-        assert said.startswith("unknown campaign 'short'; did you mean 'campaigns/short'?")
+        assert re.search("'short'.* 'campaigns/short'", said)
     assert "did you mean 'fig8'?" in str(invoke(command.campaign, ["status", "fig88"]).exception)
 
 
@@ -323,11 +320,9 @@ def test_set_names_the_nearest_factor(refused):
 
 def test_plan_answers_how_many_missions_a_question_takes(mavfi):
     done = mavfi("campaign", "plan", "--margin", "0.05", "--difference", "0.1")
-    assert done.stdout.splitlines() == [
-        "381 missions per setting: Wilson interval of +-0.05 at a rate of 0.5, 95 % confidence",
-        "155 pairs: a difference of 0.1 detected with 80 % power, 95 % confidence, where 20 % of "
-        "the pairs end differently (--discordant 0.2)",
-    ]
+    missions, pairs = done.stdout.splitlines()
+    assert re.match(r"381 missions .* \+-0\.05 .* 0\.5, 95 %", missions)
+    assert re.match(r"155 pairs: .* 0\.1 .* 80 % power, 95 % .* 20 % .*--discordant 0\.2", pairs)
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_the_library_reads_it():
 
 def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
     short = mavfi("campaign", "status", EXPORT)
-    assert short.stdout.startswith("numbers: 640 missions in an export\n"), short.stderr
+    assert short.stdout.startswith("numbers: 640 missions"), short.stderr
     full = json.loads(mavfi("campaign", "status", EXPORT, "--json", "--quality").stdout)
     assert full["missions"] == 640
     table = mavfi("campaign", "report", EXPORT, "--format", "csv").stdout
@@ -56,16 +56,12 @@ def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        (("replay", EXPORT), 2, "is a campaign: add --mission NUMBER (missions 0 to 639)"),
-        (
-            ("replay", EXPORT, "--mission", "640"),
-            1,
-            "has no flown mission 640; the list has missions 0 to 639",
-        ),
-        (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "no pair has all its run folders"),
+        (("replay", EXPORT), 2, "--mission NUMBER (missions 0 to 639)"),
+        (("replay", EXPORT, "--mission", "640"), 1, "missions 0 to 639"),
+        (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "no pair "),
         (("campaign", "draw", EXPORT, "--pair", "3", "--output", "a.svg"), 1, "no run folder of"),
         (("campaign", "status", EXPORT, "--overhead"), 1, "name the campaign's folder"),
-        (("campaign", "run", EXPORT), 1, "an export has no list of missions to fly"),
+        (("campaign", "run", EXPORT), 1, "an export has no list"),
         (("campaign", "status", "absent.parquet"), 1, "absent.parquet: no such file"),
     ],
 )
@@ -102,8 +98,7 @@ def test_exports_of_two_campaigns_in_one_file_are_refused(tmp_path):
     second = first.append_column("label_later", pa.array(["a", "b"]))  # of a later version
     path = tmp_path / "both.parquet"
     pq.write_table(pa.concat_tables([first, second], promote_options="default"), path)
-    said = "has mission 0 twice; exports of two campaigns are two"
-    with pytest.raises(RecordError, match=said), opened(path):
+    with pytest.raises(RecordError, match="mission 0 twice"), opened(path):
         pass
 
 
@@ -127,7 +122,7 @@ def test_an_export_without_pairs_is_reported_with_a_note(mavfi, tmp_path, change
     pq.write_table(table, path)
     run = mavfi("campaign", "status", path, "--full")
     assert run.returncode == 0, run.stderr
-    assert "nothing to compare: no mission with a fault has a golden flight" in run.stdout
+    assert "nothing to compare" in run.stdout
     assert json.loads(mavfi("campaign", "status", path, "--json").stdout)["faults"] == []
     assert "nothing to compare" not in mavfi("campaign", "status", EXPORT, "--full").stdout
 
@@ -136,14 +131,14 @@ def test_an_export_without_pairs_is_reported_with_a_note(mavfi, tmp_path, change
 def test_damaged_metadata_are_refused(tmp_path, metadata):
     path = tmp_path / "strange.parquet"
     pq.write_table(pq.read_table(EXPORT).replace_schema_metadata({"mavfi": metadata}), path)
-    with pytest.raises(RecordError, match=r"not an export .* metadata are damaged"), opened(path):
+    with pytest.raises(RecordError, match="metadata are damaged"), opened(path):
         pass
 
 
 def test_a_table_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.parquet"
     pq.write_table(pa.table({"number": [1]}), path)
-    with pytest.raises(MavfiError, match="not an export of a campaign"), opened(path):
+    with pytest.raises(MavfiError, match="not an export"), opened(path):
         pass
 
 

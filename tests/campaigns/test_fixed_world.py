@@ -1,5 +1,6 @@
 """Fixed worlds: the rule, the search, and that a campaign remembers what it has found."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -64,10 +65,8 @@ def test_all_missions_in_a_world_fly_the_first_candidate_that_fits(begun, campai
     assert {config.stack for config in flown} == {"hardened"}  # the first
     assert {config.fault for config in flown} == {None}
     assert sorted({config.seed for config in flown}) == [1, 2, 3]
-    assert rule.describe() == (
-        "world seeds: rising 5 (median 5); "
-        "the first from 1 on whose golden flights replan 5 to 6 times (median of 3)"
-    )
+    told = r": rising 5 \(median 5\); .* from 1 on .* 5 to 6 times \(median of 3\)$"
+    assert re.search(told, rule.describe())
 
 
 def test_a_campaign_that_was_begun_searches_no_more(begun, campaign):
@@ -96,16 +95,16 @@ def test_an_interrupted_search_goes_on(begun, campaign):
 def test_another_rule_is_another_campaign(begun):
     begun(spec_of())
     other = spec_of(SPEC.replace("[5, 6]", "[2, 2]"))
-    with pytest.raises(ConfigError, match="rule of fixed worlds the first from 1 on whose golden"):
+    with pytest.raises(ConfigError, match="rule of fixed worlds"):
         begun(other)
-    with pytest.raises(ConfigError, match=r"another \[fixed_world\]; choose another folder"):
+    with pytest.raises(ConfigError, match=r"another \[fixed_world\]"):
         begun(other, append=True)
 
 
 @pytest.mark.slow
 def test_a_world_in_which_none_fits_is_an_error_unless_it_is_named_or_left_out(begun, campaign):
     everywhere = SPEC.replace('worlds = ["rising"]\n', "")
-    told = r"^fixed_world: no world seed of flat up to 9 is the first .* they replan 0 to 0 times; "
+    told = "^fixed_world: no world seed of flat up to 9 .* 0 to 0 times"
     with pytest.raises(ConfigError, match=told):
         begun(spec_of(everywhere))
     assert not (campaign.folder / "campaign.toml").exists()
@@ -151,9 +150,7 @@ def test_a_rule_that_makes_no_sense_is_refused(old, new, error, told):
 def test_a_world_of_the_rule_that_no_mission_flies_is_refused(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text(SPEC.replace('worlds = ["rising"]', 'worlds = ["risin"]'))
-    with pytest.raises(
-        UnknownName, match=r"unknown world of \[fixed_world\] 'risin'; did you mean 'ris"
-    ):
+    with pytest.raises(UnknownName, match=r"\[fixed_world\] 'risin'.* 'rising'"):
         load_spec(str(file))
     file.write_text(SPEC)
     assert load_spec(str(file)).fixed_world.worlds == ("rising",)

@@ -59,4 +59,4 @@ def test_a_killed_guard_costs_an_attempt_and_no_mission(campaign, monkeypatch):
         attempts = [result.attempts for result in ledger.results()]
     assert struck
     assert sorted(attempts) == [1, 1, 2]
-    assert campaign.notes.lines[0].endswith("its guard was killed; begun again")
+    assert "its guard was killed" in campaign.notes.lines[0]

@@ -120,7 +120,7 @@ def test_another_version_is_refused(tmp_path):
     with written(tmp_path) as ledger:
         ledger.set_meta({"schema": "99"})
     for writing in (False, True):
-        with pytest.raises(ConfigError, match="a ledger of version 99; this mavfi reads version 1"):
+        with pytest.raises(ConfigError, match=r"version 99; .* version 1"):
             Ledger(tmp_path, writing=writing)
 
 

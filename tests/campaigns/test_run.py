@@ -62,32 +62,37 @@ def test_outcomes_are_counted_by_setting_and_only_those_of_this_run(campaign):
     assert campaign.notes.last.success_rates == {"FI": 1.0}
 
 
-def test_a_second_run_flies_nothing(campaign):
-    missions = planned("fly", "fly")
+def test_a_mission_that_is_listed_twice_is_flown_twice_and_not_again_by_a_second_run(campaign):
+    missions = planned("fly") * 2
     with campaign.run(missions) as ledger:
-        first = [(r.wall_s, r.attempts) for r in ledger.results()]
+        first = [(r.number, r.wall_s, r.attempts) for r in ledger.results()]
+    assert [number for number, *_ in first] == [0, 1]
     with campaign.run(missions) as ledger:
-        assert [(r.wall_s, r.attempts) for r in ledger.results()] == first
+        assert [(r.number, r.wall_s, r.attempts) for r in ledger.results()] == first
 
 
-@pytest.mark.parametrize(
-    ("world", "outcome", "reason"),
-    [
-        (f"signal:{int(signal.SIGSEGV)}", "crash", "the companion was killed by SIGSEGV"),
-        (f"signal:{int(signal.SIGABRT)}", "crash", "the companion was killed by SIGABRT"),
-        ("exit:3", "crash", "the companion ended with code 3"),
-        ("end:collision", "collision", ""),
-    ],
-)
-def test_a_mission_that_ends_badly_is_a_result(campaign, world, outcome, reason):
-    result = only(campaign.run(planned(world)))
-    assert (result.state, result.outcome, result.reason) == (ResultState.FLOWN, outcome, reason)
-    assert result.attempts == 1
+def test_a_mission_that_ends_badly_is_a_result(campaign):
+    expected = {
+        f"signal:{int(signal.SIGSEGV)}": ("crash", "killed by SIGSEGV"),
+        f"signal:{int(signal.SIGABRT)}": ("crash", "killed by SIGABRT"),
+        "exit:3": ("crash", "ended with code 3"),
+        "end:collision": ("collision", ""),
+    }
+    with campaign.run(planned(*expected), keep=Keep.ALL) as ledger:
+        results = list(ledger.results())
+    for result, (outcome, reason) in zip(results, expected.values(), strict=True):
+        assert (result.state, result.outcome) == (ResultState.FLOWN, outcome)
+        assert result.reason.endswith(reason)
+        assert result.attempts == 1
+    path = results[0].path
+    assert path.name == "000000-cut-off"  # it is kept with its last words
+    assert "Segmentation fault" in (path / "stderr.txt").read_text()
 
 
 def test_a_mission_without_an_end_hangs(campaign):
     result = only(campaign.run(planned("sleep:600"), limit_s=3.0))
-    assert (result.outcome, result.reason) == ("hang", "no end within 3 s of wall time")
+    assert result.outcome == "hang"
+    assert "within 3 s" in result.reason
     assert result.result["fault"] == {"schema": 1, "state": "applied", "seed": 0}
 
 
@@ -137,22 +142,16 @@ def test_profiles_that_several_campaigns_share_stay(campaign, tmp_path):
 def test_a_mission_killed_from_outside_is_begun_again(campaign):
     result = only(campaign.run(planned(f"signal-once:{int(signal.SIGKILL)}")))
     assert (result.outcome, result.attempts) == ("success", 2)
-    assert campaign.notes.lines == ["mission 0: killed by SIGKILL; begun again"]
+    (note,) = campaign.notes.lines
+    assert note.startswith("mission 0: killed by SIGKILL; ")
 
 
-def test_a_mission_killed_each_time_stays_missing(campaign):
-    with pytest.raises(CampaignStopped, match="1 missions were killed from outside 3 times"):
-        campaign.run(planned("fly", f"signal:{int(signal.SIGKILL)}"))
+def test_missions_that_are_killed_each_time_or_lose_their_vehicle_stay_missing(campaign):
+    killed = (f"signal:{int(signal.SIGKILL)}", "end:link_lost", "untrue", "vehicle")
+    with pytest.raises(CampaignStopped, match=r"4 missions .* 3 times"):
+        campaign.run(planned("fly", *killed))
     with Ledger(campaign.folder) as ledger:
-        assert [number for number, *_ in ledger.missing()] == [1]
-
-
-@pytest.mark.parametrize("world", ["end:link_lost", "untrue", "vehicle"])
-def test_a_mission_whose_vehicle_is_killed_each_time_is_still_to_be_flown(campaign, world):
-    with pytest.raises(CampaignStopped, match="1 missions were killed from outside 3 times"):
-        campaign.run(planned("fly", world))
-    with Ledger(campaign.folder) as ledger:
-        assert [number for number, *_ in ledger.missing()] == [1]
+        assert [number for number, *_ in ledger.missing()] == [1, 2, 3, 4]
 
 
 def test_a_node_that_is_killed_each_time_is_believed_at_last(campaign):
@@ -160,24 +159,19 @@ def test_a_node_that_is_killed_each_time_is_believed_at_last(campaign):
     assert (result.state, result.attempts) == (ResultState.FLOWN, ATTEMPTS)
 
 
-@pytest.mark.parametrize(
-    ("world", "reason", "attempts"),
-    [
-        ("blocked", "the start is blocked", 1),
-        ("no-vehicle", "the vehicle process ended with code 1", ATTEMPTS),
-    ],
-)
-def test_a_mission_that_cannot_begin_has_no_outcome(campaign, world, reason, attempts):
-    result = only(campaign.run(planned(world)))
-    assert (result.state, result.outcome, result.reason) == (ResultState.ERROR, None, reason)
-    assert result.injected is None
-    assert result.attempts == attempts
-
-
-def test_a_defect_is_an_error_with_its_traceback(campaign):
-    result = only(campaign.run(planned("defect")))
-    assert result.state is ResultState.ERROR
-    assert result.reason.endswith("ZeroDivisionError: a defect")
+def test_a_mission_that_cannot_begin_or_meets_a_defect_has_no_outcome(campaign):
+    expected = {
+        "blocked": ("blocked", 1),
+        "no-vehicle": ("ended with code 1", ATTEMPTS),
+        "defect": ("ZeroDivisionError: a defect", 1),
+    }
+    with campaign.run(planned(*expected)) as ledger:
+        results = list(ledger.results())
+    for result, (reason, attempts) in zip(results, expected.values(), strict=True):
+        assert (result.state, result.outcome) == (ResultState.ERROR, None)
+        assert result.reason.endswith(reason)
+        assert result.injected is None
+        assert result.attempts == attempts
 
 
 @pytest.mark.slow
@@ -194,12 +188,12 @@ def test_errors_are_flown_again_when_asked_for(campaign):
 
 @pytest.mark.parametrize("limit_s", [0.0, math.nan, math.inf])
 def test_a_limit_that_ends_all_missions_or_none_is_refused(campaign, limit_s):
-    with pytest.raises(ConfigError, match="limit: must be above 0 and finite"):
+    with pytest.raises(ConfigError, match=r"^limit: "):
         campaign.run(planned("fly"), limit_s=limit_s)
 
 
 def test_no_mission_at_all_ends_the_campaign(campaign):
-    with pytest.raises(CampaignStopped, match=r"no mission could begin; .* start is blocked"):
+    with pytest.raises(CampaignStopped, match=r"no mission could begin; .*blocked"):
         campaign.run(planned(*["blocked"] * 100))
 
 
@@ -239,23 +233,15 @@ def test_the_sample_of_successes_has_some_of_every_setting(settings):
     assert sum(kept) / len(kept) == pytest.approx(1 / 20, rel=0.1 if settings > 1 else 0.5)
 
 
-def test_the_folder_of_a_mission_that_was_cut_off_is_kept_with_its_last_words(campaign):
-    result = only(campaign.run(planned(f"signal:{int(signal.SIGSEGV)}"), keep=Keep.ALL))
-    assert result.path.name == "000000-cut-off"
-    assert "Segmentation fault" in (result.path / "stderr.txt").read_text()
-
-
 def test_another_list_is_refused_and_its_first_difference_shown(campaign):
     campaign.run(planned("fly")).close()
-    counted = r'"seed":1.*1 missions there, 2 here, of which 1 are new'
+    counted = r'"seed":1.*1 missions there, 2 here, .*1 are new'
     with pytest.raises(ConfigError, match=counted):
         campaign.run(planned("fly", "fly"))
     both = r'new one.*"seed":0,.*gone one.*"fly".*1 are gone'
     with pytest.raises(ConfigError, match=both) as told:
         campaign.run(planned("exit:1"))
-    # Not every command that flies a list can add to it.
-    assert str(told.value).endswith("; choose another folder")
-    assert "--append" not in str(told.value)
+    assert "--append" not in str(told.value)  # not every command that flies a list can add to it
 
 
 @pytest.mark.slow
@@ -277,7 +263,7 @@ def test_a_file_that_missions_name_must_not_change_between_them(campaign, tmp_pa
     campaign.run([*missions, *planned("fly", vehicle=str(other))], append=True).close()
     mine.write_text("scale = 2.5")
     more = [*missions, *planned("fly", "fly", platform=str(mine))[1:]]
-    with pytest.raises(ConfigError, match=r"mine\.toml: changed after the campaign began"):
+    with pytest.raises(ConfigError, match=r"mine\.toml: changed after"):
         campaign.run(more, append=True)
     mine.write_text("scale = 1.2")
     campaign.run(more, append=True).close()
@@ -296,17 +282,10 @@ def test_the_file_of_a_varied_stack_must_not_change_either(campaign, tmp_path):
         campaign.run(missions)
 
 
-def test_a_mission_that_is_listed_twice_is_flown_twice(campaign):
-    missions = planned("fly") * 2
-    for _ in range(2):
-        with campaign.run(missions) as ledger:
-            assert [result.number for result in ledger.results()] == [0, 1]
-
-
 def test_only_one_process_runs_a_campaign(campaign):
     with (
         Ledger(campaign.folder, writing=True),
-        pytest.raises(ConfigError, match="another process runs this campaign"),
+        pytest.raises(ConfigError, match="another process"),
     ):
         campaign.run(planned("fly"))
 
@@ -333,7 +312,8 @@ def test_ctrl_c_once_lets_missions_finish(campaign):
     missions = planned("sleep:1.5", "sleep:1.5", "fly")
     with pytest.raises(Interrupted, match="run again to continue"):
         campaign.run(missions)
-    assert notes.lines == ["finishing what flies; Ctrl-C once more ends it"]
+    (note,) = notes.lines
+    assert "Ctrl-C once more" in note
     with Ledger(campaign.folder) as ledger:
         assert [result.number for result in ledger.results()] == [0, 1]
     with campaign.run(missions) as ledger:

@@ -214,7 +214,8 @@ def test_a_mission_that_cannot_be_forked_is_flown_alone_and_says_so(
     configs = [replace(short_config, fault=fault) for fault in (None, *FAULTS[:2])]
     notes, results = flown_both_ways(configs, tmp_path, task="unforkable_task")
     reason = "cannot fork: Resource temporarily unavailable"
-    assert notes == [f"missions to be flown alone: 1; {reason}"]
+    (note,) = notes
+    assert note.endswith(f" alone: 1; {reason}")
     said = [result["host"].get("alone") for result in results]
     forked = ["forked_s" in result["host"] for result in results]
     assert said == [None, None, reason] or said == [None, reason, None]
@@ -238,7 +239,7 @@ def test_a_golden_flight_that_cannot_begin(short_config, tmp_path):
     """Each of its missions is tried alone and reports why."""
     blocked = replace(short_config, goal=(1e4, 0.0, 2.5))
     notes, results = flown_both_ways([blocked, replace(blocked, fault=FAULTS[0])], tmp_path)
-    assert notes[0].startswith("missions to be flown alone: 2; their flight failed: ")
+    assert " alone: 2; " in notes[0]
     assert results == [{}, {}]
 
 

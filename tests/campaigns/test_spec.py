@@ -162,7 +162,7 @@ def test_a_stack_is_a_factor_as_any_other():
     assert second.labels["stack"] == second.config.stack
     assert first.pair != second.pair
     assert len(flyable(spec_of(text))) == 2
-    with pytest.raises(MavfiError, match=r"gards: unknown key; did you mean 'guards_tracking'.*in"):
+    with pytest.raises(MavfiError, match=r"gards: .*'guards_tracking'.*in"):
         flyable(spec_of(text.replace("guards_tracking", "gards")))
 
 
@@ -170,7 +170,7 @@ def test_a_planner_is_one_setting_however_it_is_written():
     missions = spec_of('[factors]\nplanner = ["RRT*", "rrt-connect"]').missions()
     assert [m.config.planner for m in missions] == ["rrtstar", "rrtconnect"]
     assert [m.labels["planner"] for m in missions] == ["rrtstar", "rrtconnect"]
-    with pytest.raises(ConfigError, match="must not list a value twice"):
+    with pytest.raises(ConfigError, match="twice"):
         spec_of('[factors]\nplanner = ["rrtstar", "rrt-star"]')
 
 
@@ -200,15 +200,15 @@ def test_instruction_level_and_lists_of_values():
 @pytest.mark.parametrize(
     ("text", "error", "problem"),
     [
-        ("[factors]\nwrld = ['farm']", ConfigError, r"factors.wrld: .*did you mean 'world'"),
-        ("[[setting]]\nstgae = 'control'", ConfigError, r"did you mean 'stage'"),
-        ("[mission]\ntime_limit = 3", ConfigError, r"did you mean 'time_limit_s'"),
-        ("repetition = 3", ConfigError, r"did you mean 'repetitions'"),
+        ("[factors]\nwrld = ['farm']", ConfigError, r"factors.wrld: .*'world'"),
+        ("[[setting]]\nstgae = 'control'", ConfigError, r"'stage'"),
+        ("[mission]\ntime_limit = 3", ConfigError, r"'time_limit_s'"),
+        ("repetition = 3", ConfigError, r"'repetitions'"),
         ("[factors]\nlink = 'udpin:1'", ConfigError, r"link: unknown key"),
-        ("[factors]\nworld = []", ConfigError, r"factors.world: must have at least one value"),
-        ("[factors]\nbits = [1, 1]", ConfigError, r"factors.bits: must not list a value twice"),
-        ("repetitions = 0", ConfigError, r"repetitions: must be at least 1, got 0"),
-        ("repetitions = true", ConfigError, r"repetitions: must be a whole number, got True"),
+        ("[factors]\nworld = []", ConfigError, r"factors.world: .*at least one"),
+        ("[factors]\nbits = [1, 1]", ConfigError, r"factors.bits: .*twice"),
+        ("repetitions = 0", ConfigError, r"repetitions: .*at least 1, got 0"),
+        ("repetitions = true", ConfigError, r"repetitions: .*got True"),
         ("keep = 'some'", UnknownName, r"Known: all, failures, none, sampled"),
         ("setting = 3", ConfigError, r"setting: must consist of tables"),
         ("setting = []", ConfigError, r"has no missions"),
@@ -222,12 +222,12 @@ def test_instruction_level_and_lists_of_values():
         ("factors = 3", ConfigError, r"factors: must be a table"),
         ("name = 3", ConfigError, r"name: must be text, got 3"),
         ("seed =\nname = 'x'", ConfigError, r"mine.toml:1: "),
-        ("[factors]\nbits = [{}, {}]", ConfigError, r"factors.bits: must not list a value twice"),
-        ("[factors]\nworld = [1979-05-27]", ConfigError, r"factors.world: must not be a date"),
-        ("[mission]\nworld = 07:32:00", ConfigError, r"mission.world: must not be a date or a t"),
-        ("[[setting]]\nprotect = 'control'", ConfigError, r"protect: must be a list, got 'cont"),
+        ("[factors]\nbits = [{}, {}]", ConfigError, r"factors.bits: .*twice"),
+        ("[factors]\nworld = [1979-05-27]", ConfigError, r"factors.world: .*date"),
+        ("[mission]\nworld = 07:32:00", ConfigError, r"mission.world: .*time"),
+        ("[[setting]]\nprotect = 'control'", ConfigError, r"protect: .*list, got 'cont"),
         ("[[setting]]\nprotect = ['control', ['planning']]", ConfigError, r"must be a list, got"),
-        ("[mission]\nstart = 2.0", ConfigError, r"mission.start: must be a list, got 2.0"),
+        ("[mission]\nstart = 2.0", ConfigError, r"mission.start: .*list, got 2.0"),
         ("[stop]\nmargin = 0.7", ConfigError, r"stop: margin must be between"),
         ("[stop]\nmargn = 0.1", ConfigError, r"did you mean 'margin'"),
     ],
@@ -241,23 +241,20 @@ def test_a_bad_specification_is_refused_where_it_is_wrong(text, error, problem):
     ("text", "problem"),
     [
         ("seed = ['a']", r"seed"),
-        ("seed = [-1]", r"seed: must be between 0 and 2147483647"),
-        ("bits = [1]", r"bits: requires a stage or a site"),
-        ("level = 'source'", r"level: requires a stage or a site"),
-        ("stage = 'control'\nsite = 'command_yaw'", r"a stage or a site for the fault, not both"),
-        ("stage = 'control'\nlevel = 'sauce'", r"level: must be source or instruction"),
-        (
-            "sites = ['waypoint_x']",
-            r"sites: is not a factor of faults at source level; did you mean 'site'",
-        ),
-        ("level = 'instruction'\nsites = ['flags']", r"sites: requires a stage or a site"),
-        ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: is not a factor of faults at"),
-        ("stage = 'control'\nlevel = 'instruction'\neffect = 'zero'", r"effect: is not a factor of"),
+        ("seed = [-1]", r"seed: .*0 and 2147483647"),
+        ("bits = [1]", r"bits: .*stage or a site"),
+        ("level = 'source'", r"level: .*stage or a site"),
+        ("stage = 'control'\nsite = 'command_yaw'", r"stage or a site .*not both"),
+        ("stage = 'control'\nlevel = 'sauce'", r"level: .*source or instruction"),
+        ("sites = ['waypoint_x']", r"sites: .*source level.*'site'"),
+        ("level = 'instruction'\nsites = ['flags']", r"sites: .*stage or a site"),
+        ("stage = 'control'\nsampling = 'cpu-time'", r"sampling: is not a factor"),
+        ("stage = 'control'\nlevel = 'instruction'\neffect = 'zero'", r"^effect: is not a factor"),
         ("stage = 'control'\nbits = ['one']", r"bits: must be a whole number"),
-        ("stage = 'control'\nat = 'time=301'", r"at time=301: must be within the mission's"),
+        ("stage = 'control'\nat = 'time=301'", r"at time=301: "),
         (
             "stage = 'control'\nat = 'tick=600'\ntime_limit_s = [30.0, 11.0]",
-            r"at tick=600: must be within the mission's time limit of 11 s, got 12 s \(in ",
+            r"at tick=600: .* 11 s, got 12 s \(in ",
         ),
         ("v_max_mps = [99.0]", r"v_max_mps: must be between"),
         ("threshold = 2.0", r"threshold: requires a detector"),

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import re
 import resource
 import socket
 import subprocess
@@ -51,9 +52,7 @@ def test_an_unknown_name_gets_the_nearest(refused, option, given, kind, nearest)
 
 
 def test_a_name_like_no_other_gets_the_list(refused):
-    assert refused("--stack", "zzz", code=2).startswith(
-        "--stack: unknown stack 'zzz'; known: hardened, "
-    )
+    assert re.match("--stack: .*'zzz'.* hardened, ", refused("--stack", "zzz", code=2))
 
 
 @pytest.mark.parametrize(
@@ -77,22 +76,22 @@ def test_a_place_where_nobody_can_be(refused, arguments, said):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--v-max", "nan"), "--v-max: must be between 0.1 and 12, got nan"),
-        (("--inject", "control", "--at", "time=99999"), "at time=99999: must be within the"),
-        (("--inject", "control", "--at", "tick=15001"), "at tick=15001: must be within the"),
+        (("--v-max", "nan"), "--v-max: must be between 0.1 and 12"),
+        (("--inject", "control", "--at", "time=99999"), "at time=99999: "),
+        (("--inject", "control", "--at", "tick=15001"), "at tick=15001: "),
         (("--time-limit", "inf"), "--time-limit: must be between"),
-        (("--seed", "-1"), "--seed: must be between 0 and 2147483647, got -1"),
+        (("--seed", "-1"), "--seed: must be between 0 and 2147483647"),
         (("--inject", "planning", "--fault-seed", "-1"), "Invalid value for '--fault-seed'"),
-        (("--inject", "planning", "--bit", "64"), "Invalid value for '--bit': 64 is not in"),
-        (("--goal", "1e9,0,5"), "--goal: must be within 1e+07 m of the origin"),
-        (("--goal", "nan,1,2"), "--goal: must be three finite numbers"),
-        (("--start", "1,inf,2"), "--start: must be three finite numbers"),
+        (("--inject", "planning", "--bit", "64"), "Invalid value for '--bit': 64 "),
+        (("--goal", "1e9,0,5"), "--goal: must be within 1e+07 m"),
+        (("--goal", "nan,1,2"), "--goal: must be three finite"),
+        (("--start", "1,inf,2"), "--start: must be three finite"),
         (("--stack", "mavbench:foo=3"), "foo: unknown key; known: "),
-        (("--inject", "process.planner", "--at", "foreseen"), "process.planner: at must be a time"),
-        (("--companion", "true", "--planner", "rrt"), "--planner: has no effect on the flight of"),
-        (("--companion", "true", "--restart", "2"), "--restart: has no effect on the flight of"),
-        (("--companion", "true", "--record", "mcap"), "--record cannot be combined with --comp"),
-        (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: must be true or false"),
+        (("--inject", "process.planner", "--at", "foreseen"), "process.planner: at "),
+        (("--companion", "true", "--planner", "rrt"), "--planner: has no effect"),
+        (("--companion", "true", "--restart", "2"), "--restart: has no effect"),
+        (("--companion", "true", "--record", "mcap"), "--record cannot be combined"),
+        (("--stack", "mavbench:guards_tracking=3"), "guards_tracking: "),
     ],
 )
 def test_a_number_out_of_its_range_names_the_option(refused, arguments, said):
@@ -102,7 +101,7 @@ def test_a_number_out_of_its_range_names_the_option(refused, arguments, said):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--goal", "1,2"), "Invalid value for '--goal': must be three numbers"),
+        (("--goal", "1,2"), "Invalid value for '--goal': "),
         (("--wrold", "x"), "no such option '--wrold'; did you mean '--world'?"),
         (("--xyz",), "no such option '--xyz'\n"),
     ],
@@ -116,7 +115,7 @@ def test_wrong_usage_is_one_line_and_exits_with_2(command_line, arguments, said)
 def test_an_unknown_command_gets_the_nearest(command_line):
     code, _, err = command_line("fyl")
     assert code == 2
-    assert "unknown command 'fyl'; did you mean 'fly'?" in err
+    assert re.search("'fyl'.* 'fly'", err)
 
 
 # Files ---------------------------------------------------------------------------------------
@@ -167,7 +166,8 @@ def test_a_serial_device_without_permission(refused, monkeypatch):
 
     monkeypatch.setattr(serial, "Serial", deny)
     line = refused("--link", "serial:/dev/ttyACM0:57600", "--goal", "1,2,3")
-    assert line == "serial:/dev/ttyACM0:57600: no permission to open /dev/ttyACM0"
+    assert line.startswith("serial:/dev/ttyACM0:57600: ")
+    assert "permission" in line
 
 
 def test_a_key_file_without_permission(refused, tmp_path, monkeypatch):
@@ -181,7 +181,7 @@ def test_a_key_file_without_permission(refused, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "read_text", deny)
     line = refused(*LINK, "--key-file", "key")
-    assert line == "key: cannot read the passphrase: Permission denied"
+    assert re.fullmatch("key: .*: Permission denied", line)
 
 
 def test_a_camera_that_cannot_start_says_why(refused):
@@ -213,7 +213,8 @@ def test_no_autopilot_at_the_url(refused, free_port, monkeypatch):
     monkeypatch.setattr(flight, "SessionSettings", lambda **o: settings(connect_timeout_s=0.2, **o))
     url = f"udpin:127.0.0.1:{free_port}"
     line = refused("--link", url, "--goal", "20,2,3")
-    assert line == f"no autopilot at {url}: no heartbeat within 0.2 s"
+    assert line.startswith(f"no autopilot at {url}: ")
+    assert "0.2 s" in line
 
 
 def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopilot_on_udp):
@@ -223,8 +224,8 @@ def test_an_autopilot_that_refuses_to_arm_in_its_own_words(command_line, autopil
     code, out, err = command_line("fly", "--link", url, "--goal", "20,2,3", "--quiet")
     assert (code, out) == (1, "")
     (line,) = err.splitlines()
-    assert line.startswith("error: autopilot refused arming: ")
-    assert line.endswith("(Preflight Fail: No valid data from Accel 0)")
+    assert "arming" in line
+    assert line.endswith(f"({autopilot.refuse_arming.strip()})")
 
 
 # The disk ------------------------------------------------------------------------------------
@@ -246,20 +247,20 @@ def test_a_full_disk_in_flight(command_line):
         code, out, err = command_line(*SHORT_LINE, "--quiet")
     assert (code, out) == (1, "")
     (line,) = err.splitlines()
-    assert line.startswith("error: runs/farm-5-001/flight.tlog: cannot write: File too large")
+    assert re.match("error: runs/farm-5-001/flight.tlog: .*: File too large", line)
     assert "cut off before its end" in command_line("show", "runs/farm-5-001")[2]
 
 
 def test_a_folder_that_cannot_be_made(refused, tmp_path):
     (tmp_path / "file").write_text("")
     line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs", code=2)
-    assert "'--out': file/runs: not a folder that can be created or written" in line
+    assert "'--out': file/runs: not a folder" in line
 
 
 @pytest.mark.parametrize(
     ("out", "why"),
     [
-        ("/dev/null", "/dev/null: not a folder that can be created or written"),
+        ("/dev/null", "/dev/null: not a folder"),
         (b"caf\xe9".decode(errors="surrogateescape"), r"'caf\udce9': not a UTF-8 name"),
     ],
 )
@@ -271,7 +272,8 @@ def test_a_folder_that_could_not_be_read_again_is_refused_before_the_flight(refu
 def test_an_output_that_cannot_be_written_is_one_line(tmp_path, arguments):
     line = f"{sys.executable} -m mavfi_cli {arguments} > /dev/full"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (1, "error: No space left on device\n")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert "No space left" in done.stderr
 
 
 def test_output_into_a_closed_pipe_is_no_traceback(tmp_path):
@@ -287,21 +289,21 @@ LINK = ["--link", "udpin:127.0.0.1:14540", "--goal", "1,2,3"]
     ("arguments", "said"),
     [
         (["--bits", "3"], "--bits needs --inject"),
-        (["--loss-limit", "3"], "--loss-limit: needs --link, a link to a foreign autopilot"),
+        (["--loss-limit", "3"], "--loss-limit: needs --link"),
         (["--firmware", "px4"], "--firmware needs --autopilot px4 or ardupilot"),
         (["--field", "sign"], "--field needs --inject"),
         (["--level", "instruction"], "--level instruction needs --inject NODE"),
-        (["--inject", "planning", "--restart", "5"], "--restart needs nodes that can die"),
+        (["--inject", "planning", "--restart", "5"], "--restart needs nodes"),
         (["--inject", "planning", "--duration", "5"], "--duration needs --persistence stuck-at"),
         (["--inject", "detector"], "--inject detector needs --detector NAME"),
         (["--link", "udpin:127.0.0.1:14540"], "--link: needs --goal X,Y,Z"),
         (["--platform", "measured:2"], "--platform: measured:2 needs --realtime"),
-        ([*LINK, "--world", "dense"], "--world has no effect with --link unless --eyes is given"),
+        ([*LINK, "--world", "dense"], "--world has no effect with --link unless --eyes"),
         ([*LINK, "--vehicle", "solo"], "--vehicle has no effect with --link unless --eyes"),
         ([*LINK, "--start", "1,2,0"], "--start has no effect with --link unless --eyes"),
         ([*LINK, "--world-seed", "4"], "--world-seed has no effect with --link unless --eyes"),
         ([*LINK, "--eyes", "--realtime"], "--realtime: cannot be combined with --link"),
-        (["--eyes"], "--eyes: needs --link, a link to a foreign autopilot"),
+        (["--eyes"], "--eyes: needs --link"),
         ([*LINK, "--origin", "1,2,0"], "--origin: needs --eyes"),
         (["--inject", "planning", "--site", "flags"], "--site needs --level instruction"),
         (["--level", "instruction", "--inject", "octomap", "--at", "tick=3"], "--at needs --level"),
@@ -330,7 +332,7 @@ def no_firmware(tmp_path, monkeypatch):
         ("px4", "nothing", "no firmware at {path}"),
         ("px4", "folder", "no firmware at {path}"),
         ("px4", "text", "no permission to execute {path}"),
-        ("px4", "program", "{path} is not PX4: it has no startup files in"),
+        ("px4", "program", "{path} is not PX4"),
         ("ardupilot", "program", "true ended with code 0"),
     ],
 )
@@ -342,4 +344,4 @@ def test_a_path_that_is_no_firmware(refused, no_firmware, autopilot, kind, said)
 
 def test_a_real_autopilot_without_a_binary(refused, no_firmware):
     line = refused(*SHORT_LINE[1:], "--quiet", "--autopilot", "px4", code=2)
-    assert line.startswith("--firmware: px4 needs its SITL binary: --firmware PATH, or PX4_SITL")
+    assert re.match("--firmware: px4 .*--firmware PATH, or PX4_SITL", line)

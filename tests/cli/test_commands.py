@@ -38,25 +38,26 @@ def test_help_names_every_command(command_line):
     assert code == 0
     for name in ("fly", "show", "world", "sitl", "doctor"):
         assert f"\n  {name} " in out
-        sub_code, _, _ = command_line(name, "--help")
+        sub_code, told, _ = command_line(name, "--help")
         assert sub_code == 0
+        assert told.startswith(f"Usage: mavfi {name} ")  # also of the vehicle's own program
+        if name in ("fly", "sitl"):
+            assert_help_says_what_another_goal_does(told)
 
 
-def test_the_vehicle_s_help_has_the_command_s_name(command_line):
-    assert command_line("sitl", "--help")[1].startswith("Usage: mavfi sitl ")
+def assert_help_says_what_another_goal_does(told):
+    """To a generated world."""
+    assert f"towers within {CLEAR_RADIUS_M:g} m of " in " ".join(told.split())
+
+
+def test_help_says_what_another_goal_does_to_a_world(command_line):
+    assert_help_says_what_another_goal_does(command_line("world", "make", "--help")[1])
 
 
 def test_help_has_a_plan_in_groups(command_line):
     told = command_line("campaign", "plan", "--help")[1].splitlines()
     heads = [line for line in told if line.endswith(":") and not line.startswith(" ")]
     assert heads == ["Missions:", "Sample size:", "Output:"]
-
-
-@pytest.mark.parametrize("command", [("fly",), ("world", "make"), ("sitl",)])
-def test_help_says_what_another_goal_does_to_a_generated_world(command_line, command):
-    told = " ".join(command_line(*command, "--help")[1].split())
-    near = rf"towers within {CLEAR_RADIUS_M:g} m of (it|them|start and goal)"
-    assert re.search(rf"{near} are left out", told)
 
 
 def test_who_interrupts_is_told_how_to_go_on(command_line, monkeypatch):
@@ -91,20 +92,21 @@ def test_show_draws_a_run_that_has_no_picture(command_line, short_flight, tmp_pa
 def test_show_refuses_a_picture_of_no_known_format(command_line, short_flight, tmp_path):
     code, out, err = command_line("show", short_flight.path, "--picture", "above.jpg")
     assert (code, out) == (2, "")
-    assert err.startswith("error: Invalid value for '--picture': above.jpg: name a file that ends")
+    assert "'--picture': above.jpg: " in err
     assert not (tmp_path / "above.jpg").exists()
 
 
 def test_show_of_a_golden_run_has_no_pair(command_line, short_flight):
     code, out, err = command_line("show", short_flight.path, "--pair")
-    assert (code, out, err) == (2, "", "error: --pair needs a run with a fault\n")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: --pair needs ")
 
 
 def test_a_record_that_is_none_says_so(command_line, short_flight, tmp_path):
     (tmp_path / "result.json").write_text("[1, 2]")
     code, _, err = command_line("show", tmp_path)
     assert code == 1
-    assert err.endswith("result.json: not a JSON object\n")
+    assert "result.json: " in err
 
 
 def test_show_events_and_json(command_line, troubled_flight):
@@ -119,14 +121,14 @@ def test_show_events_and_json(command_line, troubled_flight):
 def test_show_json_is_the_record_alone(command_line, short_flight):
     code, out, err = command_line("show", short_flight.path, "--json", "--pair")
     assert (code, out) == (2, "")
-    assert "cannot be combined with --pair or --events" in err
+    assert "--pair or --events" in err
 
 
 @pytest.mark.parametrize("options", [(), ("--without-fault",)])
 def test_a_replay_waits_for_a_debugger_at_an_instruction_only(command_line, short_flight, options):
     code, out, err = command_line("replay", short_flight.path, "--gdb", *options)
     assert (code, out) == (2, "")
-    assert "--gdb needs an instruction-level fault" in err
+    assert "--gdb needs " in err
 
 
 @pytest.fixture
@@ -148,12 +150,12 @@ def _change(folder, section, value):
         (lambda f: (f / "result.json").write_bytes(b"\xff\xfe"), "damaged"),
         (lambda f: (f / "result.json").write_text("[]"), "not a JSON object"),
         (lambda f: (f / "result.json").write_text("[" * 100_000), "nested too deeply"),
-        (lambda f: _change(f, "config", 5), "damaged (a value in it has the wrong type)"),
-        (lambda f: _change(f, "detection", 5), "detection: must be a table, got 5"),
+        (lambda f: _change(f, "config", 5), "damaged ("),
+        (lambda f: _change(f, "detection", 5), "detection: "),
         (lambda f: _change(f, "events", 5), "damaged (events"),
         (
             lambda f: _change(f, "quality_of_flight", {"distance_m": "x"}),
-            "distance_m: must be a number, got 'x'",
+            "distance_m: ",
         ),
         (lambda f: (f / "result.json").write_text('{"schema": 99}'), "another version"),
         (lambda f: (f / "result.json").write_text('{"schema": 1}'), "damaged"),
@@ -217,13 +219,13 @@ def test_world_make_check_draw_a_file_of_ones_own(command_line, tmp_path):
 def test_world_errors_pass_through(command_line):
     code, out, err = command_line("world", "check", "denze")
     assert (code, out) == (2, "")
-    assert err.startswith("error: unknown world 'denze'; did you mean 'dense'?")
+    assert re.match("error: .*'denze'.* 'dense'", err)
 
 
 def test_sitl_errors_pass_through(command_line):
     code, out, err = command_line("sitl", "--vehicle", "sollo")
     assert (code, out) == (2, "")
-    assert "error: unknown vehicle 'sollo'; did you mean 'solo'?" in err
+    assert re.search("error: .*'sollo'.* 'solo'", err)
     assert command_line("sitl", "--speed", "-1")[0] == 2
 
 

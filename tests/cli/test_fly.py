@@ -1,6 +1,7 @@
 """`mavfi fly`: what it prints, and with which code it leaves."""
 
 import json
+import re
 import shlex
 
 import pytest
@@ -30,7 +31,7 @@ def test_summary_on_stdout_progress_on_stderr_record_in_the_folder(command_line,
     code, out, err = command_line(*SHORT_LINE)
     assert code == 0
     assert out.startswith("SUCCESS: reached the goal\n")
-    assert "Run folder  runs/farm-5-001  (see flight.svg)" in out
+    assert re.search("Run folder  runs/farm-5-001 .*flight.svg", out)
     assert err.startswith("Flying solo in farm, seed 5\n")
     assert "offboard" in err
     assert "\x1b" not in out + err
@@ -45,10 +46,8 @@ def test_json_is_the_result_and_nothing_else(command_line, tmp_path):
     assert not (tmp_path / "here/farm-5-001/flight.svg").exists()
 
 
-def test_expect(command_line):
+def test_another_outcome_than_the_expected_one_is_an_error(command_line):
     short = (*SHORT_LINE, "--quiet", "--no-picture", "--time-limit=1")
-    code, _, err = command_line(*short, "--expect", "timeout")
-    assert (code, err) == (0, "")
     code, out, err = command_line(*short, "--expect", "success")
     assert code == 1
     assert out.startswith("TIMEOUT")
@@ -56,15 +55,15 @@ def test_expect(command_line):
     assert len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("planner", ["rrt", "rrtconnect"])
-def test_options_arrive_in_the_mission(command_line, planner):
-    _, out, _ = command_line(
-        *SHORT_LINE, "--json", "--quiet", "--no-picture", "--time-limit=1", "--planner", planner,
-        "--vehicle=spark", "--v-max=2", "--land",
+def test_options_arrive_in_the_mission(command_line):
+    code, out, err = command_line(
+        *SHORT_LINE, "--json", "--quiet", "--no-picture", "--time-limit=1", "--planner=rrtconnect",
+        "--vehicle=spark", "--v-max=2", "--land", "--expect=timeout",
     )  # fmt: skip
+    assert (code, err) == (0, "")
     config = json.loads(out)["config"]
     expected = {
-        "planner": planner, "vehicle": "spark", "v_max_mps": 2.0, "time_limit_s": 1.0,
+        "planner": "rrtconnect", "vehicle": "spark", "v_max_mps": 2.0, "time_limit_s": 1.0,
         "land": True, "seed": 5, "start": [2.0, 2.0, 0.0],
     }  # fmt: skip
     assert {name: config[name] for name in expected} == expected
@@ -110,18 +109,18 @@ def test_a_file_holds_a_whole_mission_and_options_replace_what_it_says(command_l
 @pytest.mark.parametrize(
     ("text", "options", "code", "said"),
     [
-        ("wrold = 3\n", (), 1, "mission.toml:1: wrold: unknown key; did you mean 'world'?"),
-        ("v_max_mps = 0\n", (), 1, "v_max_mps: must be between 0.1 and 12, got 0"),
+        ("wrold = 3\n", (), 1, "mission.toml:1: wrold: .*'world'"),
+        ("v_max_mps = 0\n", (), 1, "v_max_mps: .*0.1 and 12, got 0"),
         ("[fault]\nbits = 2\n", (), 1, "mission.toml"),
-        ("", ("--v-max=0",), 2, "error: --v-max: must be between 0.1 and 12, got 0"),
-        ("", ("--inject=planning", "--at=8"), 2, "as in time=8 (s)"),
+        ("", ("--v-max=0",), 2, "error: --v-max: .*0.1 and 12, got 0"),
+        ("", ("--inject=planning", "--at=8"), 2, "time=8"),
     ],
 )
 def test_a_mistake_names_the_file_or_the_option(command_line, tmp_path, text, options, code, said):
     (tmp_path / "mission.toml").write_text(text)
     left, out, err = command_line("fly", "--config", "mission.toml", *options)
     assert (left, out, len(err.splitlines())) == (code, "", 1)
-    assert said in err
+    assert re.search(said, err)
 
 
 @pytest.mark.parametrize(("bit", "hinted"), [("0", True), ("62", False)])
@@ -130,7 +129,7 @@ def test_a_flip_that_is_too_small_to_see_names_one_that_shows(command_line, bit,
     code, out, _ = command_line(*line)
     assert code == 0
     last = out.splitlines()[-1]
-    assert last.startswith("This flip is too small to see; try: mavfi fly ") == hinted
+    assert ("try: mavfi fly " in last) == hinted
     if hinted:
         words = shlex.split(last.partition("try: mavfi ")[2])
         assert words[:5] == ["fly", "--world", "farm", "--seed", "5"]

@@ -1,6 +1,7 @@
 """Ctrl-C while a run is repeated: nothing cut off is kept, compared, or drawn from."""
 
 import json
+import re
 import signal
 
 import pyarrow as pa
@@ -56,16 +57,13 @@ def test_an_interrupted_golden_pair_is_not_kept(command_line, sideways, cut_once
     cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, out) == (130, "")
-    assert err.splitlines() == [
-        "flying the golden pair: farm, seed 5",
-        CUT_OFF,
-    ]
+    assert err.splitlines()[1:] == [CUT_OFF]
     assert {path.name for path in sideways.path.iterdir()} == before
     code, out, err = command_line("show", sideways.path)
     assert (code, err, "Effect      unknown; `mavfi show --pair`" in out) == (0, "", True)
     code, out, err = command_line("show", "--pair", sideways.path)
     assert (code, "Effect      first at" in out) == (0, True)
-    assert err == "flying the golden pair: farm, seed 5\n"
+    assert "golden pair: farm, seed 5" in err
     for options in ([], ["--pair"]):  # kept, so not flown again
         assert command_line("show", *options, sideways.path) == (0, out, "")
 
@@ -85,11 +83,9 @@ def test_an_interrupted_repetition_is_neither_equal_nor_different(
     cut_once("mavfi_cli.mission.run")
     code, out, err = command_line("replay", sideways.path, "--out", "again", *options)
     assert (code, out) == (130, "")
-    again = "without its fault" if "--without-fault" in options else "again"
-    assert err.splitlines() == [
-        f"flying farm, seed 5, {again}",
-        CUT_OFF,
-    ]
+    flying, cut_off = err.splitlines()
+    assert ("without its fault" in flying) == ("--without-fault" in options)
+    assert cut_off == CUT_OFF
     assert not list((tmp_path / "again").iterdir())
 
 
@@ -126,7 +122,7 @@ def test_an_interrupted_flight_does_not_repeat(command_line, fly_short, command)
     folder = fly_short(CtrlC(), fault=FaultConfig(target="command_vx", at="time=9"))
     code, out, err = command_line(*command, folder.path)
     assert (code, out) == (1, "")
-    assert err == f"error: {folder.path}: an interrupted flight does not repeat\n"
+    assert re.match(f"error: {folder.path}: .*interrupted", err)
     assert command_line("show", folder.path)[0] == 0
 
 

@@ -1,6 +1,7 @@
 """`mavfi view` and `mavfi fly --record`."""
 
 import json
+import re
 import shutil
 from importlib import util
 from pathlib import Path
@@ -74,8 +75,7 @@ def test_a_flight_that_does_not_repeat_is_shown_without_what_its_nodes_received(
     (run / "result.json").write_text(json.dumps(result))
     done = mavfi("view", run, "--save", tmp_path / "foreign.mcap")
     assert done.returncode == 0
-    assert done.stderr.startswith("no depth frames, clouds and maps: ")
-    assert "does not repeat; `mavfi fly --record` keeps them" in done.stderr
+    assert "`mavfi fly --record`" in done.stderr
     told = topics(tmp_path / "foreign.mcap")
     assert "/flight/states" in told
     assert "/flight/map" not in told
@@ -99,17 +99,9 @@ def test_a_repetition_that_differs_is_told(short_flight, mavfi, tmp_path):
 @pytest.mark.parametrize(
     ("missing", "line", "told"),
     [
-        ("rerun", [], "rerun's window needs more packages: pip install 'mavfi[view]'"),
-        (
-            "rerun",
-            ["--save", "x.rrd"],
-            "a .rrd file needs more packages: pip install 'mavfi[view]'",
-        ),
-        (
-            "mcap_protobuf",
-            ["--save", "x.mcap"],
-            "a .mcap file needs more packages: pip install 'mavfi[mcap]'",
-        ),
+        ("rerun", [], "pip install 'mavfi[view]'"),
+        ("rerun", ["--save", "x.rrd"], "pip install 'mavfi[view]'"),
+        ("mcap_protobuf", ["--save", "x.mcap"], "pip install 'mavfi[mcap]'"),
     ],
 )
 def test_a_missing_extra_is_named_before_anything_flies(
@@ -117,7 +109,8 @@ def test_a_missing_extra_is_named_before_anything_flies(
 ):
     monkeypatch.setattr(view, "find_spec", lambda n: None if n == missing else util.find_spec(n))
     done = mavfi("view", short_flight.path, *line)
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"error: {told}\n")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert told in done.stderr
 
 
 def test_without_a_display_a_file_is_offered_before_anything_flies(
@@ -126,13 +119,13 @@ def test_without_a_display_a_file_is_offered_before_anything_flies(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     done = mavfi("view", short_flight.path)
-    told = "error: there is no display for rerun's window: use --save FILE.rrd\n"
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", told)
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
+    assert re.match("error: .*no display.*--save FILE.rrd", done.stderr)
 
 
 def test_bad_input_is_one_line(short_flight, mavfi, tmp_path):
     for line, code, told in (
-        ([short_flight.path, "--save", "x.png"], 2, "name a file that ends in .rrd or .mcap"),
+        ([short_flight.path, "--save", "x.png"], 2, ".rrd or .mcap"),
         ([tmp_path / "nothing", "--save", "x.mcap"], 1, "no such run folder"),
         ([short_flight.path, "--save", tmp_path / "no" / "x.mcap"], 2, "its folder does not exist"),
     ):

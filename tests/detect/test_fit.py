@@ -97,12 +97,12 @@ def test_the_split_is_by_flight_alike_in_each_world_and_drawn(dataset):
 def test_too_few_flights_are_refused(dataset):
     few = Dataset(flights=dataset.flights[:9], preprocess=dataset.preprocess, stack=STACK)
     for kind in fit.KINDS:
-        with pytest.raises(ModelError, match="the number of flights must be at least 10, got 9"):
+        with pytest.raises(ModelError, match="at least 10, got 9"):
             fit.fit(kind, few)
 
 
 def test_bad_requests(dataset):
-    with pytest.raises(UnknownName, match="unknown detector 'x'; known: aad, gad, l2, range"):
+    with pytest.raises(UnknownName, match=r"'x'.* aad, gad, l2, range"):
         fit.fit("x", dataset)
     with pytest.raises(ConfigError, match="n sigma"):
         fit.fit("gad", dataset, n_sigma=-1.0)

@@ -53,29 +53,26 @@ def test_what_is_saved_is_loaded_exactly(path):
     [
         ({"schema": 1}, "model schema must be 2, got 1"),
         ({"mavfi": "0.1.0"}, "must be made for mavfi '"),
-        ({"stack": "mavbench"}, "corrupt model file: stack: must be a table"),
-        ({"stack": {"name": "mavbench"}}, "corrupt model file: stack.digest: is missing"),
-        ({"stack": {"name": "mavbench", "digest": 1}}, "stack.digest: must be text, got 1"),
-        ({"stack": None}, "corrupt model file: missing or unknown keys stack"),
-        ({"extended": {}}, "extended must be collision, plan_trajectory_seq, plan_future"),
-        ({"extended": {**RANGES, "collision": [0]}}, "corrupt model file: extended.collision: "),
-        ({"extended": {**RANGES, "collision": [1, 2]}}, "extended: collision is not a range"),
-        (
-            {"extended": {**RANGES, "collision": [0, 0.5]}},
-            "collision.1.: must be a whole number",
-        ),
-        ({"extended": {**RANGES, "collision": [0, 40000]}}, "extended: collision is not a range"),
-        ({"detector": "aad"}, "must be made for detector 'gad', got 'aad'"),
-        ({"states": "0" * 64}, "made for another table of states"),
-        ({"preprocess_digest": "0" * 64}, "made with another preprocessing"),
-        ({"preprocess": {"yaw_floor": 1.5}}, "corrupt model file: preprocess.yaw_floor: must be"),
-        ({"preprocess": {"nonsense": 1}}, "corrupt model file: preprocess.nonsense: unknown key"),
-        ({"preprocess": [1]}, "preprocess: must be a table, got"),
-        ({"preprocess": {"yaw_floor": -1}}, "preprocess: parameters are missing"),
+        ({"stack": "mavbench"}, "corrupt model file: stack: "),
+        ({"stack": {"name": "mavbench"}}, "stack.digest: .*missing"),
+        ({"stack": {"name": "mavbench", "digest": 1}}, "stack.digest: .*got 1"),
+        ({"stack": None}, "unknown keys stack"),
+        ({"extended": {}}, "collision, plan_trajectory_seq, plan_future"),
+        ({"extended": {**RANGES, "collision": [0]}}, "extended.collision: "),
+        ({"extended": {**RANGES, "collision": [1, 2]}}, "extended: collision "),
+        ({"extended": {**RANGES, "collision": [0, 0.5]}}, "collision.1.: .*whole number"),
+        ({"extended": {**RANGES, "collision": [0, 40000]}}, "extended: collision "),
+        ({"detector": "aad"}, "'gad', got 'aad'"),
+        ({"states": "0" * 64}, "table of states"),
+        ({"preprocess_digest": "0" * 64}, "another preprocessing"),
+        ({"preprocess": {"yaw_floor": 1.5}}, "preprocess.yaw_floor: "),
+        ({"preprocess": {"nonsense": 1}}, "preprocess.nonsense: unknown"),
+        ({"preprocess": [1]}, "preprocess: .*table, got"),
+        ({"preprocess": {"yaw_floor": -1}}, "preprocess: .*missing"),
         ({"preprocess": {"position_floor": 5000}}, "corrupt model file: preprocess"),
-        ({"provenance": []}, "provenance: must be a table, got"),
-        ({"provenance": None}, "corrupt model file: missing or unknown keys provenance"),
-        ({"extra": 1}, "corrupt model file: missing or unknown keys extra"),
+        ({"provenance": []}, "provenance: .*table, got"),
+        ({"provenance": None}, "unknown keys provenance"),
+        ({"extra": 1}, "unknown keys extra"),
         ({"arrays": {}}, "arrays must be n_sigma, sigma_floor"),
     ],
 )
@@ -90,10 +87,10 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(path, values, problem):
 @pytest.mark.parametrize(
     ("value", "problem"),
     [
-        ([1.0, 2.0], r"array 'n_sigma' must have shape \(1,\), got \(2,\)"),
-        (["a"], "array 'n_sigma' does not contain numbers"),
+        ([1.0, 2.0], r"'n_sigma' .*\(1,\), got \(2,\)"),
+        (["a"], "'n_sigma' .*numbers"),
         ([None], "must be finite"),
-        ([[1.0], [2.0, 3.0]], "does not contain numbers"),
+        ([[1.0], [2.0, 3.0]], "numbers"),
         ([float("inf")], "must be finite"),
     ],
 )
@@ -141,7 +138,7 @@ def test_a_number_that_is_not_finite_overwrites_nothing(path):
 
 @pytest.mark.parametrize("value", [0, -2.0, float("nan"), float("inf")])
 def test_thresholds_out_of_range(value):
-    with pytest.raises(ConfigError, match="n sigma: must be a finite number above 0"):
+    with pytest.raises(ConfigError, match=r"n sigma: .*above 0"):
         base.checked_threshold(value, "n sigma")
 
 
@@ -181,5 +178,5 @@ def test_a_plug_in_that_does_not_load_has_a_row_of_its_own(monkeypatch):
     found = installed.PlugIns(base.PLUG_INS.group, "detector")
     monkeypatch.setattr(base, "PLUG_INS", found)
     rows = {row.name: row for row in base.listing()}
-    assert rows["gone"].description.startswith("cannot be used: the plug-in 'gone'")
+    assert "plug-in 'gone'" in rows["gone"].description
     assert {"gad", "aad", "range", "l2"} < set(rows)

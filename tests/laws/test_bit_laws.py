@@ -109,7 +109,7 @@ def test_a_bit_outside_the_width_is_refused_in_one_line(bit, kind):
 
 
 def test_a_field_that_the_type_has_not_is_refused():
-    with pytest.raises(FaultError, match="int32 has no field 'exponent'; it has: sign, any"):
+    with pytest.raises(FaultError, match=r"int32 .*'exponent'.* sign, any"):
         b.INT32.field_bits(Field.EXPONENT)
     with pytest.raises(FaultError, match="sign of at least 2 bits"):
         b.FLOAT64.draw(np.random.default_rng(0), field=Field.SIGN, count=2)

@@ -51,12 +51,12 @@ def test_serial_urls(url: str, device: str, baud: int) -> None:
     [
         ("", "unknown kind of endpoint"),
         ("14540", "unknown kind of endpoint"),
-        ("htpp:127.0.0.1:80", "known: udpin:.*udpout:.*tcp:.*tcpin:.*serial:.*fd:"),
-        ("udpout:14540", "not of the form udpout:host:port"),
-        ("udpout::14540", "not of the form udpout:host:port"),
+        ("htpp:127.0.0.1:80", "udpin:.*udpout:.*tcp:.*tcpin:.*serial:.*fd:"),
+        ("udpout:14540", "form udpout:host:port"),
+        ("udpout::14540", "form udpout:host:port"),
         ("tcp:host:port", "not of the form"),
         ("tcp:host:70000", "at most 65535, got 70000"),
-        ("tcp:host:0", "port must be at least 1, got 0"),
+        ("tcp:host:0", "at least 1, got 0"),
         ("udpin:::14540", "not of the form"),
         ("serial:", "not of the form serial"),
         ("serial::57600", "not of the form serial"),
@@ -103,12 +103,12 @@ def test_a_host_that_does_not_exist() -> None:
 
 
 def test_an_address_of_another_machine_cannot_be_bound() -> None:
-    with pytest.raises(LinkError, match="not an address of this machine"):
+    with pytest.raises(LinkError, match="this machine"):
         open_transport("udpin:192.0.2.1:0", allow_unsigned=True)
 
 
 def test_a_device_that_does_not_exist() -> None:
-    with pytest.raises(LinkError, match="no such device /dev/no-such-device"):
+    with pytest.raises(LinkError, match="no such device"):
         open_transport("serial:/dev/no-such-device:57600")
 
 

@@ -120,7 +120,7 @@ with link.recording(Path({str(path)!r})):
 
 
 def test_a_full_disk_is_one_clear_line() -> None:
-    with pytest.raises(RecordError, match="/dev/full: cannot write: No space left on device"):
+    with pytest.raises(RecordError, match=r"/dev/full: .*No space left"):
         _write(Path("/dev/full"), 1)
 
 

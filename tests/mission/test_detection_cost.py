@@ -3,34 +3,20 @@
 import json
 
 import pytest
+from made_flights import watched
 
 from mavfi_cli.mission.measures import DetectionCost, FlightRecord
-from mavfi_cli.spec.detector import DetectorConfig
 
+ALARMS = [
+    ("perception", "recompute"), ("planning", "recompute"), ("planning", "hold"),
+    ("planning", "accept"), ("control", "recompute"),
+]  # fmt: skip
+COUNTS = {"recompute": 6, "hold": 2, "accept": 1}
 RECORD = {
-    "detection": {
-        "detector": "gad",
-        "checks": {"report": 40, "plan": 4, "ahead": 56, "tick": 900},
-        "responses": {"recompute": 6, "hold": 2, "accept": 1},
-        "alarms": [
-            {"stage": "perception", "response": "recompute"},
-            {"stage": "planning", "response": "recompute"},
-            {"stage": "planning", "response": "hold"},
-            {"stage": "planning", "response": "accept"},
-            {"stage": "control", "response": "recompute"},
-        ],
-    },
+    **watched("gad", 0.005, ALARMS, responses=COUNTS),
     "quality_of_flight": {"flight_time_s": 20.0},
     "simulated_s": 32.0,
-    "host": {"stage_wall_s": {"gate": 0.005, "octomap": 0.2}},
-    "kernels": {
-        name: {"invocations": invocations, "busy_s": busy_s}
-        for name, invocations, busy_s in (
-            ("point_cloud", 100, 1.0), ("octomap", 20, 6.0), ("collision_check", 10, 0.5),
-            ("planner", 5, 1.0), ("control", 1000, 0.5),
-        )
-    },
-}  # fmt: skip
+}
 
 
 def test_checks_take_host_time_and_recomputations_the_latency_of_their_kernels():
@@ -76,8 +62,8 @@ def test_a_flight_in_which_nothing_was_checked_has_no_cost(changes):
     assert DetectionCost.of(FlightRecord.of({"outcome": "hang"})) is None
 
 
-def test_a_real_record_has_what_it_takes(fly_short):
-    result = json.loads(fly_short(detector=DetectorConfig(name="aad")).result.read_text())
+def test_a_real_record_has_what_it_takes(watched_flight):
+    result = json.loads(watched_flight.result.read_text())
     cost = DetectionCost.of(FlightRecord.of(result))
     assert cost.checks_host_s == result["host"]["stage_wall_s"]["gate"] > 0.0
     assert cost.flight_s == result["quality_of_flight"]["flight_time_s"]

@@ -74,15 +74,14 @@ def fails_at(monkeypatch):
     ("error", "told"),
     [
         (VehicleProcessError("physics diverged at 12.00 s"), "physics diverged at 12.00 s"),
-        (IndexError("a defect"), "the vehicle ended with IndexError: a defect"),
+        (IndexError("a defect"), "IndexError: a defect"),
     ],
 )
 def test_a_vehicle_that_breaks_is_a_lost_link_with_its_reason(fly_short, fails_at, error, told):
     fails_at(12.0, error)
     run = load_run(fly_short().path)
     assert run.result["outcome"] == "link_lost"
-    reason = f"the simulated vehicle: the peer closed the connection: {told}"
-    assert run.result["reason"] == reason
+    assert run.result["reason"].endswith(told)
     assert run.result["referee"] is not None  # the truth up to there
     assert run.result["simulated_s"] == 12.0
 
@@ -90,8 +89,8 @@ def test_a_vehicle_that_breaks_is_a_lost_link_with_its_reason(fly_short, fails_a
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"world": "fram"}, UnknownName, "unknown world 'fram'; did you mean 'farm'"),
-        ({"vehicle": "sole"}, UnknownName, "unknown vehicle 'sole'"),
+        ({"world": "fram"}, UnknownName, "'fram'.* 'farm'"),
+        ({"vehicle": "sole"}, UnknownName, "'sole'"),
         ({"goal": (1e6, 0.0, 5.0)}, PlaceError, "goal"),
     ],
 )

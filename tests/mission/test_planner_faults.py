@@ -4,6 +4,7 @@ import contextlib
 import json
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,12 +38,17 @@ def flown(folder):
     return folder.trace.read_bytes(), folder.tlog.read_bytes(), result
 
 
+@pytest.fixture(scope="module")
+def struck(fly_short):
+    """Flies straight with a fault in its planner, once for each seed."""
+    return cache(lambda seed: fly_short(instruction=InstructionConfig(target="planner", seed=seed)))
+
+
 @pytest.mark.slow
 @traced
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed):
-    folder = fly_short(instruction=InstructionConfig(target="planner", seed=seed))
-    result = load_run(folder.path).result
+def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(struck, seed):
+    result = load_run(struck(seed).path).result
     fault = result["fault"]
     assert (fault["state"], fault["node"], fault["kernel"]) == ("applied", "planner", "rrtstar")
     assert fault["object"] in {SEGMENT, PIECES}
@@ -56,8 +62,8 @@ def test_a_flight_that_is_straight_takes_a_fault_in_its_planner(fly_short, seed)
 
 @pytest.mark.slow
 @traced
-def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(fly_short, tmp_path):
-    first = fly_short(instruction=InstructionConfig(target="planner", seed=1))
+def test_a_replay_of_a_fault_in_a_straight_request_is_the_same_to_the_byte(struck, tmp_path):
+    first = struck(1)
     config, recorded = load_run(first.path).mission(), records.read(first.fault)
     assert flown(fly_mission(config, tmp_path, Watcher(), repeat=recorded)) == flown(first)
 

@@ -1,6 +1,7 @@
 """The gate in a mission: what is withheld, what is computed again, when it ends, what is told."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,8 +114,8 @@ def test_people_hear_of_a_row_of_alarms_once_and_of_a_hold_always(limit):
     for command in (COMMAND, WILD, WILD, WILD, WILD):
         tick(gate, command)
     first, second = gate.news()
-    assert first == "limit alarm in control: command_vx; recompute"
-    assert second == "limit alarm in control: command_vx; hold"
+    assert first.endswith("control: command_vx; recompute")
+    assert second.endswith("control: command_vx; hold")
     assert gate.news() == []
 
 
@@ -193,7 +194,7 @@ def test_a_plan_with_a_wrong_number_is_withheld_until_recomputing_has_confirmed_
         Response.RECOMPUTE, Response.HOLD, Response.ACCEPT, Response.PASS,
     ]  # fmt: skip
     assert {alarm.states for alarm in gate.summary().alarms} == {("plan_trajectory_seq",)}
-    assert gate.news()[0] == ("extended watch alarm in planning: plan_trajectory_seq; recompute")
+    assert "planning: plan_trajectory_seq; recompute" in gate.news()[0]
 
 
 @pytest.mark.parametrize("name", ["gad", "aad"])
@@ -228,10 +229,10 @@ def test_a_model_is_that_of_the_stack_or_of_its_base(tmp_path):
 @pytest.mark.parametrize(
     ("stack", "asked", "problem"),
     [
-        ("mavbench-release", {}, r"made for the stack 'mavbench', not for 'mavbench-release'; "),
+        ("mavbench-release", {}, r"'mavbench', not for 'mavbench-release'"),
         ("mavbench:guards_tracking=true", {}, "mavfi train --stack mavbench:guards_tracking=true"),
         ("mavbench", {"model": str(shipped("gad", "hardened"))},
-         r"hardened/gad\.json: .*the stack 'hardened', not for 'mavbench'"),
+         r"hardened/gad\.json: .*'hardened', not for 'mavbench'"),
     ],
 )  # fmt: skip
 def test_a_model_of_another_stack_is_refused_in_one_line(stack, asked, problem):
@@ -254,7 +255,7 @@ def test_a_model_of_the_stack_as_it_once_was_is_refused(tmp_path):
     held["stack"]["digest"] = "0" * 64
     (tmp_path / "old.json").write_text(json.dumps(held))
     config = DetectorConfig(name="gad", model=str(tmp_path / "old.json"))
-    with pytest.raises(ModelError, match="for the stack 'mavbench as it was', not for"):
+    with pytest.raises(ModelError, match="'mavbench as it was'"):
         config.build("mavbench")
 
 
@@ -277,6 +278,9 @@ def test_a_golden_flight_is_the_same_with_a_silent_gate(guarded, short_flight):
     assert run.result["detection"]["checks"]["tick"] == run.trace.num_rows
     assert run.folder.trace.read_bytes() == golden.folder.trace.read_bytes()
     assert run.folder.tlog.read_bytes() == golden.folder.tlog.read_bytes()
+    assert run.mission().detector == DetectorConfig(name="limit", alarms_max=3)
+    asked = json.loads(run.folder.result.read_text())["config"]["detector"]
+    assert asked["protect"] == [stage.value for stage in Stage]
 
 
 def test_a_wild_command_never_leaves_and_is_told_to_ground_stations(
@@ -387,8 +391,8 @@ def test_a_flip_in_a_number_of_the_flown_plan_is_undone_before_the_check_reads_i
     assert result["outcome"] == "success"
 
 
-def test_a_golden_flight_is_the_same_with_the_extended_watch(fly_short, short_flight):
-    golden, run = load_run(short_flight.path), load_run(fly_short(detector=EXTENDED).path)
+def test_a_golden_flight_is_the_same_with_the_extended_watch(watched_flight, short_flight):
+    golden, run = load_run(short_flight.path), load_run(watched_flight.path)
     assert run.result["detection"]["alarm_count"] == 0
     assert run.folder.trace.read_bytes() == golden.folder.trace.read_bytes()
     assert run.folder.tlog.read_bytes() == golden.folder.tlog.read_bytes()
@@ -401,7 +405,7 @@ def test_a_flight_with_a_model_of_another_stack_ends_before_it_begins(fly_short,
     done = mavfi(*words)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("error: ")
-    assert "mavbench/gad.json: gad: made for the stack 'mavbench'" in done.stderr
+    assert re.search("mavbench/gad.json: .*'mavbench'", done.stderr)
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "runs").exists()
 
@@ -423,7 +427,7 @@ def test_a_campaign_refuses_a_model_of_another_stack_before_it_flies(mavfi, tmp_
     specification.write_text(text.format("false"))
     done = mavfi("campaign", "run", specification, "--out", tmp_path / "flown", "--quiet")
     assert done.returncode == 1
-    assert "made for the stack 'mavbench'" in done.stderr
+    assert "stack 'mavbench'" in done.stderr
     assert not (tmp_path / "flown").exists()
     specification.write_text(text.format("true"))
     missions = [m.config.detector for m in load_spec(str(specification)).missions()]
@@ -435,10 +439,3 @@ def test_a_campaign_refuses_a_model_of_another_stack_before_it_flies(mavfi, tmp_
 def test_a_fault_in_no_detector_is_refused(fly_short):
     with pytest.raises(FaultSpecError, match="--detector"):
         fly_short(fault=FaultConfig(target="detector"))
-
-
-def test_the_record_of_a_guarded_run_can_be_read_back(guarded):
-    run = guarded()
-    asked = json.loads(run.folder.result.read_text())["config"]["detector"]
-    assert run.mission().detector == DetectorConfig(name="limit", alarms_max=3)
-    assert asked["protect"] == [stage.value for stage in Stage]

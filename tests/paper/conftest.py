@@ -7,10 +7,12 @@ import pytest
 from mavfi_cli.paper import flying
 
 
-@pytest.fixture
-def no_vehicle(monkeypatch):
+@pytest.fixture(scope="module")
+def no_vehicle():
     """Let nothing start a vehicle, and let the workers find the task that flies nothing."""
-    monkeypatch.setattr(flying, "check_kinds", lambda missions: None)
     folder = os.path.join(os.path.dirname(__file__), os.pardir, "campaigns")
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("PYTHONPATH", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flying, "check_kinds", lambda missions: None)
+        patch.syspath_prepend(folder)
+        patch.setenv("PYTHONPATH", folder)
+        yield

@@ -205,7 +205,7 @@ def test_silent_faults_and_dead_nodes_are_judged_apart():
     assert set(by_name["table4-golden-dense"].judgements["mavbench"]) == {Fate.ALL}
     calm = {each.claim.name: each for each in judged({"mavbench": dense(0)}, {})}
     dead = calm["table4-dense"].judgements["mavbench"][Fate.DEAD]
-    assert dead.why == "none of the faults ends a node"
+    assert "none of the faults" in dead.why
 
 
 def kernels(**shares):
@@ -294,7 +294,7 @@ def test_five_bits_beside_one_that_costs_nothing_tell_nothing():
     assert found["table3-1"].verdict("mavbench") is Verdict.CONTRADICTED
     judgement = found["table3-5"].judgements["mavbench"][Fate.ALL]
     assert judgement.verdict is Verdict.NOT_DECIDABLE
-    assert judgement.why == "its premise does not hold here: table3-1 is contradicted"
+    assert judgement.why.endswith("table3-1 is contradicted")
 
 
 def test_what_a_detector_causes_stands_against_what_it_saves():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import matplotlib.colors
 import pytest
-from made_flights import flight, struck, table
+from made_flights import flight, flights, struck
 from matplotlib.text import Text
 
 from mavfi_cli.core.errors import RecordError
@@ -26,17 +26,17 @@ from mavfi_cli.report.paper import (
     draw_stack,
 )
 
-FLIGHTS = table(*(
+FLIGHTS = flights(
     each
     for seed in "abcd"
     for world in ("factory", "sparse")
     for each in (
-        flight(seed, 20.0, world=world),
-        struck(seed, 20.0 + ord(seed) % 7, world=world, fault_field="sign"),
-        struck(seed, 21.0, world=world, fault_field="sign", detector="gad"),
-        struck(seed, 20.5, world=world, fault_field="sign", detector="aad"),
+        flight(20.0, pair=seed, world=world),
+        struck(20.0 + ord(seed) % 7, pair=seed, world=world, fault_field="sign"),
+        struck(21.0, pair=seed, world=world, fault_field="sign", detector="gad"),
+        struck(20.5, pair=seed, world=world, fault_field="sign", detector="aad"),
     )
-))  # fmt: skip
+)  # fmt: skip
 FROM_TABLES = sorted(set(DRAWN) - {"fig13"})  # fig13 draws run folders
 
 
@@ -126,15 +126,15 @@ def test_what_is_drawn_is_what_the_table_says():
 
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 def test_before_a_mission_has_flown_there_is_nothing_to_draw(name):
-    nothing = table()
-    with pytest.raises(RecordError, match="no mission of the figure has flown yet"):
+    nothing = flights([])
+    with pytest.raises(RecordError, match="no mission"):
         draw(of_flights(name, nothing), nothing, "one")
 
 
 @pytest.mark.parametrize("name", ["fig8", "fig9"])
 def test_faults_by_place_need_a_fault(name):
-    golden = table(flight("a", 20.0))
-    with pytest.raises(RecordError, match="no mission of the figure has flown yet"):
+    golden = flights([flight(20.0)])
+    with pytest.raises(RecordError, match="no mission"):
         draw(of_flights(name, golden), golden, "one")
 
 

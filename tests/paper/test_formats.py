@@ -7,7 +7,7 @@ import itertools
 import re
 
 import pytest
-from made_flights import flight, struck, table
+from made_flights import flight, flights, struck
 
 from mavfi_cli.paper.layouts import OF_FLIGHTS, of_flights
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
@@ -25,29 +25,31 @@ def whole():
     """Flights of the four worlds with each detector, three a setting with other times."""
     for seed, world in itertools.product(("a", "b", "c"), WORLDS):
         time_s = 90.0 + ord(seed) % 7
-        yield flight(seed, time_s, world=world)
-        yield struck(seed, 1.9 * time_s, world=world, fault_bits=1)
+        yield flight(time_s, pair=seed, world=world)
+        yield struck(1.9 * time_s, pair=seed, world=world, fault_bits=1)
         for detector in ("gad", "aad"):
-            yield struck(seed, 1.2 * time_s, world=world, detector=detector, fault_bits=1, **COSTS)
+            yield struck(
+                1.2 * time_s, pair=seed, world=world, detector=detector, fault_bits=1, **COSTS
+            )
 
 
 def places(column, values, **common):
     for seed, time_s in (("a", 90.0), ("b", 101.0), ("c", 97.0)):
-        yield flight(seed, time_s)
+        yield flight(time_s, pair=seed)
         for value in values:
-            yield struck(seed, 1.31 * time_s, **{column: value}, **common)
+            yield struck(1.31 * time_s, pair=seed, **{column: value}, **common)
 
 
 FLIGHTS = {
-    "fig8": table(*places("fault_target", STATES)),
-    "table3": table(*places("fault_bits", (1, 3, 5))),
-    **dict.fromkeys(("table4", "table5", "fig12", "fig14"), table(*whole())),
+    "fig8": flights(places("fault_target", STATES)),
+    "table3": flights(places("fault_bits", (1, 3, 5))),
+    **dict.fromkeys(("table4", "table5", "fig12", "fig14"), flights(whole())),
 }
 
 
 @functools.cache
 def laid_out(name):
-    return of_flights(name, table(*whole()))
+    return of_flights(name, flights(whole()))
 
 
 @pytest.mark.parametrize("name", FLIGHTS)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from made_flights import export_table
+from made_flights import export_table, flight
 
 from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.campaigns.missions import canonical, changes_of
@@ -38,16 +38,15 @@ def shown(monkeypatch):
 def export(seed, folder=None):
     """The missions of Fig. 13 with a seed, whose run folders are this one."""
     rows = []
-    for place, mission in enumerate(KINDS):
+    for mission in KINDS:
         changes = {**changes_of(mission.config), "seed": seed}
         level = "instruction" if mission.config.instruction else None
         rows.append(
-            {"number": place, "pair": str(seed), "stack": "mavbench", "level": level,
-             "world": "dense", "planner": "rrtstar", "platform": "x86", "detector": None,
-             "protect": None, "state": "flown", "outcome": "success", "flight_time_s": 20.0,
-             "fault_target": "planning" if level else None, "fault_field": "any",
-             "fault_bits": 1, "fault_seed": 1, "changes": canonical(changes),
-             "path": None if folder is None else str(folder)}
+            flight(
+                20.0, pair=str(seed), stack="mavbench", world="dense", level=level,
+                fault_target="planning" if level else None, changes=canonical(changes),
+                path=None if folder is None else str(folder),
+            )
         )  # fmt: skip
     return export_table(rows)
 

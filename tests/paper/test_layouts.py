@@ -3,9 +3,9 @@
 import math
 from pathlib import Path
 
-import flown_twice
+import made_flights
 import pytest
-from made_flights import flight, struck, table
+from made_flights import flight, flights, struck
 
 from mavfi_cli.analysis.kernels import KernelSummary
 from mavfi_cli.paper.items import ITEMS, Source, printed
@@ -29,14 +29,14 @@ def rows_of(found):
 
 
 def test_table_iv_counts_every_flown_mission_beside_the_papers_rate():
-    flights = table(
-        flight("a", 20.0), flight("b", 20.0, world="dense"),
-        struck("a", 25.0), struck("a", None), struck("a", 21.0), struck("a", 22.0),
-        struck("a", 20.0, detector="gad"), struck("a", None, detector="aad"),
-        struck("a", None, detector="gad", protect="control"),
-        {**struck("a", 20.0), "state": "error"},
-    )  # fmt: skip
-    found = of_flights("table4", flights)
+    flown = flights([
+        flight(20.0), flight(20.0, pair="b", world="dense"),
+        struck(25.0), struck(None), struck(21.0), struck(22.0),
+        struck(20.0, detector="gad"), struck(None, detector="aad"),
+        struck(None, detector="gad", protect="control"),
+        {**struck(20.0), "state": "error"},
+    ])  # fmt: skip
+    found = of_flights("table4", flown)
     assert [column.title for column in found.columns] == ["sparse", "dense"]
     faults = cell(found, "injection", "sparse")
     assert (faults.value, faults.count, faults.paper) == (75.0, 4, 88.3)
@@ -49,14 +49,14 @@ def test_table_iv_counts_every_flown_mission_beside_the_papers_rate():
 
 
 def test_fig_12_compares_each_flight_with_its_own_golden_one():
-    flights = table(
-        flight("a", 20.0), flight("b", 40.0), flight("c", None),
-        struck("a", 30.0), struck("b", 44.0), struck("c", 90.0),
-        struck("a", None, fault_seed=2),
-        struck("a", 22.0, detector="gad"), struck("b", 40.0, detector="gad"),
-        struck("a", 20.0, detector="aad"),
-    )  # fmt: skip
-    found = of_flights("fig12", flights)
+    flown = flights([
+        flight(20.0), flight(40.0, pair="b"), flight(None, pair="c"),
+        struck(30.0), struck(44.0, pair="b"), struck(90.0, pair="c"),
+        struck(None, fault_seed=2),
+        struck(22.0, detector="gad"), struck(40.0, pair="b", detector="gad"),
+        struck(20.0, detector="aad"),
+    ])  # fmt: skip
+    found = of_flights("fig12", flown)
     worst = cell(found, "sparse", "worst, %")
     assert (worst.value, worst.count, worst.paper) == (pytest.approx(50.0), 2, 62.6)
     assert math.isnan(worst.low)  # a maximum
@@ -67,23 +67,22 @@ def test_fig_12_compares_each_flight_with_its_own_golden_one():
 
 
 def test_a_longer_fault_that_no_detector_saw_is_not_recovered():
-    flights = table(
-        flight("a", 20.0), struck("a", 22.0, fault_seed=1), struck("a", 40.0, fault_seed=2),
-        struck("a", 22.0, fault_seed=1, detector="gad"),
-    )  # fmt: skip
-    found = of_flights("fig12", flights)
+    flown = flights([
+        flight(20.0), struck(22.0, fault_seed=1), struck(40.0, fault_seed=2),
+        struck(22.0, fault_seed=1, detector="gad"),
+    ])  # fmt: skip
+    found = of_flights("fig12", flown)
     assert cell(found, "sparse", "worst, %").value == pytest.approx(100.0)
     assert cell(found, "sparse", "GAD, points").value == pytest.approx(0.0)
 
 
 def test_fig_14_gives_the_recovered_share_by_protected_stages():
-    flights = table(
-        flight("a", 20.0, world="factory"),
-        struck("a", 30.0, world="factory"),
-        struck("a", 25.0, world="factory", detector="gad", protect="control"),
-        struck("a", 20.0, world="factory", detector="aad"),
-    )
-    found = of_flights("fig14", flights)
+    flown = flights([
+        flight(20.0, world="factory"), struck(30.0, world="factory"),
+        struck(25.0, world="factory", detector="gad", protect="control"),
+        struck(20.0, world="factory", detector="aad"),
+    ])  # fmt: skip
+    found = of_flights("fig14", flown)
     control = cell(found, "Gaussian control", "factory")
     assert (control.value, control.paper, control.count) == (pytest.approx(50.0), 34.7, 1)
     assert cell(found, "autoencoder perception+planning+control", "factory").value == 100.0
@@ -91,12 +90,12 @@ def test_fig_14_gives_the_recovered_share_by_protected_stages():
 
 
 def test_table_iii_has_a_row_for_each_number_of_bits():
-    flights = table(
-        flight("a", 20.0), flight("b", 22.0, replans=2),
-        struck("a", 30.0, level="source", fault_bits=1), struck("b", None, fault_bits=1),
-        struck("a", 40.0, level="source", fault_bits=5, energy_regression_j=20_000.0),
-    )  # fmt: skip
-    found = of_flights("table3", flights)
+    flown = flights([
+        flight(20.0), flight(22.0, pair="b", replans=2),
+        struck(30.0, level="source", fault_bits=1), struck(None, pair="b", fault_bits=1),
+        struck(40.0, level="source", fault_bits=5, energy_regression_j=20_000.0),
+    ])  # fmt: skip
+    found = of_flights("table3", flown)
     assert [row.labels for row in found.rows] == [("0 (golden)",), ("1",), ("5",)]
     golden = cell(found, "0", "flight time, s")
     assert (golden.value, golden.count, golden.paper) == (21.0, 2, 94.6)
@@ -106,7 +105,7 @@ def test_table_iii_has_a_row_for_each_number_of_bits():
 
 
 def test_table_v_says_that_an_export_has_no_times():
-    found = of_flights("table5", table(struck("a", 20.0, detector="gad")))
+    found = of_flights("table5", flights([struck(20.0, detector="gad")]))
     assert any(note.startswith("no numbers: this export") for note in found.notes)
 
 
@@ -114,10 +113,8 @@ def test_table_v_adds_detection_and_recovery():
     costs = {"check_share": 0.001, "recovery_share_perception": 0.02,
              "recovery_share_planning": 0.03, "recovery_share_control": 0.0}  # fmt: skip
     alone = {**costs, "recovery_share_perception": 0.0, "recovery_share_planning": 0.0}
-    flights = table(
-        struck("a", 20.0, detector="gad", **costs), struck("a", 20.0, detector="aad", **alone)
-    )
-    found = of_flights("table5", flights)
+    flown = flights([struck(20.0, detector="gad", **costs), struck(20.0, detector="aad", **alone)])
+    found = of_flights("table5", flown)
     assert cell(found, "GAD planning", "sparse").value == pytest.approx(3.0)
     assert cell(found, "GAD sum", "sparse").value == pytest.approx(5.1)
     assert cell(found, "GAD sum", "sparse").paper == 1.9218
@@ -126,52 +123,54 @@ def test_table_v_adds_detection_and_recovery():
 
 
 def test_figs_7_to_9_have_a_row_for_each_place():
-    flights = table(
-        flight("a", 20.0), flight("b", 30.0, planner="rrt"),
-        struck("a", 24.0, fault_target="planner"),
-        struck("b", 33.0, fault_target="planner", planner="rrt"),
-        struck("a", None, fault_target="control"),
-    )  # fmt: skip
-    found = of_flights("fig7", flights)
+    flown = flights([
+        flight(20.0), flight(30.0, pair="b", planner="rrt"),
+        struck(24.0, fault_target="planner"),
+        struck(33.0, pair="b", fault_target="planner", planner="rrt"),
+        struck(None, fault_target="control"),
+    ])  # fmt: skip
+    found = of_flights("fig7", flown)
     assert rows_of(found)["RRT*"][2].value == pytest.approx(20.0)
     rows = rows_of(found)
     assert list(rows) == ["golden, RRT*", "golden, RRT", "RRT", "RRT*", "PID"]
     assert rows["RRT"][2].value == pytest.approx(10.0)
     assert rows["PID"][0].value == 0.0
-    fields = of_flights("fig9", table(
-        flight("a", 20.0), struck("a", 21.0, fault_field="sign"),
-        struck("a", 20.0, fault_field="mantissa"),
-    ))  # fmt: skip
+    fields = of_flights("fig9", flights([
+        flight(20.0), struck(21.0, fault_field="sign"),
+        struck(20.0, fault_field="mantissa"),
+    ]))  # fmt: skip
     labels = [row.labels for row in fields.rows]
     assert labels == [("golden", ""), ("sign", "yes"), ("mantissa", "no")]
-    states = of_flights("fig8", table(
-        flight("a", 20.0), struck("a", 30.0, fault_target="time_to_collision")
-    ))  # fmt: skip
+    states = of_flights("fig8", flights([
+        flight(20.0), struck(30.0, fault_target="time_to_collision")
+    ]))  # fmt: skip
     assert "+50.0 % over its own golden one (time_to_collision)" in states.result
 
 
 def test_fig_13_follows_one_flight_into_its_recovery():
-    flights = table(
-        flight("a", 20.0), flight("b", 20.0),
-        struck("a", 22.0), struck("b", 30.0),
-        struck("a", 26.0, detector="aad"), struck("b", 21.0, detector="aad"),
-    )  # fmt: skip
-    found = of_flights("fig13", flights)
+    flown = flights([
+        flight(20.0), flight(20.0, pair="b"),
+        struck(22.0), struck(30.0, pair="b"),
+        struck(26.0, detector="aad"), struck(21.0, pair="b", detector="aad"),
+    ])  # fmt: skip
+    found = of_flights("fig13", flown)
     assert cell(found, "planning", "worst, %").value == pytest.approx(50.0)
     assert cell(found, "planning", "worst, %").paper == 24.5
     assert cell(found, "planning", "the same with AAD, %").value == pytest.approx(5.0)
-    milder = struck("b", 28.0, detector="aad", fault_seed=2)  # of the same mission
-    found = of_flights("fig13", table(flight("b", 20.0), struck("b", 30.0, fault_seed=1), milder))
+    milder = struck(28.0, pair="b", detector="aad", fault_seed=2)  # of the same mission
+    found = of_flights(
+        "fig13", flights([flight(20.0, pair="b"), struck(30.0, pair="b", fault_seed=1), milder])
+    )
     assert math.isnan(cell(found, "planning", "the same with AAD, %").value)
 
 
 def test_fig_16_compares_platforms():
-    flights = table(
-        flight("a", 20.0), flight("c", 25.0, platform="tx2"),
-        struck("a", 22.0), struck("c", 50.0, platform="tx2"),
-        struck("c", 30.0, platform="tx2", detector="gad"),
-    )  # fmt: skip
-    found = of_flights("fig16", flights)
+    flown = flights([
+        flight(20.0), flight(25.0, pair="c", platform="tx2"),
+        struck(22.0), struck(50.0, pair="c", platform="tx2"),
+        struck(30.0, pair="c", platform="tx2", detector="gad"),
+    ])  # fmt: skip
+    found = of_flights("fig16", flown)
     worst = cell(found, "tx2", "worst, x own golden")
     assert (worst.value, worst.paper) == (pytest.approx(2.0), 2.8)
     assert cell(found, "tx2", "GAD recovers, %").value == pytest.approx(80.0)
@@ -182,11 +181,11 @@ def test_fig_16_and_a_comparison_take_the_same_flights():
     """The worst fault was not flown with the detector, so no detector recovers any of it."""
     times_s = [("golden", 1, 20.0), ("golden", 2, 20.0), ("none", 1, 24.0), ("none", 2, 40.0),
                ("gad", 1, 21.0)]  # fmt: skip
-    flights = [flown_twice.flight("tx2", seed, time_s, setting, world="sparse")
+    flights = [made_flights.on("tx2", seed, time_s, setting, world="sparse")
                for setting, seed, time_s in times_s]  # fmt: skip
     plan = ComparePlan(platforms=("tx2",), inject=("planning",), detectors=("gad",))
-    bare, protected = flown_twice.figures_of(plan, flights).costs
-    figure = of_flights("fig16", flown_twice.table(flights))
+    bare, protected = made_flights.comparison(plan, flights).costs
+    figure = of_flights("fig16", made_flights.compared(flights))
     worst = cell(figure, "tx2", "worst, x own golden").value
     recovered = cell(figure, "tx2", "GAD recovers, %").value
     assert worst == bare.over_own.largest == pytest.approx(2.0)
@@ -195,7 +194,7 @@ def test_fig_16_and_a_comparison_take_the_same_flights():
 
 @pytest.mark.parametrize("name", OF_FLIGHTS)
 def test_a_layout_takes_a_table_without_flights(name):
-    found = of_flights(name, table())
+    found = of_flights(name, flights([]))
     assert found.name == name
     assert all(math.isnan(each.value) for row in found.rows for each in row.cells)
     assert found.result

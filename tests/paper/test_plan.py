@@ -60,8 +60,8 @@ def test_an_item_has_a_preset_or_another_source():
 def test_unknown_items_are_named():
     assert items_named([]) == ITEMS
     assert [each.name for each in items_named(["table4", "fig8"])] == ["fig8", "table4"]
-    with pytest.raises(UnknownName, match="did you mean 'table4'"):
+    with pytest.raises(UnknownName, match="'table4'"):
         items_named(["tabel4"])
-    with pytest.raises(ConfigError, match="fig1: is not an experiment: it draws the pipeline"):
+    with pytest.raises(ConfigError, match="fig1: is not an experiment"):
         items_named(["fig1"])
     assert not LEFT_OUT.keys() & BY_NAME.keys()

@@ -3,6 +3,8 @@
 import csv
 import io
 import json
+import re
+import shutil
 
 import pytest
 from test_reproductions import TASK, flown, plan
@@ -15,19 +17,19 @@ from mavfi_cli.paper.flying import Forecast
 pytestmark = pytest.mark.usefixtures("no_vehicle")
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """The folder of a reproduction of fig9."""
-    asked = plan(tmp_path, "fig9")
+@pytest.fixture(scope="module")
+def folder(no_vehicle, tmp_path_factory):
+    """The folder of a reproduction of fig9; do not change it."""
+    asked = plan(tmp_path_factory.mktemp("reproduction"), "fig9")
     flown(asked)
     return asked.folder
 
 
-@pytest.fixture
-def table3(tmp_path, mavfi):
-    """The folder of a campaign of a preset."""
+@pytest.fixture(scope="module")
+def table3(no_vehicle, tmp_path_factory):
+    """The folder of a campaign of a preset; do not change it."""
     missions = load_spec("table3").scaled(0.02).missions()
-    folder = tmp_path / "campaigns/table3"
+    folder = tmp_path_factory.mktemp("home") / "campaigns/table3"
     run_campaign(missions, folder, TASK).close()
     with Ledger(folder, writing=True) as ledger:
         ledger.set_meta({"name": "table3"})  # as `begin` does
@@ -38,20 +40,18 @@ def test_a_reproduction_ends_with_a_line_an_item(folder, mavfi):
     run = mavfi("reproduce", "fig9", "fig15", "--scale", "0.02", "--out", folder.parent)
     assert (run.returncode, run.stderr) == (0, "8 missions, 8 of them flown\n")
     title, result, *rest = run.stdout.splitlines()
-    assert title == "Fig. 9: faults in each field of float64"
+    assert title.startswith("Fig. 9: ")
     assert "over its own golden one" in result
-    assert rest[0] == "Fig. 15: flight time with redundant computers"
-    assert (
-        rest[1]
-        == "  flight time with TMR: x airsim 1.060 (paper 1.060), x spark 1.910 (paper 1.910)"
-    )
+    assert rest[0].startswith("Fig. 15: ")
+    assert re.search(r"airsim 1\.060 \(paper 1\.060\), .*spark 1\.910 \(paper 1\.910\)", rest[1])
     assert f"mavfi campaign report {folder} --item ITEM" in run.stdout
     assert f"mavfi report {folder.parent} -o report.html" in run.stdout
 
 
 def test_one_item_is_shown_whole(tmp_path, mavfi):
     run = mavfi("reproduce", "fig15", "--out", tmp_path / "new")
-    assert (run.returncode, run.stderr) == (0, "nothing to fly: the model computes the items\n")
+    assert run.returncode == 0
+    assert run.stderr.startswith("nothing to fly")
     assert "tmr" in run.stdout
     assert "campaign report" not in run.stdout
     assert not (tmp_path / "new").exists()  # the model flies nothing
@@ -73,29 +73,30 @@ def test_a_scale_that_cannot_be_is_wrong_usage(tmp_path, mavfi, scale):
     assert "'--scale'" in run.stderr
 
 
+def numbers(forecast):
+    return re.findall(r"\d[\d:]*", forecast.summary)
+
+
 def test_the_forecast_is_one_line():
     forecast = Forecast(
         missions=100, over=10, seconds=3700, disk_bytes=2.5e6, measured=10, jobs=2, runs=7
     )
-    assert forecast.summary == (
-        "100 missions, 10 of them flown; 7 runs of kernels; what is left takes about 1:01:40 h on "
-        "this machine (2 at a time, from 10 missions) and 2 MB"
-    )
-    early = Forecast(missions=100, over=1, disk_bytes=2.5e6)
-    assert early.summary == "100 missions, 1 of them flown; what is left takes about 2 MB"
-    assert Forecast(missions=8, over=8).summary == "8 missions, 8 of them flown"
+    # Missions, over, runs, time left, jobs, measured, MB.
+    assert numbers(forecast) == ["100", "10", "7", "1:01:40", "2", "10", "2"]
+    assert numbers(Forecast(missions=100, over=1, disk_bytes=2.5e6)) == ["100", "1", "2"]
+    assert numbers(Forecast(missions=8, over=8)) == ["8", "8"]
 
 
 def test_unknown_items_are_usage_errors(mavfi, tmp_path):
     run = mavfi("reproduce", "tabel4")
     assert (run.returncode, run.stdout) == (2, "")
-    assert "did you mean 'table4'" in run.stderr
+    assert "'table4'" in run.stderr
     run = mavfi("reproduce", "table1")
     assert (run.returncode, len(run.stderr.splitlines())) == (1, 1)
     assert "is not an experiment" in run.stderr
     assert mavfi("reproduce", "fig9", "--scale", "0").returncode == 2
     run = mavfi("reproduce", "fig9", "--stack", "mavbnch", "--out", tmp_path)
-    assert "did you mean 'mavbench'" in run.stderr
+    assert "'mavbench'" in run.stderr
 
 
 @pytest.mark.slow
@@ -115,7 +116,7 @@ def test_report_prints_a_table_and_draws_its_figure(folder, mavfi, tmp_path):
 def test_report_and_status_of_a_preset_show_the_papers_table(table3, mavfi):
     home = table3.parent.parent
     text = mavfi("campaign", "report", "table3", cwd=home).stdout
-    assert text.startswith("Table III: number of flipped bits\n")
+    assert text.startswith("Table III: ")
     assert mavfi("campaign", "report", "table3", "--item", "table3", cwd=home).stdout == text
     status = mavfi("campaign", "status", "table3", cwd=home).stdout
     assert status == f"table3: 8 of 8 missions\n\n{text}"
@@ -145,7 +146,7 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
     for arguments, told in (
         (("--item", "fig99"), "unknown item 'fig99'"),
         (("--item", "fig2"), "is not an experiment"),
-        (("--item", "fig9", "--output", "x.jpg"), "name a file that ends in .svg, .pdf or .png"),
+        (("--item", "fig9", "--output", "x.jpg"), ".svg, .pdf or .png"),
         (("--item", "fig9", "--output", tmp_path / "no/x.png"), "its folder does not exist"),
         (("--item", "fig6"), "no runs of kernels"),
     ):
@@ -155,16 +156,17 @@ def test_bad_reports_are_one_line(folder, mavfi, tmp_path):
         assert told in run.stderr
 
 
-def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi):
+def test_status_of_a_campaign_of_ones_own_is_one_table(table3, mavfi, tmp_path):
     """What all settings share is said once, below the table."""
-    with Ledger(table3, writing=True) as ledger:
+    mine = shutil.copytree(table3, tmp_path / "mine")
+    with Ledger(mine, writing=True) as ledger:
         ledger.set_meta({"name": "mine"})
-    lines = mavfi("campaign", "status", table3).stdout.splitlines()
+    lines = mavfi("campaign", "status", mine).stdout.splitlines()
     (shared,) = [line for line in lines if "site=waypoint_acceleration" in line]
-    assert shared.startswith("in all settings that have it: ")
-    assert "mavfi campaign report has distance, energy, replans" in lines
+    assert shared.startswith("in all settings")
+    assert any(line.startswith("mavfi campaign report ") for line in lines)
     heads = [line for line in lines if line.startswith("setting")]
     assert [head.split()[:3] for head in heads] == [["setting", "bits", "n"]]
-    whole = mavfi("campaign", "report", table3).stdout
+    whole = mavfi("campaign", "report", mine).stdout
     assert whole.count("site=waypoint_acceleration") == 1
     assert "energy, kJ" in whole

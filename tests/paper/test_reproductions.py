@@ -8,17 +8,15 @@ from collections import namedtuple
 
 import pyarrow.parquet as pq
 import pytest
-from made_flights import export_table, row
+from made_flights import Book, export_table, row
 
 from mavfi_cli.campaigns.ledger import ExportedLedger, Ledger
-from mavfi_cli.campaigns.missions import PlannedMission
 from mavfi_cli.campaigns.progress import Spectator
-from mavfi_cli.campaigns.run import PROFILES, Options, run_campaign, store_plan
+from mavfi_cli.campaigns.run import PROFILES, Options, store_plan
 from mavfi_cli.core.errors import ConfigError, RecordError
 from mavfi_cli.paper import flying
 from mavfi_cli.paper.items import FlightsPlan, items_named
 from mavfi_cli.paper.status import shown
-from mavfi_cli.spec.mission import MissionConfig
 
 pytestmark = pytest.mark.usefixtures("no_vehicle")
 TASK = Options(jobs=2, task="fake_task")
@@ -37,15 +35,30 @@ def flown(asked, options=TASK, spectator=None):
     return forecast
 
 
+@pytest.fixture(scope="module")
+def fig9(no_vehicle, tmp_path_factory):
+    """A reproduction of Fig. 9 and its forecast; copy the folder before you change it."""
+    asked = plan(tmp_path_factory.mktemp("fig9"), "fig9")
+    return asked, flown(asked)
+
+
+@pytest.fixture
+def copied(fig9, tmp_path):
+    """The same reproduction in a folder that may change."""
+    asked, _ = fig9
+    shutil.copytree(asked.folder, tmp_path / asked.folder.name)
+    return plan(tmp_path, "fig9")
+
+
 def over(asked):
     with Ledger(asked.folder) as ledger:
         return ledger.over()
 
 
 @pytest.mark.slow
-def test_only_the_missions_of_the_named_items_are_flown(tmp_path):
-    asked = plan(tmp_path, "fig9")
-    assert flown(asked).missions == len(asked.missions()) == 8
+def test_only_the_missions_of_the_named_items_are_flown(fig9, copied, tmp_path):
+    (_, forecast), asked = fig9, copied
+    assert forecast.missions == len(asked.missions()) == 8
     with Ledger(asked.folder) as ledger:
         assert (ledger.over(), ledger.planned()) == (8, 356)
         assert FlightsPlan.stored(ledger).scale == SCALE
@@ -108,8 +121,8 @@ def test_a_forecast_counts_the_profiles(tmp_path):
     assert before.disk_bytes - after.disk_bytes == len(goldens) * (flying._PROFILES_BYTES - 300)
 
 
-def test_few_missions_are_not_measured(tmp_path):
-    first = flown(plan(tmp_path, "fig9"))
+def test_few_missions_are_not_measured(fig9):
+    _, first = fig9
     assert (first.missions, first.measured, first.seconds) == (8, 0, 0.0)
     assert first.disk_bytes > 0.0
 
@@ -156,39 +169,35 @@ def test_a_killed_reproduction_resumes(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_grows_to_a_larger_scale_and_never_shrinks(tmp_path):
-    small = plan(tmp_path, "fig9")
-    flown(small)
+def test_a_folder_grows_to_a_larger_scale_and_never_shrinks(copied, tmp_path):
     forecast = flown(plan(tmp_path, "fig9", scale=0.03))
     assert (forecast.missions, forecast.over) == (12, 8)
     with pytest.raises(ConfigError, match="cannot shrink to 0"):
-        flown(small)
+        flown(copied)
 
 
-def test_each_stack_has_its_own_folder(tmp_path):
-    ours = plan(tmp_path, "fig9", stack="mavbench:guards_tracking=true")
-    flown(ours)
-    assert ours.folder == tmp_path / "mavbench-guards_tracking=true"
-    shutil.copytree(ours.folder, tmp_path / "mavbench")
-    with pytest.raises(ConfigError, match="flies the stack mavbench:guards_tracking=true, not"):
-        flown(plan(tmp_path, "fig9"))
+def test_each_stack_has_its_own_folder(copied, tmp_path):
+    other = plan(tmp_path, "fig9", stack="mavbench:guards_tracking=true")
+    assert other.folder == tmp_path / "mavbench-guards_tracking=true"
+    copied.folder.rename(other.folder)
+    with pytest.raises(ConfigError, match="stack mavbench, not mavbench:guards_tracking=true"):
+        flown(other)
 
 
 def test_another_campaign_is_refused(tmp_path):
-    missions = [PlannedMission(config=MissionConfig(world="flat"), labels={})]
-    run_campaign(missions, tmp_path / "mavbench", TASK).close()
-    with pytest.raises(ConfigError, match="holds a campaign that is not a reproduction"):
+    book = Book(tmp_path / "mavbench")
+    book.plan({}, 1)
+    book.ledger.close()
+    with pytest.raises(ConfigError, match="not a reproduction"):
         flown(plan(tmp_path, "fig9"))
 
 
-def test_other_versions_are_refused(tmp_path, monkeypatch):
-    asked = plan(tmp_path, "fig9")
-    flown(asked)
-    with Ledger(asked.folder, writing=True) as ledger:
+def test_other_versions_are_refused(copied, tmp_path):
+    with Ledger(copied.folder, writing=True) as ledger:
         ledger.set_meta({"versions": '{"mavfi":"0.1"}'})
     with pytest.raises(ConfigError, match="begun with other versions"):
         flown(plan(tmp_path, "fig9", scale=0.03))
-    with Ledger(asked.folder) as ledger:
+    with Ledger(copied.folder) as ledger:
         assert FlightsPlan.stored(ledger).scale == SCALE  # nothing was changed
 
 
@@ -217,7 +226,7 @@ def test_an_export_has_the_items_whose_flights_it_holds(tmp_path):
         table, flights = shown(ledger, "table4")
         assert len(flights) == 2
         assert [line.count for line in table.rows] == ["1", "1", "0", "0"]
-        with pytest.raises(RecordError, match="holds no flight like those of Table III"):
+        with pytest.raises(RecordError, match=r"no flight .*Table III"):
             shown(ledger, "table3")
 
 
@@ -225,14 +234,14 @@ def test_an_export_without_pairs_has_a_note_and_no_effect(tmp_path):
     rows = [in_dense("planning", instruction=True, seed=seed) for seed in (1, 2)]
     with exported(tmp_path, rows) as ledger:
         table, _ = shown(ledger, "fig12")
-    assert table.notes[-2].startswith("2 of 2 flights with a fault: no golden flight")
+    assert table.notes[-2].startswith("2 of 2 flights")
     assert {line.count for line in table.rows} == {"0"}
 
 
 def test_golden_flights_alone_are_no_item_with_faults(tmp_path):
     with (
         exported(tmp_path, [in_dense()]) as ledger,
-        pytest.raises(RecordError, match=r"holds no flight like those of Fig\. 14"),
+        pytest.raises(RecordError, match=r"no flight .*Fig\. 14"),
     ):
         shown(ledger, "fig14")
 
@@ -242,6 +251,6 @@ def test_an_item_of_two_stacks_is_refused(tmp_path):
     rows = [row("planning", instruction=True, config=config) for config in stacks]
     with (
         exported(tmp_path, rows) as ledger,
-        pytest.raises(RecordError, match="Table IV on several stacks"),
+        pytest.raises(RecordError, match=r"Table IV .*stacks"),
     ):
         shown(ledger, "table4")

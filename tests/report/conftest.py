@@ -3,7 +3,7 @@
 import pytest
 from browser import Browser
 from committed import everything
-from flown_twice import whole  # noqa: F401
+from made_flights import whole  # noqa: F401
 
 from mavfi_cli.report.page import render
 

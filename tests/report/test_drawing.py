@@ -92,7 +92,7 @@ def test_a_group_of_nothing_is_empty_and_says_so_once(evaluated):
 
 @pytest.mark.parametrize("name", ["picture.jpg", "picture", "picture.svg.txt"])
 def test_the_name_of_a_picture_says_its_format(tmp_path, name):
-    with pytest.raises(RecordError, match=rf"{name}: name a file that ends in \.svg, \.pdf or"):
+    with pytest.raises(RecordError, match=rf"{name}: .*\.svg, \.pdf or"):
         write_figure(Figure(), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
     write_figure(Figure(), tmp_path / "picture.SVG")

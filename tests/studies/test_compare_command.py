@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import xml.etree.ElementTree as ET
 from dataclasses import asdict
@@ -91,7 +92,7 @@ def test_called_again_it_flies_nothing_and_says_the_same(flown, told, home, mavf
     assert "flying, " not in again.stderr
     text = mavfi("compare", "--world", "posts.toml", *FEW, "--quiet", cwd=home)
     assert (text.returncode, text.stderr) == (0, "")
-    assert "tx2 over x86, mission by mission" in text.stdout
+    assert "tx2 over x86" in text.stdout
 
 
 @pytest.mark.slow
@@ -99,10 +100,8 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_difference(flown
     other = [*FEW[:5], "command_velocity", *FEW[6:]]
     run = mavfi("compare", "--world", "posts.toml", *other, cwd=home)
     assert (run.returncode, run.stdout) == (1, "")
-    assert run.stderr == (
-        "error: out: holds another comparison: site waypoint_position there, command_velocity "
-        "here; choose another --out\n"
-    )
+    assert run.stderr.startswith("error: out: ")
+    assert "site waypoint_position there, command_velocity here; " in run.stderr
     fewer = mavfi("compare", "--world", "posts.toml", *FEW, "--missions", "1", cwd=home)
     assert "missions 2 there, 1 here" in fewer.stderr
 
@@ -138,29 +137,24 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--missions", "0"], "error: Invalid value for '--missions': 0 is not in the range "),
-        (["--missions", "1000000"], "error: --missions: must be at most 100000, got 1000000\n"),
-        (["--platform", "tx3"], "error: --platform: unknown platform 'tx3'; did you mean 'tx2'? "),
-        (
-            ["--platform", "x86", "--platform", "x86"],
-            "error: --platform: must not name x86 twice\n",
-        ),
-        (["--platform", "mine.toml"], "error: mine.toml: no such file (in setting=golden "),
-        (["--detector", "gda"], "error: --detector: unknown detector 'gda'; did you mean 'gad'? "),
-        (["--detector", ","], "error: --detector: must name at least one, got none\n"),
-        (["--inject", ""], "error: --inject: must name at least one target, or be none, got ''\n"),
-        (["--inject", "plannin"],
-         "error: --inject: unknown stage, state or group 'plannin'; did you mean 'planning'? "),
-        (["--world", "sparze"], "error: --world: unknown world 'sparze'; did you mean 'sparse'? "),
-        (["--field", "exponnt"],
-         "error: --field: unknown field 'exponnt'; did you mean 'exponent'? Known: "),
+        (["--missions", "0"], ".*'--missions': 0 "),
+        (["--missions", "1000000"], "--missions: .*at most 100000, got 1000000"),
+        (["--platform", "tx3"], "--platform: .*'tx3'.* 'tx2'"),
+        (["--platform", "x86", "--platform", "x86"], "--platform: .*x86 twice"),
+        (["--platform", "mine.toml"], r"mine.toml: no such file \(in setting=golden "),
+        (["--detector", "gda"], "--detector: .*'gda'.* 'gad'"),
+        (["--detector", ","], "--detector: .*at least one"),
+        (["--inject", ""], "--inject: .*at least one .*none, got ''"),
+        (["--inject", "plannin"], "--inject: .*'plannin'.* 'planning'"),
+        (["--world", "sparze"], "--world: .*'sparze'.* 'sparse'"),
+        (["--field", "exponnt"], "--field: .*'exponnt'.* 'exponent'"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_leaves_nothing(mavfi, tmp_path, arguments, told):
     run = mavfi("compare", *arguments, cwd=tmp_path)
-    code = 1 if told.startswith("error: mine.toml") else 2
+    code = 1 if told.startswith("mine.toml") else 2
     assert (run.returncode, run.stdout) == (code, "")
-    assert run.stderr.startswith(told)
+    assert re.match(f"error: {told}", run.stderr)
     assert run.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 

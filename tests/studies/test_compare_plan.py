@@ -4,7 +4,7 @@ from collections import defaultdict
 from dataclasses import replace
 
 import pytest
-from flown_twice import flight, table
+from made_flights import compared, on
 
 from mavfi_cli.analysis.platforms import titles
 from mavfi_cli.analysis.timeline import timeline_seed
@@ -69,25 +69,24 @@ def test_a_bit_field_reaches_every_fault():
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"missions": 0}, "missions: must be at least 1, got 0"),
-        ({"platforms": ()}, "platform: must name at least one, got none"),
-        ({"detectors": ()}, "detector: must name at least one, got none"),
-        ({"platforms": ("x86", "x86")}, "platform: must not name x86 twice"),
-        ({"detectors": ("gad", "none", "gad")}, "detector: must not name gad twice"),
-        ({"inject": ("control", "control")}, "inject: must not name control twice"),
-        ({"first_seed": -1}, "first_seed: must be at least 0, got -1"),
-        ({"seed": -3}, "seed: must be at least 0, got -3"),
-        ({"inject": (), "field": "sign"}, "field: has no effect without a fault, got sign"),
+        ({"missions": 0}, "missions: .*at least 1, got 0"),
+        ({"platforms": ()}, "platform: .*at least one"),
+        ({"detectors": ()}, "detector: .*at least one"),
+        ({"platforms": ("x86", "x86")}, "platform: .*x86 twice"),
+        ({"detectors": ("gad", "none", "gad")}, "detector: .*gad twice"),
+        ({"inject": ("control", "control")}, "inject: .*control twice"),
+        ({"first_seed": -1}, "first_seed: .*at least 0, got -1"),
+        ({"seed": -3}, "seed: .*at least 0, got -3"),
+        ({"inject": (), "field": "sign"}, "field: .*without a fault, got sign"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(changes, told):
-    with pytest.raises(ConfigError) as refused:
+    with pytest.raises(ConfigError, match=f"^{told}"):
         ComparePlan(**changes)
-    assert str(refused.value) == told
 
 
 def test_two_spellings_of_one_file_are_one_platform():
-    with pytest.raises(ConfigError, match=r"^platform: must not name .*/a\.toml twice$"):
+    with pytest.raises(ConfigError, match=r"^platform: .*/a\.toml twice$"):
         ComparePlan(platforms=("a.toml", "./a.toml"))
 
 
@@ -103,15 +102,15 @@ def test_the_timeline_is_of_a_mission_that_all_fly_well_with_a_new_plan_on_the_w
     plan = ComparePlan(missions=4)
     straight = {"replans": 0.0}
     flights = [
-        *(flight("x86", seed, 20.0, **straight) for seed in (1, 2)),
-        *(flight("x86", seed, 20.0) for seed in (3, 4)),
-        *(flight("tx2", seed, 21.0) for seed in (1, 2, 4)),
-        flight("tx2", 3, 21.0, outcome="collision"),
+        *(on("x86", seed, 20.0, **straight) for seed in (1, 2)),
+        *(on("x86", seed, 20.0) for seed in (3, 4)),
+        *(on("tx2", seed, 21.0) for seed in (1, 2, 4)),
+        on("tx2", 3, 21.0, outcome="collision"),
     ]
-    assert timeline_seed(table(flights).table, plan.platforms) == 4
+    assert timeline_seed(compared(flights).table, plan.platforms) == 4
     rest = [f for f in flights if f["seed"] != 4]
-    assert timeline_seed(table(rest).table, plan.platforms) == 1
-    assert timeline_seed(table([]).table, plan.platforms) is None
+    assert timeline_seed(compared(rest).table, plan.platforms) == 1
+    assert timeline_seed(compared([]).table, plan.platforms) is None
 
 
 def test_a_platform_that_does_not_describe_itself_is_called_by_its_name(tmp_path):

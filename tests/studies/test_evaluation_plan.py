@@ -111,7 +111,7 @@ def test_instruction_level_attacks_each_node():
 def test_seeds_that_a_model_was_made_with_are_refused(models):
     plan = replace(PLAN, models=models)
     plan.require_held_out()
-    with pytest.raises(ModelError, match=r"gad was fitted to the flight train-0.2-5/41: seeds 41"):
+    with pytest.raises(ModelError, match=r"gad .* train-0.2-5/41: seeds 41"):
         replace(plan, first_seed=41).require_held_out()
     with pytest.raises(ModelError, match=r"train-0.05-3/40"):
         replace(plan, first_seed=38).require_held_out()
@@ -136,9 +136,9 @@ def test_all_parts_of_the_split_are_seen(models):
     ("changes", "error", "told"),
     [
         ({"detectors": ("gda",)}, UnknownName, "did you mean 'gad'"),
-        ({"detectors": ()}, ConfigError, "detector: must name at least one"),
-        ({"detectors": ("gad", "gad")}, ConfigError, "must not name gad twice"),
-        ({"worlds": ("farm", "farm")}, ConfigError, "must not name farm twice"),
+        ({"detectors": ()}, ConfigError, "detector: .*at least one"),
+        ({"detectors": ("gad", "gad")}, ConfigError, "gad twice"),
+        ({"worlds": ("farm", "farm")}, ConfigError, "farm twice"),
         ({"protect": ("palnning",)}, UnknownName, "did you mean 'planning'"),
         ({"level": "gate"}, UnknownName, "level"),
         ({"fields": ("exponnet",)}, UnknownName, "did you mean 'exponent'"),

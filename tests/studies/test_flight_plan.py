@@ -1,5 +1,6 @@
 """What a row of the model becomes in the simulator."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -58,12 +59,13 @@ def test_the_stack_is_the_mission_s(tmp_path):
 
 def test_what_a_mission_cannot_take_is_told(plan):
     planned, _ = plan("spark", "none")
-    assert planned.setup.cut == ("acceleration 8 m/s² instead of 9.171 m/s²",)
+    (cut,) = planned.setup.cut
+    assert re.fullmatch(r"acceleration 8 m/s² .* 9\.171 m/s²", cut)
     assert plan("spark", "tmr")[0].setup.cut == ()
     fast, _ = plan("cal20", "none", Choices(response_s=0.01, board=Board.load("ncs")))
     assert fast.mission.v_max_mps == 12.0
     assert fast.setup.cut[0].startswith("velocity 12 m/s instead of ")
-    assert fast.setup.cut[-1] == "sensor rate 50 Hz instead of 60 Hz"
+    assert re.fullmatch("sensor rate 50 Hz .* 60 Hz", fast.setup.cut[-1])
 
 
 @pytest.mark.parametrize("scheme", ["none", "tmr", "gad", "aad"])

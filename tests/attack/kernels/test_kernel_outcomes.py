@@ -126,7 +126,7 @@ def test_a_kernel_that_fails_without_a_fault_is_refused(known):
 def test_a_kernel_that_does_not_load_says_why(known_target):
     target = known_target("return 7;")
     Path(target.kernel).with_name("libvictim.so").unlink()
-    with pytest.raises(TargetError, match=r"(does not start|cannot be attacked): .*libvictim\.so"):
+    with pytest.raises(TargetError, match=r"libvictim\.so"):
         target.open()
     Path(target.kernel).with_name("broken.py").write_text("import nothing_of_that_name")
     with pytest.raises(TargetError, match=r"cannot be loaded: .*nothing_of_that_name"):
@@ -146,11 +146,11 @@ def test_two_kernels_of_one_name_are_refused(known_target):
     path = Path(known_target("return 7;").kernel)
     other = path.with_name("other.py")
     other.write_text(path.read_text())
-    with pytest.raises(TargetError, match="known: several kernels have this name"):
+    with pytest.raises(TargetError, match=r"^known: several"):
         catalogue.select([str(path), str(other)])
     other.write_text(path.read_text().replace('"known"', '"control"'))
     catalogue.find.cache_clear()
-    with pytest.raises(TargetError, match="control: several kernels have this name"):
+    with pytest.raises(TargetError, match=r"^control: several"):
         catalogue.select(["control", str(other)])
 
 

@@ -97,7 +97,7 @@ def test_a_discarded_flag_is_not_injected(start):
     tracee, instruction = stop_at(start, "at_add")
     done, followed = struck(tracee, instruction, register_corruption("rflags", 9), window=10)
     assert not done.applied
-    assert done.reason == "discarded by the operating system: bits [9]"
+    assert done.reason.endswith(": bits [9]")
     assert followed.activation is BitActivation.NOT_INJECTED
 
 

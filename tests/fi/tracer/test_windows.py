@@ -97,7 +97,7 @@ def test_a_function_called_from_foreign_code_ends_there_too(start, mechanism):
 
 
 def test_a_window_that_is_too_long_is_refused(start):
-    with pytest.raises(WindowTooLong, match="more than 100 instructions in scope, too many"):
+    with pytest.raises(WindowTooLong, match="more than 100 instructions"):
         profile_of(start, "counting", "1000", limit=100)
 
 
@@ -187,7 +187,7 @@ def test_a_scope_without_a_matching_operand_is_an_error(start):
     tracee = start("sorting")
     profile = whole(trace)
     plan = Strategy.of("instruction-uniform", FaultModel(sites=frozenset((Site.MASK,))))
-    with pytest.raises(FaultError, match="no executed instruction in scope has an operand"):
+    with pytest.raises(FaultError, match="no executed instruction"):
         draw_fault(
             profile,
             plan,

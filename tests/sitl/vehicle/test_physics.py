@@ -129,5 +129,5 @@ def test_model_files_are_ours_and_whole(tmp_path):
 
 def test_no_room_for_the_model_files_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
-    with pytest.raises(VehicleProcessError, match="cannot make the model of vehicle 'solo'"):
+    with pytest.raises(VehicleProcessError, match="model of vehicle 'solo'"):
         bench("solo", 1.0)

@@ -84,20 +84,12 @@ def test_the_tilt_limit_lets_it_accelerate(load, acceleration, tilt_deg):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('base = "spark"', 'base = "sparc"', r"mine\.toml: base: .*did you mean 'spark'"),
-        ("mass_kg = 0.3", "mass_kg = -0.3", r"mine\.toml.*mass_kg: must be above 0, got -0\.3"),
-        (
-            "rotor_pull_n",
-            "rotor_pul_n",
-            r"mine\.toml:\d: rotor_pul_n: .*did you mean 'rotor_pull_n",
-        ),
-        (
-            "= 63.0",
-            "= 6.3",
-            r"mine\.toml: hover_power_w: must be at least the 2.* hover 0\.3 kg, got 6\.3",
-        ),
-        ("= 0.417", "= 0.45", r"8\.3 N of thrust for 0\.3 kg \+ 0\.45 kg .* got 1\.13"),
-        ("= 30.0", "= -1.0", r"battery\.avionics_w: must be at least 0"),
+        ('base = "spark"', 'base = "sparc"', r"mine\.toml: base: .*'spark'"),
+        ("mass_kg = 0.3", "mass_kg = -0.3", r"mine\.toml.*mass_kg: .*above 0, got -0\.3"),
+        ("rotor_pull_n", "rotor_pul_n", r"mine\.toml:\d: rotor_pul_n: .*'rotor_pull_n'"),
+        ("= 63.0", "= 6.3", r"mine\.toml: hover_power_w: .*at least the 2.* 0\.3 kg, got 6\.3"),
+        ("= 0.417", "= 0.45", r"8\.3 N .* 0\.3 kg \+ 0\.45 kg .* got 1\.13"),
+        ("= 30.0", "= -1.0", r"battery\.avionics_w: .*at least 0"),
     ],
 )
 def test_what_is_wrong_with_a_stand_in(load, old, new, said):

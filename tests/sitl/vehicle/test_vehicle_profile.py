@@ -60,7 +60,7 @@ def test_box_holds_rotors_and_stands_clear_of_the_ground(name):
 
 
 def test_unknown_name_gives_the_nearest():
-    with pytest.raises(UnknownName, match=r"unknown vehicle 'sole'; did you mean 'solo'"):
+    with pytest.raises(UnknownName, match=r"'sole'.* 'solo'"):
         load_profile("sole")
 
 
@@ -82,7 +82,7 @@ def test_unknown_key_names_file_line_and_nearest(tmp_path):
 
 def test_too_heavy_in_a_file(tmp_path):
     path = variant(tmp_path, "mass_kg = 1.5", "mass_kg = 4.0")
-    with pytest.raises(ConfigError, match=r"mine.toml.*38.0 N of thrust for 4 kg"):
+    with pytest.raises(ConfigError, match=r"mine.toml.*38.0 N .* 4 kg"):
         load_profile(path)
 
 
@@ -107,7 +107,7 @@ def test_too_much_payload():
         ("horizontal_speed_mps = 12.0", "horizontal_speed_mps = 0.0", "horizontal_speed_mps"),
         ("leg_radius_m = 0.12", "leg_radius_m = 0.0", "leg_radius_m"),
         ("motor_resistance_ohm = 0.12", "motor_resistance_ohm = 5e-324", "in size, got 4.94"),
-        ("max_rpm = 7814.4", "max_rpm = 1e200", "rotor.max_rpm: must be between 1e-12 and"),
+        ("max_rpm = 7814.4", "max_rpm = 1e200", "rotor.max_rpm: .*1e-12 and"),
     ],
 )
 def test_values_that_make_no_vehicle(tmp_path, old, new, words):
