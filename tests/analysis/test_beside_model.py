@@ -185,19 +185,20 @@ def test_a_detector_that_does_not_know_these_flights(spark):
 
 
 def test_the_picture(spark, tmp_path):
-    told = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1)
-    write_figure(draw_flights(told[1]), tmp_path / "a.svg")
-    write_figure(draw_flights(told[1]), tmp_path / "b.svg")
+    told, whole = spark({"dmr": {"outcome": "collision"}}, refused=("tmr",), count=1), spark()
+    first, second = (draw_flights(told[1]) for _ in range(2))
+    write_figure(first, tmp_path / "a.svg")
+    write_figure(second, tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
-    left, right = draw_flights(spark()[1]).axes
+    left, right = draw_flights(whole[1]).axes
     diamonds = [y for line in left.lines if line.get_marker() == "D" for y in line.get_ydata()]
-    drawn = [row.flown.velocity_mps.model for row in rows_of(spark()).values()]
+    drawn = [row.flown.velocity_mps.model for row in rows_of(whole).values()]
     assert diamonds == pytest.approx(drawn)
-    highest = rows_of(spark())["tmr"].over_none.energy_ratio
+    highest = rows_of(whole)["tmr"].over_none.energy_ratio
     heights = [bar.get_height() for bar in right.patches]
     assert len(heights) == 15
     assert max(heights) == pytest.approx(highest.flights.value)
-    words = [text.get_text() for text in draw_flights(told[1]).axes[0].texts]
+    words = [text.get_text() for text in first.axes[0].texts]
     assert "not flown" in words
     assert "0 % of 1 succeed" in words
 

@@ -125,7 +125,7 @@ def test_one_that_needs_a_terminal(attack):
 @pytest.mark.parametrize(
     ("args", "program", "what"),
     [
-        ("", "threads", "(system call clone"),
+        ("", "threads", "thread (system call clone"),
         ("", "parent", "child process (system call clone)"),
         ("execs", "guest", "(system call execve)"),
     ],

@@ -57,7 +57,7 @@ def test_its_commands_say_what_those_of_its_folder_say(mavfi, tmp_path):
     ("line", "code", "said"),
     [
         (("replay", EXPORT), 2, "--mission NUMBER (missions 0 to 639)"),
-        (("replay", EXPORT, "--mission", "640"), 1, "missions 0 to 639"),
+        (("replay", EXPORT, "--mission", "640"), 1, "no flown mission 640"),
         (("campaign", "draw", EXPORT, "--output", "a.svg"), 1, "no pair "),
         (("campaign", "draw", EXPORT, "--pair", "3", "--output", "a.svg"), 1, "no run folder of"),
         (("campaign", "status", EXPORT, "--overhead"), 1, "name the campaign's folder"),

@@ -38,8 +38,14 @@ def test_equal_comparisons_give_equal_bytes_whatever_the_settings(whole, tmp_pat
     assert {p.name for p in tmp_path.iterdir()} == {"a.svg", "b.svg"}
 
 
-def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
-    write_figure(PICTURES["compare.svg"](whole), tmp_path / "compare.svg")
+@pytest.fixture(scope="module")
+def drawn(whole):
+    """The pictures of a comparison, drawn once."""
+    return {name: draw(whole) for name, draw in PICTURES.items()}
+
+
+def test_compare_names_platforms_settings_and_what_is_measured(drawn, tmp_path):
+    write_figure(drawn["compare.svg"], tmp_path / "compare.svg")
     said = texts(tmp_path / "compare.svg")
     assert any(text.startswith("x86: Intel i9-9940X") for text in said)
     assert any(text.startswith("tx2: Jetson TX2") for text in said)
@@ -49,26 +55,26 @@ def test_compare_names_platforms_settings_and_what_is_measured(whole, tmp_path):
         assert wanted in said, wanted
 
 
-def test_the_replans_stand_below_the_flights(whole):
-    said = [text.get_text() for text in PICTURES["compare.svg"](whole).axes[0].texts]
+def test_the_replans_stand_below_the_flights(whole, drawn):
+    said = [text.get_text() for text in drawn["compare.svg"].axes[0].texts]
     means = [row.quantities["replans"].mean.value for row in whole.settings]
     assert [text for text in said if "replans" in text] == [f"{m:.1f} replans" for m in means]
 
 
-def test_the_worst_case_bars_are_as_high_as_the_numbers(whole):
-    worst = PICTURES["compare.svg"](whole).axes[4]
+def test_the_worst_case_bars_are_as_high_as_the_numbers(whole, drawn):
+    worst = drawn["compare.svg"].axes[4]
     heights = [bar.get_height() for bar in bars(worst)]
     told = [row.over_own.largest for row in whole.costs]
     assert heights == pytest.approx([100.0 * (ratio - 1.0) for ratio in told])
 
 
-def test_success_bars_are_shares_in_per_cent(whole):
-    success = PICTURES["compare.svg"](whole).axes[1]
+def test_success_bars_are_shares_in_per_cent(drawn):
+    success = drawn["compare.svg"].axes[1]
     assert [bar.get_height() for bar in bars(success)] == [100.0] * 8
 
 
-def test_the_response_bar_is_the_kernels_and_the_waiting(whole):
-    response = PICTURES["compare.svg"](whole).axes[2]
+def test_the_response_bar_is_the_kernels_and_the_waiting(whole, drawn):
+    response = drawn["compare.svg"].axes[2]
     of_tx2 = [bar for bar in bars(response) if bar.get_y() > 0.5]
     assert sum(bar.get_width() for bar in of_tx2) == pytest.approx(1600.0)
     latency_s = whole.plan.platforms[1].kernel_latency_s
@@ -88,8 +94,8 @@ def test_nothing_flown_and_other_numbers_of_platforms_are_drawn_all_the_same(pla
     assert len(texts(tmp_path / "timeline.svg")) == 1
 
 
-def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp_path):
-    write_figure(PICTURES["timeline.svg"](whole), tmp_path / "timeline.svg")
+def test_the_timeline_has_both_platforms_all_kernels_and_the_response(drawn, tmp_path):
+    write_figure(drawn["timeline.svg"], tmp_path / "timeline.svg")
     said = texts(tmp_path / "timeline.svg")
     for kernel in (*KERNELS, "setpoint"):
         assert said.count(kernel) == 2, kernel
@@ -98,8 +104,8 @@ def test_the_timeline_has_both_platforms_all_kernels_and_the_response(whole, tmp
     assert said.count("stops before an obstacle") == 2
 
 
-def test_bars_lie_where_the_kernels_ran_on_one_axis_for_all(whole):
-    panels = PICTURES["timeline.svg"](whole).axes
+def test_bars_lie_where_the_kernels_ran_on_one_axis_for_all(whole, drawn):
+    panels = drawn["timeline.svg"].axes
     for axes, row in zip(panels, whole.timeline.platforms, strict=True):
         assert axes.get_xlim() == (-0.05, 2.5)
         start, end = row.chain_s["octomap"]

@@ -95,5 +95,7 @@ def test_the_name_of_a_picture_says_its_format(tmp_path, name):
     with pytest.raises(RecordError, match=rf"{name}: .*\.svg, \.pdf or"):
         write_figure(Figure(), tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RecordError, match="its folder does not exist"):
+        write_figure(Figure(), tmp_path / "none" / "picture.svg")
     write_figure(Figure(), tmp_path / "picture.SVG")
     assert (tmp_path / "picture.SVG").read_bytes().startswith(b"<?xml")

@@ -103,17 +103,18 @@ def test_files(evaluation, pairs, tmp_path):
 
 
 def test_pictures_show_the_numbers(evaluation, tmp_path):
-    roc, precision = PICTURES["roc.svg"](evaluation).axes
+    figures = {name: draw(evaluation) for name, draw in PICTURES.items()}
+    roc, precision = figures["roc.svg"].axes
     curve, dot = roc.lines[0], roc.lines[1]
     assert list(curve.get_xdata())[:2] == [0.0, 0.0]
     assert list(curve.get_ydata())[:2] == [0.0, 1.0]
     assert (dot.get_xdata()[0], dot.get_ydata()[0]) == (0.25, 1.0)
     assert (precision.lines[1].get_xdata()[0], precision.lines[1].get_ydata()[0]) == (1.0, 2 / 3)
-    shares, times = PICTURES["recovery.svg"](evaluation).axes
+    shares, times = figures["recovery.svg"].axes
     assert [bar.get_height() for bar in shares.patches[:2]] == [50.0, 50.0]  # all, control
     assert len(times.patches) == 4  # none and gad in two worlds
-    for draw, name in ((each, name) for name, each in PICTURES.items()):
-        write_figure(draw(evaluation), tmp_path / name)
+    for name, draw in PICTURES.items():
+        write_figure(figures[name], tmp_path / name)
         first = (tmp_path / name).read_bytes()
         write_figure(draw(evaluation), tmp_path / name)
         assert (tmp_path / name).read_bytes() == first
