@@ -61,7 +61,7 @@ def test_a_configuration_and_settings_go_together(short_config, monkeypatch, tmp
     class Flown(Exception):
         pass
 
-    def fly_mission(config, out, watcher, recorder):
+    def fly_mission(config, out, watcher, **_):
         flown.append((config, out))
         raise Flown
 
