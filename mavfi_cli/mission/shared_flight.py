@@ -231,8 +231,8 @@ class SharedFlight(NoInjection):
             )
 
 
-class _StruckFlight(SharedFlight):
-    """The same flight once more, up to the last order over which a node is lost."""
+class _FurtherFlight(SharedFlight):
+    """The same flight once more, with nodes that were struck in rehearsals."""
 
     def __init__(
         self,
@@ -245,6 +245,13 @@ class _StruckFlight(SharedFlight):
         self._left = dict(struck)
         self._injections |= struck
         self.recorder = _Starts(self._lose)
+
+    def _lose(self, node: str, order: int) -> None:
+        """Receive the start of each order of a node, by its number."""
+
+
+class _StruckFlight(_FurtherFlight):
+    """The same flight once more, up to the last order over which a node is lost."""
 
     def _lose(self, node: str, order: int) -> None:
         """Fork the missions whose node is lost over this order.
@@ -270,21 +277,15 @@ class _StruckFlight(SharedFlight):
         return self.config, self.folder
 
 
-class _LostFlight(SharedFlight):
+class _LostFlight(_FurtherFlight):
     """The same flight once more, in which a node is lost as by each of several faults."""
 
-    def __init__(
-        self,
-        branches: Mapping[int, Branch],
-        fork: Callable[[int], bool],
-        struck: Mapping[int, StruckNode],
-    ) -> None:
-        super().__init__(branches, fork)
-        self._requests.clear()
-        self._injections |= struck
-        self._first = next(iter(struck.values()))
-        self._text = ""
-        self.recorder = _Starts(self._lose)
+    _text = ""  # of the logged strike
+
+    @property
+    def _first(self) -> StruckNode:
+        """The fault whose strike the flight logs."""
+        return next(iter(self._left.values()))
 
     def _lose(self, node: str, order: int) -> None:
         """Lose the node over this order."""
