@@ -238,12 +238,14 @@ class Executor:
         """Move a node that has already worked to a separate process, as `isolate` does.
 
         Args:
-            fresh: Unused kernels by node, from which the process is restarted.
+            fresh: Unused kernels by node, from which the process is restarted. A hot standby keeps
+                the kernels that have worked.
             process: As for `isolate`.
         """
         self.isolate(name, process)
         for node, kernel in fresh.items():
-            self.nodes[node].kernel = kernel
+            if not self.nodes[node].standby:
+                self.nodes[node].kernel = kernel
 
     # Turns
 

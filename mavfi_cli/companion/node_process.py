@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -117,6 +118,11 @@ class NodeProcess:
             send(self._socket, order)
         return order.number
 
+    @property
+    def next_number(self) -> int:
+        """The number of the next order."""
+        return self._count + 1
+
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
         """Send an input, under the next order's number, to a fork that shares the connection."""
         self.order(node, value, start_s)
@@ -171,10 +177,7 @@ class NodeProcess:
         if ending is not None:
             return ending
         with contextlib.suppress(ChildProcessError):
-            _, status = os.waitpid(self.pid, 0)
-            if os.WIFSIGNALED(status):
-                return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
-            return f"ended with code {os.waitstatus_to_exitcode(status)}"
+            return _described_end(os.waitpid(self.pid, 0)[1])
         return "ended"
 
     def close(self, *, kill: bool = False) -> None:
@@ -217,6 +220,37 @@ class NodeProcess:
             os._exit(1)
 
 
+class StruckNodeProcess(NodeProcess):
+    """A process that was struck outside the flight, and is working on the next order already.
+
+    It is the child of another process, which reaps it later.
+
+    Args:
+        number: the number of the order that it is working on.
+    """
+
+    def __init__(self, connection: socket.socket, pid: int, *, number: int) -> None:
+        super().__init__(connection, pid, ending=self._end_of_zombie)
+        self._count, self._has_order = number, True
+
+    def order(self, node: str, value: Any, start_s: float) -> int:
+        """See `NodeProcess`. The first order is the one that the process has."""
+        if self._has_order:
+            self._has_order = False
+            return self._count
+        return super().order(node, value, start_s)
+
+    def _end_of_zombie(self) -> str | None:
+        """Wait for the end of the process; return None if it has been reaped."""
+        with contextlib.suppress(OSError):
+            while True:
+                stat = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+                if stat[0] == "Z":
+                    return _described_end(int(stat[49]))  # field 52, proc_pid_stat(5)
+                time.sleep(_LOOK_S / 100)
+        return None
+
+
 class LostNode(NodeProcess):
     """A stand-in for a process that ends or hangs during the next order."""
 
@@ -235,3 +269,10 @@ class LostNode(NodeProcess):
 
     def close(self, *, kill: bool = False) -> None:
         """See `NodeProcess`."""
+
+
+def _described_end(status: int) -> str:
+    """Describe a wait status."""
+    if os.WIFSIGNALED(status):
+        return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+    return f"ended with code {os.waitstatus_to_exitcode(status)}"

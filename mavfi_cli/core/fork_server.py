@@ -422,10 +422,16 @@ def _end_children(others: Sequence[int] = ()) -> None:
 
 
 def _children() -> list[int]:
-    """Return the children of this single-threaded process; none if Linux does not list them."""
-    with contextlib.suppress(OSError):  # a kernel without CONFIG_PROC_CHILDREN
-        return [*map(int, Path("/proc/thread-self/children").read_text().split())]
-    return []
+    """Return the children of this process; none if Linux does not list them.
+
+    The main thread is read last, as it inherits the children of a thread that ends meanwhile.
+    """
+    children = list[int]()
+    threads = Path("/proc/self/task").iterdir()
+    for thread in sorted(threads, key=lambda thread: thread.name == str(os.getpid())):
+        with contextlib.suppress(OSError):
+            children += map(int, (thread / "children").read_text().split())
+    return children
 
 
 if __name__ == "__main__":

@@ -6,10 +6,11 @@ from there on; the flight waits until it has ended, and continues. Missions whos
 due, and those without a fault, are forked when the flight is over.
 
 A fault in an instruction is struck after the flight, in a rehearsal of its node. If it is masked,
-its mission is forked from the end of the flight, too. If it has ended the node, the same flight is
-flown once more, as far as the last of these faults. The mission is forked when its node begins the
-struck invocation, and loses the node there. If several faults end a node in the same invocation in
-the same way, one further flight loses the node, and their missions are forked from its end.
+its mission is forked from the end of the flight, too. Otherwise the same flight is flown once more,
+as far as the last of these faults. The mission is forked when its node begins the struck
+invocation. There it goes on with the struck node, or loses a node that has ended. If several faults
+end a node in the same invocation in the same way, one further flight loses the node, and their
+missions are forked from its end.
 
 Every record equals that of the mission flown alone, except in its host section.
 """
@@ -109,7 +110,7 @@ class SharedFlight(NoInjection):
             if config.instruction is not None
         }
         self.recorder = Recorder() if self._requests else None
-        self._struck: dict[int, StruckNode] = {}  # nodes that are lost in a further flight
+        self._struck: dict[int, StruckNode] = {}  # nodes that are taken into a further flight
         self._ticks: list[tuple[float, int, FloatArray]] = []  # stamp, number of events, position
         self._injections = {
             number: NoInjection()
@@ -191,7 +192,8 @@ class SharedFlight(NoInjection):
         """Yield the flights of the missions whose nodes end or hang."""
         deaths: dict[tuple[str, int, str], dict[int, StruckNode]] = {}
         for number, node in self._struck.items():
-            deaths.setdefault((node.node, node.order, node.how), {})[number] = node
+            how = node.how or f"fault {number}"  # no two faults change a node in the same way
+            deaths.setdefault((node.node, node.order, how), {})[number] = node
         alone = dict[int, StruckNode]()
         for struck in deaths.values():
             if len(struck) == 1:
@@ -251,10 +253,10 @@ class _FurtherFlight(SharedFlight):
 
 
 class _StruckFlight(_FurtherFlight):
-    """The same flight once more, up to the last order over which a node is lost."""
+    """The same flight once more, up to the last order for which a node was struck."""
 
     def _lose(self, node: str, order: int) -> None:
-        """Fork the missions whose node is lost over this order.
+        """Fork the missions whose node was struck in this order.
 
         Raises:
             SystemExit: this is the shared flight, and no mission is left.
@@ -267,6 +269,8 @@ class _StruckFlight(_FurtherFlight):
                     self.host["struck"] = injection.effect
                     self.flight.isolate_late(node, injection.process)
                     return
+                if injection.process is not None:
+                    injection.process.close(kill=True)
         if self.config is None and not self._left:
             raise SystemExit
 

@@ -260,6 +260,7 @@ def test_a_kill_loses_the_work_under_way_and_what_waits(executor_of):
     assert [(loss.stamp_s, loss.how) for loss in executor.losses] == [(0.05, "killed by SIGKILL")]
 
 
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("standby", "sums"),
     [
@@ -267,21 +268,29 @@ def test_a_kill_loses_the_work_under_way_and_what_waits(executor_of):
         (("b",), {0: 1, 1: 11, 2: 111, 3: 1111}),
     ],
 )
-def test_a_hot_standby_answers_for_a_process_that_dies(executor_of, standby, sums):
+def test_a_hot_standby_answers_for_a_process_that_dies(executor_of, standby, sums, late):
     """It has worked on every input, so it answers at the same time and with the same state."""
-    executor, here, seen = executor_of("a", "b"), os.getpid(), []
+    executor, here = executor_of("a", "b"), os.getpid()
 
-    def add(value, _stamp_s):
-        if value == 100 and os.getpid() != here and len(seen) == 2:
-            crash()
-        seen.append(value)
-        return sum(seen)
+    def adder():
+        seen = []
 
-    executor.nodes["b"].kernel = add
+        def add(value, _stamp_s):
+            if value == 100 and os.getpid() != here and len(seen) == 2:
+                crash()
+            seen.append(value)
+            return sum(seen)
+
+        return add
+
+    executor.nodes["b"].kernel = adder()
     executor.share_process(("a", "b"))
     executor.stand_by(standby)
-    executor.isolate("a")
+    if not late:
+        executor.isolate("a")
     for number in range(4):
+        if late and number == 2:
+            executor.isolate_late("a", {"b": adder()})
         executor.submit("b", 10**number)
         executor.advance(2.0 * (number + 1))
     expected = [("b", total, pytest.approx(2.0 * number + 0.1)) for number, total in sums.items()]

@@ -21,7 +21,9 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import struct
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -39,9 +41,12 @@ _PAGES_BYTES = 8192
 # System calls.
 CLOSE, SENDTO = 3, 44
 _MMAP, _MUNMAP, _CLONE, _PERF_EVENT_OPEN = 9, 11, 56, 298
+_DUP2, _SOCKET, _CONNECT = 33, 41, 42
 _CLONE_PARENT = 0x8000
 _LOOK_S = 1e-3
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
+_NO_CALL = (1 << 64) - 1  # as the number of a system call that has begun, skips it
+_FREE = 512  # bytes below the stack pointer that no function uses, with room for a socket address
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
 
 _TYPE_BREAKPOINT, _EXECUTE, _LENGTH, _CLOSE_ON_EXEC = 5, 4, 8, 8
@@ -365,10 +370,7 @@ class Tracee:
         """
         before, here = self.registers.general(), self.registers.ip
         code = self.memory.read(here, len(_SYSTEM_CALL))
-        pid = self.system_call(_CLONE, _CLONE_PARENT | signal.SIGCHLD, 0, 0, 0, 0)
-        if pid >> 63:
-            code_of_error = (1 << 64) - pid
-            raise OSError(code_of_error, os.strerror(code_of_error))
+        pid = self._checked_call(_CLONE, _CLONE_PARENT | signal.SIGCHLD, 0, 0, 0, 0)
         linux.wait(pid)  # it has not executed anything
         fork = Tracee(pid, pid, pid, self.mechanism)
         fork.memory.write(here, code)
@@ -413,6 +415,40 @@ class Tracee:
         self.memory.write(here, code)
         self.registers.write_general(before)
         return result
+
+    def _checked_call(self, number: int, *arguments: int) -> int:
+        """Make the target execute a system call. Raise its error as OSError."""
+        result = self.system_call(number, *arguments)
+        if result >> 63:
+            code = (1 << 64) - result
+            raise OSError(code, os.strerror(code))
+        return result
+
+    def step_back(self) -> None:
+        """Go back to the instruction that has begun a system call (`run_to_call`)."""
+        before, call = self.registers.general(), self.registers.read("orig_rax")
+        self.registers.write("orig_rax", _NO_CALL)
+        linux.request(linux.SYSCALL, self.tid)
+        linux.wait(self.tid)
+        self.registers.write_general(before)
+        start = self.registers.ip - len(_SYSTEM_CALL)
+        self.registers.write_together({"rip": start, "rax": call})
+
+    def connect(self, descriptor: int, address: bytes) -> None:
+        """Replace a socket by a stream socket that is connected to a Unix address.
+
+        Raises:
+            OSError: the operating system refuses.
+        """
+        data = socket.AF_UNIX.to_bytes(2, sys.byteorder) + address
+        place = self.registers.sp - _FREE
+        kept = self.memory.read(place, len(data))
+        self.memory.write(place, data)
+        connected = self._checked_call(_SOCKET, socket.AF_UNIX, socket.SOCK_STREAM, 0)
+        self._checked_call(_CONNECT, connected, place, len(data))
+        self._checked_call(_DUP2, connected, descriptor)
+        self._checked_call(CLOSE, connected)
+        self.memory.write(place, kept)
 
     def detach(self) -> None:
         """Let the process continue without a tracer; the target thread must be stopped."""

@@ -34,7 +34,7 @@ from mavfi_cli.autonomy.pilot import PlanRequest
 from mavfi_cli.companion.executor import Executor
 from mavfi_cli.companion.injection import NoInjection, StruckNode
 from mavfi_cli.companion.kernels import ControlInput
-from mavfi_cli.companion.node_process import LostNode, NodeProcess
+from mavfi_cli.companion.node_process import NodeProcess
 from mavfi_cli.core.archive import pack, unpack
 from mavfi_cli.core.errors import FaultError, MavfiError, RecordError
 from mavfi_cli.core.files import (
@@ -51,7 +51,6 @@ from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.mission.instruction import PROGRAM, kept_in
 from mavfi_cli.mission.instruction.rehearsal import (
     KernelInvocation,
-    NodeEffect,
     Order,
     Rehearsal,
     Struck,
@@ -258,8 +257,7 @@ def struck_nodes(
 ) -> dict[int, StruckInjection]:
     """Strike the faults of missions in a rehearsal.
 
-    Faults that cannot be planned or compared there, and faults that change their node, are left
-    out.
+    Faults that cannot be planned or compared there are left out.
 
     Args:
         flown: the missions without their faults.
@@ -283,8 +281,6 @@ def struck_nodes(
             with contextlib.suppress(MavfiError, OSError):
                 fault, context = node.fault(requests[number], invocation, rng)
                 struck = node.rehearsal.strike(fault, invocation, context)
-                if struck.effect is NodeEffect.CHANGED:  # only a flight shows what follows
-                    continue
                 injections[number] = StruckInjection(struck, node.name, invocation.order)
 
     def work(_armed: Callable[[], None]) -> None:
@@ -502,9 +498,8 @@ class StruckInjection(StruckNode):
     def __init__(self, struck: Struck, node: str, order: int) -> None:
         written = self._written = struck.record
         text = "" if written["corruption"] is None else record.describe(written)
-        lost = None if struck.loss is None else LostNode(struck.loss)
-        super().__init__(node, order, struck.effect.value, lost, text)
-        self.how = "" if struck.loss is None else struck.loss.how
+        super().__init__(node, order, struck.effect.value, struck.process, text)
+        self.how = struck.how
 
     def begin(self, path: Path) -> None:
         """Write the record."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import struct
 import threading
 from collections.abc import Mapping, Sequence
@@ -28,8 +29,10 @@ from mavfi_cli.companion.node_process import (
     HANG_CPU_S,
     HANG_WALL_S,
     HUNG,
+    LostNode,
     NodeLost,
     NodeProcess,
+    StruckNodeProcess,
 )
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.processes import value_of
@@ -46,6 +49,7 @@ from mavfi_cli.fi.tracer.tracee import CLOSE, SENDTO, Tracee
 from mavfi_cli.mission.instruction import PROGRAM
 
 Order = tuple[str, Any, float]  # node, input, start stamp
+_CREDENTIALS = "3i"  # struct ucred, unix(7): process, user, group
 _WHOLE_LIMIT = 600_000  # instructions of an invocation, or of one window
 _WINDOWS, _ENOUGH = 4, 50_000  # for a planner's request with a search: see `profile_run`
 _INNER_CALLS = {"octomap": 16}  # sampled calls of one inner function, about 300 instructions each
@@ -77,12 +81,14 @@ class Struck:
 
     Attributes:
         record: as of a fault in a flight.
-        loss: how the node ended or hung; None if it answers.
+        process: the node from this order on; None if the fault is masked.
+        how: how the node ended or hung; empty if it answers.
     """
 
     record: FaultRecord
     effect: NodeEffect
-    loss: NodeLost | None = None
+    process: NodeProcess | None = None
+    how: str = ""
 
 
 class Rehearsal:
@@ -236,6 +242,8 @@ class Rehearsal:
     ) -> Struck:
         """Strike an invocation in a fork, and compare the fork with two unstruck ones.
 
+        If they differ, the struck fork remains, and goes on for a flight.
+
         Args:
             context: further entries of the record.
 
@@ -249,14 +257,14 @@ class Rehearsal:
         planned = record.planned(fault, self._image, scope=objects, **context)
         first, *others = fault.trigger
         here = replace(fault, trigger=(replace(first, count=self._entry), *others))
-        with contextlib.ExitStack() as undo:
+        with contextlib.ExitStack() as unneeded, contextlib.ExitStack() as undo:
 
-            def reached() -> tuple[Tracee, str]:
+            def reached(undo: contextlib.ExitStack) -> tuple[Tracee, str]:
                 tracee = self._fork()
                 undo.callback(tracee.kill)
                 return tracee, reach(tracee, self._image, here)
 
-            tracee, reason = reached()
+            tracee, reason = reached(undo)
             if reason:
                 raise TargetError(f"node {self._node}", reason)
             with _limited(tracee) as alarm:
@@ -268,14 +276,32 @@ class Rehearsal:
             struck = _run_to_answer(tracee)
             if not isinstance(struck, StoppedFork):
                 effect = NodeEffect.HUNG if struck.hung else NodeEffect.ENDED
-                return Struck(record=done, effect=effect, loss=struck)
-            runs = (_run_to_answer(reached()[0]) for _ in range(2))
+                lost = LostNode(struck)
+                return Struck(record=done, effect=effect, process=lost, how=str(struck))
+            runs = (_run_to_answer(reached(unneeded)[0]) for _ in range(2))
             unstruck = [fork for fork in runs if isinstance(fork, StoppedFork)]
             if len(unstruck) < 2:
                 raise TargetError(f"node {self._node}", "does not answer again")
-            same = remembers_the_same(struck, unstruck)
-            effect = NodeEffect.MASKED if same else NodeEffect.CHANGED
-            return Struck(record=done, effect=effect)
+            if remembers_the_same(struck, unstruck):
+                return Struck(record=done, effect=NodeEffect.MASKED)
+            process = self._let_go(tracee)
+            undo.pop_all()
+            return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
+
+    def _let_go(self, fork: Tracee) -> NodeProcess:
+        """Give a fork that is about to answer a connection of its own, and let it go on."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+            listener.bind("")  # an address that the operating system chooses
+            listener.listen()
+            fork.step_back()
+            fork.connect(CHANNEL, listener.getsockname())
+            connection, _ = listener.accept()
+            while _process_at(connection) != fork.pid:  # anybody can connect
+                connection.close()
+                connection, _ = listener.accept()
+        os.sched_setaffinity(fork.pid, os.sched_getaffinity(os.getpid()))
+        fork.detach()
+        return StruckNodeProcess(connection, fork.pid, number=self._process.next_number)
 
 
 def _run_to_answer(tracee: Tracee) -> StoppedFork | NodeLost:
@@ -290,6 +316,13 @@ def _run_to_answer(tracee: Tracee) -> StoppedFork | NodeLost:
         return NodeLost(hung=False, how=ended.describe())
     _, _, address, size, *_ = calls[-1]
     return StoppedFork(tracee=tracee, calls=calls, clock=_time_of(tracee.memory, address, size))
+
+
+def _process_at(connection: socket.socket) -> int:
+    """Return the id of the process at the other end of a Unix socket."""
+    size = struct.calcsize(_CREDENTIALS)
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+    return int(struct.unpack(_CREDENTIALS, credentials)[0])
 
 
 def _limited(tracee: Tracee) -> ProcessTimer:
