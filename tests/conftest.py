@@ -20,6 +20,7 @@ from hypothesis import settings
 from missions import POSTS, SHORT
 
 from mavfi_cli import cli
+from mavfi_cli.autonomy.warm import warm_up
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
@@ -33,6 +34,12 @@ sys.path.insert(0, str(Path(__file__).parent / "link"))  # scripted autopilots
 settings.register_profile("no clock", deadline=None)  # no test asserts speed by the clock
 settings.load_profile("no clock")
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
+
+
+def pytest_configure(config):
+    """Compile every kernel once, before workers would all do so at once."""
+    if getattr(config.option, "numprocesses", None):
+        warm_up()
 
 
 @pytest.fixture(scope="session")
@@ -126,6 +133,25 @@ def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+@pytest.fixture
+def start_sitl(free_port):
+    """Start a stand-alone simulated vehicle that sends to a port; the URL to hear it."""
+    line = [
+        sys.executable, "-m", "sitl", "--world", "farm", "--seed", "5", "--start=2,2,0",
+        "--goal=10,6,5", "--link", f"onboard=udpout:127.0.0.1:{free_port}", "--speed", "2",
+    ]  # fmt: skip
+
+    @contextlib.contextmanager
+    def started():
+        with contextlib.ExitStack() as stack:
+            process = subprocess.Popen(line, stderr=subprocess.DEVNULL)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            yield f"udpin:127.0.0.1:{free_port}"
+
+    return started
 
 
 class AutopilotOnUdp:

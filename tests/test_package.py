@@ -38,16 +38,52 @@ def run(*line, cwd, **environment):
     return done.stdout
 
 
+FLIGHT = """
+import json, sys
+from numba.core import event
+import mavfi_cli as mavfi
+from mavfi_cli.mission import vehicle
+
+class Late(event.Listener):
+    kernels = []
+    def on_start(self, told):
+        self.kernels.append(told.data["dispatcher"].py_func.__name__)
+    def on_end(self, told):
+        pass
+
+def opened(*given, **options):
+    event.register("numba:compile", Late())
+    return real(*given, **options)
+
+real, vehicle.open_transport = vehicle.open_transport, opened
+link, detector = sys.argv[1:]
+run = mavfi.fly(link=link, detector={"name": detector}, goal=(8.0, 4.0, 5.0), stack="hardened")
+unused = [name for name, node in run.result["kernels"].items() if not node["invocations"]]
+print(json.dumps({"unused": unused, "late": Late.kernels}))
+"""
+
+
 @pytest.mark.slow
-def test_what_is_installed_flies_from_an_empty_folder(source, tmp_path):
-    """With worlds, vehicles, platforms, stacks, presets and models of the wheel alone."""
-    installed, empty = tmp_path / "installed", tmp_path / "empty"
+def test_what_is_installed_flies_from_an_empty_folder(source, start_sitl, tmp_path):
+    """With worlds, vehicles, platforms, stacks, presets and models of the wheel alone.
+
+    Its first flight compiles everything before the link opens. The second finds what the first has
+    compiled, but not the kernels of its detector.
+    """
+    installed, empty, cache = tmp_path / "installed", tmp_path / "empty", tmp_path / "cache"
     empty.mkdir()
     offline = ("--no-deps", "--no-build-isolation", "--no-index", "--target", installed)
     run("-m", "pip", "install", "-q", *offline, source, cwd=empty)
     mavfi = ("-m", "mavfi_cli")
-    path = {"PYTHONPATH": str(installed)}
+    path = {"PYTHONPATH": str(installed), "NUMBA_CACHE_DIR": str(cache)}
     assert str(installed) in run("-c", "import sitl; print(sitl.__file__)", cwd=empty, **path)
+    compiled = set()
+    for detector in ("gad", "aad"):
+        with start_sitl() as link:
+            flown = run("-c", FLIGHT, link, detector, cwd=empty, **path)
+        assert json.loads(flown.splitlines()[-1]) == {"unused": [], "late": []}
+        assert {*cache.rglob("*.nbc")} > compiled
+        compiled = {*cache.rglob("*.nbc")}
     flight = (*mavfi, "fly", "--world", "farm", "--detector", "aad", "--platform", "tx2")
     assert "SUCCESS" in run(*flight, cwd=empty, **path)
     for line in (("stacks",), ("world", "list"), ("campaign", "plan", "fig9"), ("vpm",)):

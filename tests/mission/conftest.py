@@ -102,25 +102,6 @@ def flying(tmp_path):
 
 
 @pytest.fixture
-def start_sitl(free_port):
-    """Start a stand-alone simulated vehicle that sends to a port; the URL to hear it."""
-    line = [
-        sys.executable, "-m", "sitl", "--world", "farm", "--seed", "5", "--start=2,2,0",
-        "--goal=10,6,5", "--link", f"onboard=udpout:127.0.0.1:{free_port}", "--speed", "2",
-    ]  # fmt: skip
-
-    @contextlib.contextmanager
-    def started():
-        with contextlib.ExitStack() as stack:
-            process = subprocess.Popen(line, stderr=subprocess.DEVNULL)
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-            yield f"udpin:127.0.0.1:{free_port}"
-
-    return started
-
-
-@pytest.fixture
 def sitl_on_udp(start_sitl):
     """The URL of a simulated vehicle that runs for one test."""
     with start_sitl() as url:
