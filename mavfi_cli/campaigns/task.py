@@ -6,7 +6,6 @@ import contextlib
 import io
 import itertools
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,7 +74,8 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         if config.detector is not None:  # its nodes may get other orders than the golden ones
             keep_orders(config.golden, profiles, fly_golden)
         strike = partial(struck_nodes, profiles=profiles)
-    flown = replace(config, fault=None, instruction=None)
+    flown = config.shared_flight
+    assert flown is not None
     first = SharedFlight(branches, fork, strike)
     for shared in itertools.chain([first], first.further()):
         with contextlib.suppress(SystemExit):
