@@ -101,6 +101,10 @@ def camera_options(prefix: str = "") -> Decorator:
             help="Rate of the camera's heartbeats, Hz. 0 turns them off for MAVProxy, which "
             "mistakes the camera for a second vehicle.",
         ),
+        click.option(
+            "--depth", type=click.Path(path_type=Path), metavar="SOCKET",
+            help="Unix domain socket to make, which sends depth frames as arrays to every reader.",
+        ),
     )  # fmt: skip
 
 

@@ -46,6 +46,7 @@ class VehicleSetup:
 
     Attributes:
         camera_size: Columns and rows.
+        depth: Socket for depth frames as arrays; None for no such frames.
         firmware_kind: Real firmware that flies; None for our own autopilot.
         firmware: Its SITL binary; None if the user starts it and has it send to `firmware_link`.
         trusted: MAVLink systems that may command; empty for all.
@@ -59,6 +60,7 @@ class VehicleSetup:
     camera_size: tuple[int, int] = (64, 48)
     camera_rate_hz: float = 10.0
     camera_heartbeat_hz: float = 1.0
+    depth: Path | None = None
     system_id: int = 1
     firmware_kind: str | None = None
     firmware: Path | None = None

@@ -28,6 +28,7 @@ from sitl.autopilot.telemetry import STEP_US, TICK_US, Preset
 from sitl.camera.component import COMPONENT_ID as CAMERA
 from sitl.camera.component import Camera
 from sitl.camera.ranges import SENSORS
+from sitl.camera.stream import DepthStream
 from sitl.command_line import stop_on_signals
 from sitl.firmware.simulation import LINKS, FirmwareSimulation
 from sitl.options import ServerOptions, VehicleSetup, parse
@@ -376,18 +377,20 @@ def _serve(options: ServerOptions) -> None:
         warm_up()
     if options.truth is not None:
         world.write_briefing(profile.camera_mount_flu_m, options.truth)
-    simulation = _simulation(options.setup, world, profile, logs=options.truth is not None)
-    try:
-        if options.lockstep:
-            _lockstep(options, simulation, stopped)
-        else:
-            with contextlib.closing(_Realtime(options, simulation)) as server:
-                _announce(options, simulation)
-                server.run(stopped)
-    finally:
-        simulation.close()
-        if options.truth is not None:
-            simulation.save_truth(options.truth)
+    logs = options.truth is not None
+    with DepthStream.opened(options.setup.depth, options.setup.camera_size) as depth:
+        simulation = _simulation(options.setup, world, profile, logs=logs, depth=depth)
+        try:
+            if options.lockstep:
+                _lockstep(options, simulation, stopped)
+            else:
+                with contextlib.closing(_Realtime(options, simulation)) as server:
+                    _announce(options, simulation)
+                    server.run(stopped)
+        finally:
+            simulation.close()
+            if options.truth is not None:
+                simulation.save_truth(options.truth)
 
 
 def warm_up() -> None:
@@ -403,13 +406,18 @@ def _loaded(setup: VehicleSetup) -> tuple[World, VehicleProfile]:
 
 
 def _simulation(
-    setup: VehicleSetup, world: World, profile: VehicleProfile, *, logs: bool
+    setup: VehicleSetup,
+    world: World,
+    profile: VehicleProfile,
+    *,
+    logs: bool,
+    depth: DepthStream | None = None,
 ) -> Simulation:
     columns, rows = setup.camera_size
     camera = Camera(
         world.boxes_enu_m, columns=columns, rows=rows, rate_hz=setup.camera_rate_hz,
         heartbeat_hz=setup.camera_heartbeat_hz, system=setup.system_id,
-        mount_offset_flu_m=profile.camera_mount_flu_m,
+        mount_offset_flu_m=profile.camera_mount_flu_m, depth=depth,
     )  # fmt: skip
     if setup.firmware_kind is None:
         return Simulation(

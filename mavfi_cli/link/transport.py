@@ -49,7 +49,10 @@ class Transport(ABC):
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed."""
+        """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed.
+
+        No bytes continue a send to a slow client of a listener.
+        """
 
     def receive(self, timeout_s: float) -> bytes:
         """Return the next bytes, or b"" after `timeout_s` (inf: no limit).
@@ -131,24 +134,29 @@ def open_transport(
         return _Udp(opened, url, admits if endpoint.scheme == "udpin" else None)
     if endpoint.scheme == "tcp":
         return _Stream(opened, url)
-    return _FirstClient(_TcpListener(opened, url))
+    return _FirstClient(_StreamListener(opened, url))
 
 
 def open_listener(
-    url: str | Transport,
+    url: str | Transport | socket.socket,
     *,
     signed: bool = False,
     allow_unsigned: bool = False,
     admits: Callable[[bytes], bool] = begins_with_frame,
+    buffer: int = _BACKLOG,
 ) -> Listener:
     """Open an endpoint that serves several peers, with the arguments and errors of a transport.
 
     Args:
         url, signed, allow_unsigned: As in `open_transport`. An open transport is the single peer.
+            A listening stream socket is an endpoint of its own.
         admits: Returns True if the sender of this first datagram may become a peer.
+        buffer: Bytes that wait for a slow client of a listening stream socket.
     """
     if isinstance(url, Transport):
         return _OnePeer(url)
+    if isinstance(url, socket.socket):
+        return _StreamListener(url, str(url.getsockname()), buffer)
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "fd":
         return _OnePeer(_Stream(endpoint.inherited_socket(), url, patient=False))
@@ -157,7 +165,7 @@ def open_listener(
     opened = endpoint.open_socket(beyond=signed or allow_unsigned)
     if endpoint.scheme == "udpin":
         return _UdpListener(opened, url, admits)
-    return _TcpListener(opened, url)
+    return _StreamListener(opened, url)
 
 
 class _OnePeer:
@@ -193,8 +201,8 @@ class _SocketOwner:
 
 
 def _text_of(address: Any) -> str:
-    """Return host and port of a socket's address; "" for None."""
-    return "" if address is None else f"{address[0]}:{address[1]}"
+    """Return host and port of a socket's address; "" for None and a Unix domain socket."""
+    return f"{address[0]}:{address[1]}" if address else ""
 
 
 # Streams ------------------------------------------------------------------------------------------
@@ -203,17 +211,24 @@ def _text_of(address: Any) -> str:
 class _Stream(_SocketOwner, Transport):
     """A connected stream socket with one peer.
 
-    A patient stream waits for a slow reader. Any other buffers at most 64 KiB for it and drops the
-    oldest sends first, so that the reader gets recent data.
+    A patient stream waits for a slow reader. Any other buffers a number of bytes for it and drops
+    the oldest sends first, so that the reader gets recent data.
     """
 
     def __init__(
-        self, connection: socket.socket, url: str, *, patient: bool = True, address: str = ""
+        self,
+        connection: socket.socket,
+        url: str,
+        *,
+        patient: bool = True,
+        address: str = "",
+        buffer: int = _BACKLOG,
     ) -> None:
         super().__init__(connection, url)
         self.address = address
         self._patient = patient
         self._chunk = _CHUNK if patient else _SMALL_CHUNK
+        self._buffer = buffer
         self._begun = b""  # rest of a partly sent batch
         self._waiting: deque[bytes] = deque()
 
@@ -223,12 +238,13 @@ class _Stream(_SocketOwner, Transport):
                 if not self._await(select.POLLOUT, _SEND_TIMEOUT_S):
                     self._lost(f"the peer read nothing for {_SEND_TIMEOUT_S:g} s")
             return
-        self._waiting.append(data)
+        if data:
+            self._waiting.append(data)
         while self._begun or self._waiting:
             self._begun = self._push(self._begun or self._waiting.popleft())
             if self._begun:
                 break
-        while sum(map(len, self._waiting)) > _BACKLOG:
+        while sum(map(len, self._waiting)) > self._buffer:
             self._waiting.popleft()
 
     def _push(self, data: bytes) -> bytes:
@@ -252,14 +268,15 @@ class _Stream(_SocketOwner, Transport):
         return data
 
 
-class _TcpListener(_SocketOwner):
-    """A port on which every TCP client becomes a peer. Slow readers among them lose frames.
+class _StreamListener(_SocketOwner):
+    """A stream socket whose every client becomes a peer. Slow readers among them lose frames.
 
     There are at most MAX_PEERS. The connection of a further client is closed.
     """
 
-    def __init__(self, opened: socket.socket, url: str) -> None:
+    def __init__(self, opened: socket.socket, url: str, buffer: int = _BACKLOG) -> None:
         super().__init__(opened, url)
+        self._buffer = buffer
         self._peers: list[_Stream] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
@@ -274,19 +291,23 @@ class _TcpListener(_SocketOwner):
             if len(self._peers) >= MAX_PEERS:
                 connection.close()
                 continue
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if connection.family != socket.AF_UNIX:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if not patient:  # the default buffers hold half a minute of telemetry
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BACKLOG)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._buffer)
             clients.append(
-                _Stream(connection, self.url, patient=patient, address=_text_of(address))
-            )
+                _Stream(
+                    connection, self.url, patient=patient, address=_text_of(address),
+                    buffer=self._buffer,
+                )
+            )  # fmt: skip
             self._peers.append(clients[-1])
 
 
 class _FirstClient(Transport):
     """The first client of a TCP port. Data sent before it connects is lost."""
 
-    def __init__(self, listener: _TcpListener) -> None:
+    def __init__(self, listener: _StreamListener) -> None:
         self._listener = listener
         self._client: _Stream | None = None
         self.url, self.port = listener.url, listener.port

@@ -117,8 +117,11 @@ class CompanionFlight:
         """Close the companion's link."""
         self._router.close()
 
-    def fly(self, folder: RunFolder, briefing: Briefing) -> None:
+    def fly(self, folder: RunFolder, briefing: Briefing, depth: Path | None) -> None:
         """Fly until there is an outcome.
+
+        Args:
+            depth: Socket of the vehicle's depth frames; None if it has none.
 
         Raises:
             MavfiError: A program cannot be started, or the record cannot be written.
@@ -132,7 +135,7 @@ class CompanionFlight:
             contextlib.closing(self._crew),
             contextlib.closing(self.injection),
         ):
-            self._crew.prepare(programs, self._placeholders(briefing))
+            self._crew.prepare(programs, self._placeholders(briefing, depth))
             if self._faults is not None:
                 self._faults.running = self._crew.running
                 self._faults.aim_at(self._shortest_flight_s(briefing))
@@ -158,7 +161,7 @@ class CompanionFlight:
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
         return self._companion.flight_s or way_m / self._config.v_max_mps
 
-    def _placeholders(self, briefing: Briefing) -> dict[str, str]:
+    def _placeholders(self, briefing: Briefing, depth: Path | None) -> dict[str, str]:
         """Return the text of every placeholder of a command."""
         end = parse_endpoint(self._companion.link)
         port = self._router.port if end.scheme in LISTENING else end.port
@@ -171,6 +174,7 @@ class CompanionFlight:
             "mavsdk": f"{mavsdk}://{end.host}:{port}",
             "port": str(port),
             "free": str(_free_port()),
+            **({} if depth is None else {"depth": str(depth)}),
             "world": self._config.world,
             "start": ",".join(f"{value:g}" for value in briefing.start_enu_m),
             "goal": ",".join(f"{value:g}" for value in briefing.goal_enu_m),

@@ -156,7 +156,7 @@ def _fly_companion(
             briefing = vehicle.await_briefing(interrupt)
             folder = RunFolder.new(out, config.world, config.seed)
             flight_begun_s = time.perf_counter()
-            flight.fly(folder, briefing)
+            flight.fly(folder, briefing, vehicle.depth)
         flight_wall_s = time.perf_counter() - flight_begun_s
         if failure := vehicle.end():
             flight.explain(str(failure))

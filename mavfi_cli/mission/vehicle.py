@@ -29,6 +29,7 @@ from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FlightTruth
 from mavfi_cli.link.transport import Transport, open_transport, signing_from_file
+from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
 
 _START_LIMIT_S = 120.0  # of a camera; its first start compiles
@@ -42,10 +43,13 @@ class Vehicle(ABC):
     Attributes:
         link: The companion's end of the link.
         truth: The referee's log; None before the end, or if the vehicle died.
+        depth: Unix domain socket with depth frames as arrays, which exists if a user's companion
+            uses it; None for a vehicle in this process.
     """
 
     link: Transport
     truth: FlightTruth | None = None
+    depth: Path | None = None
 
     @staticmethod
     def start(config: MissionConfig) -> Vehicle:
@@ -186,6 +190,9 @@ class VehicleProcess(Vehicle):
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         line = [*PYTHON, "-m", *self._line(config, theirs.fileno())]
+        self.depth = self._scratch.path / "depth"
+        if config.companion is not None and CompanionConfig.load(config.companion).uses("depth"):
+            line += ["--depth", str(self.depth)]
         with theirs:
             try:
                 self._process = subprocess.Popen(

@@ -202,6 +202,12 @@ class CompanionConfig:
         digest = hashlib.sha256(json.dumps(commands).encode()).hexdigest()
         return StackMark(name=f"{COMPANION}{self.name}", digest=digest)
 
+    def uses(self, placeholder: str) -> bool:
+        """Return True if the command of a program has a placeholder."""
+        return any(
+            placeholder in _PLACEHOLDER.findall(own.command) for own in self.program.values()
+        )
+
     @classmethod
     def load(cls, given: str) -> CompanionConfig:
         """Load a companion from a TOML file, or make one of a command line.

@@ -17,6 +17,7 @@ from mavfi_cli.core.terminal import exit_code, note
 from mavfi_cli.link.transport import signing_from_file
 from sitl.camera.component import Camera
 from sitl.camera.station import PoseTracker, Station, Witness
+from sitl.camera.stream import DepthStream
 from sitl.command_line import (
     CONTEXT,
     Place,
@@ -66,6 +67,7 @@ def _camera(
     mount: Triple | None,
     vehicle: str,
     truth: Path | None,
+    depth: Path | None,
     key_file: Path | None,
     allow_unsigned: bool,
     world: str,
@@ -83,31 +85,32 @@ def _camera(
     scene = load_world(world, seed=seed, start_enu_m=start_enu_m, goal_enu_m=goal_enu_m)
     profile = load_profile(vehicle)
     forward, left, up = profile.camera_mount_flu_m if mount is None else mount
-    camera = Camera(
-        scene.boxes_enu_m, columns=camera_size[0], rows=camera_size[1], rate_hz=camera_rate_hz,
-        hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
-        heartbeat_hz=camera_heartbeat_hz,
-    )  # fmt: skip
     witness = Witness(scene, profile, logs=truth is not None)
     if truth is not None:
         scene.write_briefing((forward, left, up), truth)
     stopped = stop_on_signals()
     tracker = PoseTracker(scene.start_enu_m if origin is None else np.array(origin))
-    station = Station(
-        camera, tracker, links, witness=witness, origin_given=origin is not None,
-        signing=signing_from_file(key_file), allow_unsigned=allow_unsigned,
-    )  # fmt: skip
-    with contextlib.closing(station):
-        note(f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}")
-        try:
-            station.run(lambda: not stopped())
-        except LinkLost:
-            if not stopped():
-                raise
-        finally:
-            note(f"{station.frames_sent} frames sent")
-            if truth is not None:
-                witness.save(truth)
+    with DepthStream.opened(depth, camera_size) as stream:
+        camera = Camera(
+            scene.boxes_enu_m, columns=camera_size[0], rows=camera_size[1], rate_hz=camera_rate_hz,
+            hfov_rad=math.radians(hfov_deg), mount_offset_flu_m=(forward, left, up),
+            heartbeat_hz=camera_heartbeat_hz, depth=stream,
+        )  # fmt: skip
+        station = Station(
+            camera, tracker, links, witness=witness, origin_given=origin is not None,
+            signing=signing_from_file(key_file), allow_unsigned=allow_unsigned,
+        )  # fmt: skip
+        with contextlib.closing(station):
+            note(f"depth camera in {scene.name}, seed {scene.seed}, on {', '.join(links)}")
+            try:
+                station.run(lambda: not stopped())
+            except LinkLost:
+                if not stopped():
+                    raise
+            finally:
+                note(f"{station.frames_sent} frames sent")
+                if truth is not None:
+                    witness.save(truth)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,7 +1,7 @@
 """The depth camera as a MAVLink camera component that takes commands and sends frames.
 
-It has no clock and no socket. `handle` answers a message, and `poll` returns the messages due at a
-stamp. The same stamps and messages give the same bytes.
+It has no clock, and no socket but that of its depth stream. `handle` answers a message, and `poll`
+returns the messages due at a stamp. The same stamps and messages give the same bytes.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from mavfi_cli.core.frames import (
 )
 from mavfi_cli.link.codec import Message, dialect
 from sitl.autopilot.telemetry import int32
-from sitl.camera.depth import render_depth
+from sitl.camera.depth import Image, render_depth
 from sitl.camera.ranges import SENSORS
+from sitl.camera.stream import DepthStream
 from sitl.geodesy import Origin
 
 _SLACK_S = 1e-6  # tolerance, because stamps are sums of steps with rounding errors
@@ -81,6 +82,7 @@ class Camera:
         rate_hz: Default frame rate, at most 50 Hz.
         heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
+        depth: Gets frames at the default rate while it has readers; None for no stream.
 
     Raises ConfigError if the size, field of view or rate is invalid.
     """
@@ -96,6 +98,7 @@ class Camera:
         rate_hz: float = 10.0,
         heartbeat_hz: float = 1.0,
         system: int = 1,
+        depth: DepthStream | None = None,
     ) -> None:
         if not 0.0 < rate_hz <= MAX_RATE_HZ:
             limits = f"above 0 and at most {MAX_RATE_HZ:g} Hz"
@@ -121,6 +124,7 @@ class Camera:
         self._heartbeat = _Schedule(1.0 / heartbeat_hz) if heartbeat_hz > 0.0 else None
         self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
+        self._depth, self._streamed = depth, _Schedule(self._default_interval_s)
         self._sensors: dict[int, _Schedule] = {}  # that a client has requested, by message id
 
     def handle(self, message: Message) -> list[Message]:
@@ -146,20 +150,27 @@ class Camera:
             quaternion_flu_enu: Attitude of the vehicle (4,).
         """
         if stamp_s < self._stamp_s - 1.0:
-            schedules = (self._heartbeat, self._frames, *self._sensors.values())
+            schedules = (self._heartbeat, self._frames, self._streamed, *self._sensors.values())
             for schedule in filter(None, schedules):
                 schedule.restart()
         self._stamp_s = stamp_s
         due = self.idle() if self._heartbeat and self._heartbeat.due(stamp_s) else []
         frame_is_due = self._frames is not None and self._frames.due(stamp_s)
+        depth = self._depth if self._depth is not None and self._depth.serve() else None
+        streamed = depth is not None and self._streamed.due(stamp_s)
         sensors = [number for number, schedule in self._sensors.items() if schedule.due(stamp_s)]
-        if frame_is_due or sensors:
+        if frame_is_due or streamed or sensors:
             offset_m = rotate(rotation_matrix(quaternion_flu_enu), self.mount_offset_flu_m)
             lens_enu_m = position_enu_m + offset_m
-            if frame_is_due:
-                due += self._take_frame(lens_enu_m, quaternion_flu_enu)
+            pose = lens_enu_m, quaternion_flu_enu
+            if frame_is_due or streamed:
+                pixels = render_depth(self._boxes, *pose, self._columns, self._rows, self._hfov_rad)
+                if depth is not None and streamed:
+                    depth.send(pixels, stamp_s, *pose, self._hfov_rad)
+                if frame_is_due:
+                    due += self._frame(pixels, *pose)
             for number in sensors:
-                due += SENSORS[number](self._boxes, stamp_s, lens_enu_m, quaternion_flu_enu)
+                due += SENSORS[number](self._boxes, stamp_s, *pose)
         return due
 
     def idle(self) -> list[Message]:
@@ -170,7 +181,9 @@ class Camera:
         active = dialect.MAV_STATE_ACTIVE
         return [dialect.MAVLink_heartbeat_message(kind, no_autopilot, 0, 0, active, 3)]
 
-    def _take_frame(self, position_enu_m: Vector, quaternion_flu_enu: Vector) -> list[Message]:
+    def _frame(
+        self, image: Image, position_enu_m: Vector, quaternion_flu_enu: Vector
+    ) -> list[Message]:
         """Return the messages of one frame in the order of sending.
 
         CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
@@ -178,9 +191,7 @@ class Camera:
         (https://mavlink.io/en/services/image_transmission.html).
         """
         rows, columns = self._rows, self._columns
-        pixels = render_depth(
-            self._boxes, position_enu_m, quaternion_flu_enu, columns, rows, self._hfov_rad
-        ).tobytes()
+        pixels = image.tobytes()
         east, north, up = position_enu_m.tolist()
         latitude, longitude = self._origin.geodetic(north, east)
         captured = dialect.MAVLink_camera_image_captured_message(

@@ -20,7 +20,7 @@ from mavfi_cli.mission.run import fly_again
 from mavfi_cli.report.summary import summary_lines
 from mavfi_cli.report.top_view import draw_top_view
 from mavfi_cli.report.view.entries import ViewedFlight
-from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 HOP = Path(__file__).with_name("hop.py")
@@ -118,6 +118,15 @@ def test_a_companion_that_cannot_fly_is_refused_before_the_flight(tmp_path, text
     path.write_text(text)
     with pytest.raises(error, match=problem):
         CompanionConfig.load(str(path))
+
+
+def test_the_vehicle_makes_a_depth_socket_for_a_companion_that_uses_it():
+    programs = {
+        "a": ProgramConfig(command="true {link}"),
+        "b": ProgramConfig(command="true {depth}"),
+    }
+    assert CompanionConfig(program=programs).uses("depth")
+    assert not CompanionConfig(program={"a": programs["a"]}).uses("depth")
 
 
 def test_a_misspelled_placeholder_names_the_nearest():
