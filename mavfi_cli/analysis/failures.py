@@ -2,12 +2,15 @@
 
 Every injected fault counts if the golden flight of its mission succeeds, even if nothing read it.
 `mavfi kernels` counts such a flip as a benign run, so both count the same population.
+
+The flights of a user's companion do not repeat. Every injected fault counts there, and the failures
+of all golden flights stand beside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +32,20 @@ class SettingFailures:
 
     Attributes:
         name: phrase for the setting.
-        failure: share of injected faults that fail a mission whose golden flight succeeds.
+        failure: share of injected faults that fail a mission whose golden flight succeeds, or
+            that fail any mission if flights do not repeat.
+        golden: share of golden flights that fail, if flights do not repeat; None for pairs.
         kernel: the only kernel that its faults strike at instruction level; None if there are
             several.
         layers: SDC of the isolated kernel beside it; None without runs of the isolated kernel.
         per_hour: failures per flight hour with the ends of the interval; None unless requested.
+            If flights do not repeat, the failures beyond those of golden flights.
     """
 
     labels: Labels
     name: str
     failure: Share
+    golden: Share | None
     kernel: str | None
     layers: CrossLayer | None
     per_hour: tuple[float, float, float] | None
@@ -63,11 +70,12 @@ def setting_failures(
     """
     alone = None if kernels is None else KernelSummary.read(kernels / KERNELS)
     silent = {own.name: own.outcomes["sdc"] for own in alone.kernels} if alone else {}
+    pairs = Group.parts(groups, repeats=True)
     succeeds = [group.codes("pair")[group.counted & group.succeeded]
-                for group in groups if group.golden and not group.watched]  # fmt: skip
+                for group in pairs if group.golden and not group.watched]  # fmt: skip
     golden = np.concatenate([np.zeros(0, dtype=np.int64), *succeeds])
     rows = []
-    for group in groups:
+    for group in pairs:
         places = group.among("injected", _STRUCK) & np.isin(group.codes("pair"), golden)
         struck = int(places.sum())
         if group.golden or not struck:
@@ -89,12 +97,37 @@ def setting_failures(
                 labels=group.labels,
                 name=group.name,
                 failure=failure,
+                golden=None,
                 kernel=kernel,
                 layers=layers,
                 per_hour=None if upsets_per_hour is None else failure.per_hour(upsets_per_hour),
             )
         )
-    return rows
+    return [*rows, *_unpaired(Group.parts(groups, repeats=False), upsets_per_hour, confidence)]
+
+
+def _unpaired(
+    groups: Sequence[Group], upsets_per_hour: float | None, confidence: float
+) -> Iterator[SettingFailures]:
+    """Failures of the settings with faults whose flights do not repeat."""
+    for group in groups:
+        golden, places = group.golden_among(groups), group.among("injected", _STRUCK)
+        if golden is None or not places.any():
+            continue
+        failure = group.share(~group.succeeded, places, confidence)
+        without = golden.share(~golden.succeeded, golden.counted, confidence)
+        more = failure.minus(without)
+        share, low, high = (max(0.0, end) for end in (more.value, more.low, more.high))
+        added = replace(failure, share=share, low=low, high=high)
+        yield SettingFailures(
+            labels=group.labels,
+            name=group.name,
+            failure=failure,
+            golden=without,
+            kernel=None,
+            layers=None,
+            per_hour=None if upsets_per_hour is None else added.per_hour(upsets_per_hour),
+        )
 
 
 def _kernel(configs: Sequence[MissionConfig]) -> str | None:

@@ -100,6 +100,7 @@ class Flights:
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
         ended: whether the fault ended a node, by a crash or a hang.
+        repeats: whether the flight would repeat; one of a user's companion has no partner.
     Columns about its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.
@@ -321,6 +322,7 @@ def _flown(table: pa.Table) -> pa.Table:
         struck=pc.and_not(flips, kills),
         lost=lost,
         ended=pc.is_valid(table["node_ended"]),
+        repeats=pa.array(("companion" not in config for config in configs), pa.bool_()),
     )
 
 
@@ -343,7 +345,7 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
 
 def _beside_golden(table: pa.Table) -> pa.Table:
     """Add the columns that compare each flight with its golden and its bare flight."""
-    unprotected = pc.is_null(table["detector"])
+    unprotected = pc.and_(pc.is_null(table["detector"]), table["repeats"])
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))
     bare = _places(partners(table, table, ("pair", "fault"), only=unprotected))

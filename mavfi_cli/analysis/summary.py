@@ -1,4 +1,7 @@
-"""Summary of a campaign: its settings, and paired comparisons of their missions.
+"""Summary of a campaign: its settings, and comparisons of their missions.
+
+The flight of a user's companion does not repeat, so it has no pair: such settings are compared as
+independent samples.
 
 Reads the short rows of the ledger, because a campaign may have a million missions.
 """
@@ -7,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +19,7 @@ import pyarrow.compute as pc
 
 from mavfi_cli.analysis.flights import BoolArray, IntArray, known, numbers, untreated
 from mavfi_cli.analysis.pairs import partners
-from mavfi_cli.campaigns.ledger import STRATUM, WEIGHT, Ledger
+from mavfi_cli.campaigns.ledger import REPEATS, STRATUM, WEIGHT, Ledger
 from mavfi_cli.campaigns.missions import COUNTED, Injected, Labels, canonical, label_text
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.types import FloatArray, Outcome
@@ -91,13 +94,44 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class UnpairedComparison:
+    """Comparison of two settings of a user's companion, whose flights do not repeat.
+
+    Attributes:
+        first, second: labels of the reference and of the other setting.
+        name: phrase for the other setting.
+        first_success, second_success: share of success of each.
+        difference: second minus first, with Newcombe's interval.
+        p_value, corrected_p: of Fisher's exact test, and corrected by Holm over all comparisons of
+            this kind.
+        differences: mean of the successful flights of the second minus that of the first, by
+            METRICS, with Welch's interval.
+        golden: share of success of the golden flights.
+        golden_deviation: standard deviation over the successful golden flights, by METRICS; NaN
+            with fewer than two.
+    """
+
+    first: Labels
+    second: Labels
+    name: str
+    first_success: Share
+    second_success: Share
+    difference: Interval
+    p_value: float
+    corrected_p: float
+    differences: Mapping[str, Interval]
+    golden: Share
+    golden_deviation: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
     """A metric of a setting over its successful missions.
 
     Attributes:
         least, median, most: values over the flights; NaN without flights.
-        difference: difference from the golden flights of the same missions; None for golden
-            settings.
+        difference: difference from the golden flights of the same missions, or from all golden
+            flights if they do not repeat; None for golden settings, and for settings of both.
     """
 
     labels: Labels
@@ -121,6 +155,7 @@ class CampaignSummary:
         sampling: how faults were drawn, `uniform` or `stratified`.
         faults: each setting with faults compared with the golden one.
         protection: each protected setting compared with the unprotected one with the same faults.
+        unpaired_faults, unpaired_protection: the same of the flights that do not repeat.
     """
 
     name: str
@@ -131,6 +166,8 @@ class CampaignSummary:
     cells: Sequence[SettingSummary]
     faults: Sequence[Comparison]
     protection: Sequence[Comparison]
+    unpaired_faults: Sequence[UnpairedComparison]
+    unpaired_protection: Sequence[UnpairedComparison]
     missing: int
 
 
@@ -149,7 +186,8 @@ class Group:
         flights: the flown missions, in the order of the list: `number`, `cell`, `outcome`,
             `injected`, METRICS, `stratum`, `weight`, `pair` and `strike`. Golden, faulty and
             protected flights of a mission share the code `pair`. Labels that differ only in
-            TREATMENT share the code `strike`, which stands for the fault.
+            TREATMENT share the code `strike`, which stands for the fault. `repeats` is 0 for the
+            flights of a user's companion.
     """
 
     labels: Labels
@@ -186,6 +224,21 @@ class Group:
     def golden(self) -> bool:
         """Whether the missions have no fault."""
         return bool(self.among("injected", (Injected.GOLDEN.value,)).all())
+
+    @cached_property
+    def repeats(self) -> BoolArray:
+        """Whether each flight would repeat, (n,)."""
+        return self.codes("repeats").astype(bool)
+
+    @staticmethod
+    def parts(groups: Iterable[Group], *, repeats: bool) -> list[Group]:
+        """The flights of each setting that repeat, or that do not; without empty settings."""
+        chosen = [(group, group.repeats == repeats) for group in groups]
+        return [
+            group if own.all() else replace(group, flights=group.flights.filter(pa.array(own)))
+            for group, own in chosen
+            if own.any()
+        ]
 
     @cached_property
     def pairs(self) -> IntArray:
@@ -241,6 +294,10 @@ class Group:
             confidence=confidence,
         )
 
+    def success(self, confidence: float = 0.95) -> Share:
+        """The share of success of the counted missions."""
+        return self.share(self.succeeded, self.counted, confidence)
+
     def successes(self, metric: str) -> FloatArray:
         """A metric of the counted successful missions that have it."""
         return known(self.metrics[metric][self.succeeded & self.counted])
@@ -252,6 +309,23 @@ class Group:
         weights = None if self.weights is None else self.weights[there]
         clusters = None if self.clusters is None else self.clusters[there]
         return _interval(values[there], confidence, weights, clusters)
+
+    def deviation(self, metric: str) -> float:
+        """The standard deviation of `successes`; NaN with fewer than two."""
+        values = self.successes(metric)
+        return float(np.std(values - values[0], ddof=1)) if len(values) > 1 else np.nan
+
+    def golden_among(self, groups: Sequence[Group]) -> Group | None:
+        """The golden setting that flew most of this setting's missions; None for a golden one."""
+        if self.golden:
+            return None
+        shared = [
+            (np.intersect1d(self.pairs, other.pairs, assume_unique=True).size, -index)
+            for index, other in enumerate(groups)
+            if other.golden and not other.watched
+        ]
+        most = max(shared, default=(0, 0))
+        return groups[-most[1]] if most[0] else None
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
         """Row indices of the counted missions with equal pairs, in this and the other, (m,) each.
@@ -285,7 +359,7 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
     for cell, setting in enumerate(kept):
         members.setdefault(canonical(setting), []).append(cell)
     planned, errors = ledger.planned_by_cell(), ledger.errors_by_cell()
-    parts = _parts(_short_rows(ledger, labels), list(members.values()), len(labels))
+    parts = _split(_short_rows(ledger, labels), list(members.values()), len(labels))
     return [
         Group(
             labels=kept[cells[0]],
@@ -302,10 +376,11 @@ def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
 def _short_rows(ledger: Ledger, labels: Sequence[Labels]) -> pa.Table:
     kinds = dict.fromkeys(_WHOLE, pa.int64()) | dict.fromkeys(_WORDS, pa.string())
     kinds |= {"changes": pa.string()} if ledger.stratified else {}
-    schema = pa.schema(kinds | dict.fromkeys((*METRICS, WEIGHT), pa.float64()))
+    kinds |= dict.fromkeys((*METRICS, WEIGHT), pa.float64()) | {"repeats": pa.int64()}
+    schema = pa.schema(kinds)
     portions = [
         pa.table([pa.array(c, t) for c, t in zip(portion, schema.types, strict=True)], schema)
-        for portion in ledger.columns(schema.names)
+        for portion in ledger.columns([*schema.names[:-1], REPEATS])
     ]
     whole = pa.concat_tables(portions or [schema.empty_table()]).combine_chunks()
     strikes: dict[str, int] = {}
@@ -327,7 +402,7 @@ def _fault_text(changes: str) -> str:
     return canonical([config.get("fault"), config.get("instruction")])
 
 
-def _parts(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
+def _split(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
     """The rows of each group of cells, in the order of the list."""
     group_of = np.zeros(cells, dtype=np.int64)
     for index, cells_of_group in enumerate(members):
@@ -340,12 +415,18 @@ def _parts(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> lis
 
 
 @dataclass(frozen=True, slots=True)
-class _Match:
-    """Two settings, their golden setting, and the row indices of their pairs, (m,) in each."""
+class _Arms:
+    """Two settings to compare, and their golden setting."""
 
     first: Group
     second: Group
     golden: Group
+
+
+@dataclass(frozen=True, slots=True)
+class _Match(_Arms):
+    """Two settings, their golden setting, and the row indices of their pairs, (m,) in each."""
+
     at_first: IntArray
     at_second: IntArray
 
@@ -414,45 +495,32 @@ class _Match:
         return times_s
 
 
-def _against_golden(groups: Sequence[Group], confidence: float) -> list[Comparison]:
-    """Compare each setting with faults with the golden setting that shares most pairs."""
-    matches = []
-    for group in groups:
-        golden = _golden_for(group, groups)
-        if golden is not None:
-            matches.append(_Match(golden, group, golden, *golden.matched(group)))
-    return _compared(matches, confidence)
+def _against_golden(groups: Sequence[Group]) -> list[_Arms]:
+    """Each setting with faults beside the golden setting that shares most pairs."""
+    goldens = [(group, group.golden_among(groups)) for group in groups]
+    return [_Arms(golden, group, golden) for group, golden in goldens if golden is not None]
 
 
-def _protection(groups: Sequence[Group], confidence: float) -> list[Comparison]:
-    """Compare each protected setting with the unprotected one that has the same faults."""
+def _protection(groups: Sequence[Group]) -> list[_Arms]:
+    """Each protected setting beside the unprotected one that has the same faults."""
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
     }
-    matches = []
+    compared = []
     for group in groups:
         if not group.watched:
             continue
-        faulty, golden = bare.get(untreated(group.labels)), _golden_for(group, groups)
+        faulty, golden = bare.get(untreated(group.labels)), group.golden_among(groups)
         if faulty is not None and golden is not None:
-            matches.append(_Match(faulty, group, golden, *faulty.matched(group)))
-    return _compared(matches, confidence)
+            compared.append(_Arms(faulty, group, golden))
+    return compared
 
 
-def _golden_for(group: Group, groups: Sequence[Group]) -> Group | None:
-    """The golden setting that flew most of this setting's missions; None for a golden one."""
-    if group.golden:
-        return None
-    shared = [
-        (np.intersect1d(group.pairs, other.pairs, assume_unique=True).size, -index)
-        for index, other in enumerate(groups)
-        if other.golden and not other.watched
+def _paired(arms: Sequence[_Arms], confidence: float) -> list[Comparison]:
+    """Compare settings over the missions that both flew."""
+    matches = [
+        _Match(own.first, own.second, own.golden, *own.first.matched(own.second)) for own in arms
     ]
-    most = max(shared, default=(0, 0))
-    return groups[-most[1]] if most[0] else None
-
-
-def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     matches = [match for match in matches if len(match.at_second)]
     tests = [
         McNemar.of(*match.success, weights=match.weights, clusters=match.clusters)
@@ -477,6 +545,36 @@ def _compared(matches: Sequence[_Match], confidence: float) -> list[Comparison]:
     return rows
 
 
+def _unpaired(arms: Sequence[_Arms], confidence: float) -> list[UnpairedComparison]:
+    """Compare settings as independent samples."""
+    arms = [own for own in arms if own.first.counted.any() and own.second.counted.any()]
+    shares = [(own.first.success(confidence), own.second.success(confidence)) for own in arms]
+    p_values = [first.fisher(second) for first, second in shares]
+    return [
+        UnpairedComparison(
+            first=own.first.labels,
+            second=own.second.labels,
+            name=own.second.name,
+            first_success=first,
+            second_success=second,
+            difference=second.minus(first),
+            p_value=p_value,
+            corrected_p=corrected,
+            differences={
+                name: Interval.welch(
+                    own.first.successes(name), own.second.successes(name), confidence
+                )
+                for name in METRICS
+            },
+            golden=own.golden.success(confidence),
+            golden_deviation={name: own.golden.deviation(name) for name in METRICS},
+        )
+        for own, (first, second), p_value, corrected in zip(
+            arms, shares, p_values, holm(p_values), strict=True
+        )
+    ]
+
+
 def _interval(
     values: FloatArray,
     confidence: float,
@@ -495,6 +593,7 @@ def summarise(
 ) -> CampaignSummary:
     """Summarise the flown missions of a ledger by its settings; see `groups`."""
     missions, over = ledger.planned(), ledger.over()
+    pairs, apart = (Group.parts(settings, repeats=repeats) for repeats in (True, False))
     return CampaignSummary(
         name=ledger.meta("name") or ledger.folder.name,
         missions=missions,
@@ -502,8 +601,10 @@ def summarise(
         confidence=confidence,
         sampling=ledger.sampling.value,
         cells=[_setting(group, confidence) for group in settings],
-        faults=_against_golden(settings, confidence),
-        protection=_protection(settings, confidence),
+        faults=_paired(_against_golden(pairs), confidence),
+        protection=_paired(_protection(pairs), confidence),
+        unpaired_faults=_unpaired(_against_golden(apart), confidence),
+        unpaired_protection=_unpaired(_protection(apart), confidence),
         missing=missions - over,
     )
 
@@ -519,7 +620,7 @@ def _setting(group: Group, confidence: float) -> SettingSummary:
         errors=group.errors,
         outcomes=group.counts("outcome"),
         injected=group.counts("injected"),
-        success=success(COUNTED),
+        success=group.success(confidence),
         inactive=success(INACTIVE),
         every=success(COUNTED | INACTIVE),
         metrics={name: group.mean(name, confidence) for name in METRICS},
@@ -528,7 +629,14 @@ def _setting(group: Group, confidence: float) -> SettingSummary:
 
 def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality]:
     """Every metric of every setting over its successful missions, metric by metric."""
-    golden = {row.name: row.differences for row in _against_golden(groups, confidence)}
+    pairs, apart = (
+        {
+            row.name: row.differences
+            for row in compare(_against_golden(Group.parts(groups, repeats=repeats)), confidence)
+        }
+        for repeats, compare in ((True, _paired), (False, _unpaired))
+    )
+    golden = {name: (pairs | apart)[name] for name in pairs.keys() ^ apart.keys()}
     rows = []
     for metric in METRICS:
         for group in groups:

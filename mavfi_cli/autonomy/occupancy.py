@@ -134,11 +134,12 @@ class OccupancyMap:
 
     def _remember(self, ends: FloatArray) -> None:
         """Add the voxels of ray ends (n, 3) to the voxels that may be occupied."""
-        fresh = np.setdiff1d(_codes_of(ends, self._params.resolution_m), self._ended_in)
-        if len(fresh):
-            places = np.searchsorted(self._ended_in, fresh)
-            self._ended_in = np.insert(self._ended_in, places, fresh)
-            self._occupied = np.insert(self._occupied, places, False)
+        codes = np.unique(_codes_of(ends, self._params.resolution_m))
+        places, after = (np.searchsorted(self._ended_in, codes, side) for side in ("left", "right"))
+        fresh = places == after  # `setdiff1d` would sort all voxels anew
+        if fresh.any():
+            self._ended_in = np.insert(self._ended_in, places[fresh], codes[fresh])
+            self._occupied = np.insert(self._occupied, places[fresh], False)
 
     def _look_up(self, low: FloatArray, high: FloatArray) -> None:
         """Look up in the tree all listed voxels in the box from low to high, each (3,)."""

@@ -99,6 +99,8 @@ _DRAWN = (
     "changes, stratum, COALESCE(weight, 1.0) AS weight FROM missions AS m LEFT JOIN draws AS d "
     "USING (number))"
 )
+# Whether the flight of a mission repeats, for `columns`; a user's companion runs by the wall clock.
+REPEATS = "instr(changes, '\"companion\":') = 0"
 _SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
     "replans", "simulated_s",
@@ -521,7 +523,7 @@ class Ledger:
         """Yield portions of columns of the flown missions, in the order of the list.
 
         Args:
-            names: columns of the tables `missions` and `results`, `stratum` and `weight`.
+            names: columns of the tables `missions` and `results`, `stratum`, `weight`, REPEATS.
         """
         rows = self._rows(
             f"SELECT {', '.join(names)} FROM results JOIN {self._list} USING (number) "

@@ -17,7 +17,7 @@ from mavfi_cli.core.errors import ConfigError, MavfiError
 from mavfi_cli.core.files import Json
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.spec.fault import is_omitted
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
 
 Label = str | int | float | bool | None
 Labels = Mapping[str, Label]  # of a setting, by name
@@ -50,10 +50,8 @@ class PlannedMission:
 
 
 _DEFAULT = MissionConfig()
-# Faults and protection, which a golden run does not have.
-_TREATMENT = ("fault", "instruction", "detector", "isolate")
 _NAMES = tuple(field.name for field in fields(MissionConfig))
-_SHARED = tuple(name for name in _NAMES if name not in _TREATMENT)
+_SHARED = tuple(name for name in _NAMES if name not in NOT_OF_GOLDEN)
 _shared = attrgetter(*_SHARED)
 
 

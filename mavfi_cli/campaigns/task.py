@@ -6,7 +6,6 @@ import contextlib
 import io
 import itertools
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,10 +43,12 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
     """
     from mavfi_cli.core.config import structure
     from mavfi_cli.core.files import leave_unsynced
+    from mavfi_cli.core.processes import leave_network
     from mavfi_cli.mission.instruction import CACHE
     from mavfi_cli.mission.progress import Watcher
     from mavfi_cli.mission.run import fly_golden, fly_mission
     from mavfi_cli.mission.shared_flight import SharedFlight
+    from mavfi_cli.spec.companion import CompanionConfig
     from mavfi_cli.spec.mission import MissionConfig
 
     leave_unsynced(out.parent)  # the runner removes the folder, or syncs what it keeps
@@ -57,6 +58,8 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
     }
     config, folder = next(iter(branches.values()))
     profiles = (folder / CACHE).resolve()  # the runner has linked it to the campaign's profiles
+    if config.companion is not None and CompanionConfig.load(config.companion).own_network:
+        leave_network()
     if forks is None:
         host = {"alone": task["alone"]} if task["alone"] else {}
         return fly_mission(config, out, Watcher(), profiles=profiles, host=host).path
@@ -71,7 +74,8 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
         if config.detector is not None:  # its nodes may get other orders than the golden ones
             keep_orders(config.golden, profiles, fly_golden)
         strike = partial(struck_nodes, profiles=profiles)
-    flown = replace(config, fault=None, instruction=None)
+    flown = config.shared_flight
+    assert flown is not None
     first = SharedFlight(branches, fork, strike)
     for shared in itertools.chain([first], first.further()):
         with contextlib.suppress(SystemExit):

@@ -50,7 +50,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.files import Json, open_own
+from mavfi_cli.core.files import Json, open_own, writing
 from mavfi_cli.core.processes import PYTHON, fork
 
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
@@ -106,8 +106,10 @@ class ForkServer:
             forks: the worker may fork itself, and reports the ends of its forks too.
 
         Raises:
-            MavfiError: the server cannot be started.
+            MavfiError: the server cannot be started, or the folder cannot be made.
         """
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         parts = {"task": task, "folder": str(folder), "limit_s": limit_s, "forks": forks}
         order = json.dumps(parts).encode()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -372,9 +374,12 @@ def _begin(folder: Path, parent: int) -> None:
 
 
 def _isolate_streams(folder: Path) -> None:
-    """Give the worker its own streams and its own folder for temporary files."""
+    """Give the worker its own streams and its own folder for temporary files.
+
+    It does not make `folder` again, which a client that ends may have removed.
+    """
     scratch = folder / SCRATCH
-    scratch.mkdir(parents=True, exist_ok=True)
+    scratch.mkdir(exist_ok=True)
     os.environ["TMPDIR"] = tempfile.tempdir = str(scratch)
     nothing = os.open(os.devnull, os.O_RDWR)
     errors = open_own(folder / ERRORS, os.O_WRONLY | os.O_TRUNC)

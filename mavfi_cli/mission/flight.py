@@ -209,6 +209,14 @@ class Flight:
         """Continue as another mission in a fork of the process, with another fault and tlog."""
         self._config = config
         self.link.continue_in(tlog)
+        self.lose_nodes_as(config)
+
+    def lose_nodes_as(self, config: MissionConfig) -> None:
+        """Restart lost nodes from now on as another mission does."""
+        if self.companion is not None:
+            executor = self.companion.executor
+            executor.restart_s = config.node_restart_s
+            executor.watchdog_s = config.node_watchdog_s
 
     def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor:
         """Move a node that has already worked to its own process; it restarts with fresh state.

@@ -1,9 +1,10 @@
 """One flight from which missions are forked, each at the moment of its own fault.
 
-Missions that differ only in their fault fly the same way until it strikes. They fly that way
-once: a process flies without a fault, and forks itself when a fault is due. The fork is the mission
-from there on; the flight waits until it has ended, and continues. Missions whose fault was never
-due, and those without a fault, are forked when the flight is over.
+Missions that differ only in their fault, and in the restarts of lost nodes, fly the same way until
+the fault strikes. They fly that way once: a process flies without a fault, and forks itself when a
+fault is due. The fork is the mission from there on; the flight waits until it has ended, and
+continues. Missions whose fault was never due, and those without a fault, are forked when the flight
+is over.
 
 A fault in an instruction is struck after the flight, in a rehearsal of its node. If it is masked,
 its mission is forked from the end of the flight, too. Otherwise the same flight is flown once more,
@@ -59,6 +60,8 @@ class _Flight(Protocol):
     def place_enu_m(self) -> FloatArray: ...
 
     def take(self, config: MissionConfig, tlog: Path) -> None: ...
+
+    def lose_nodes_as(self, config: MissionConfig) -> None: ...
 
     def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor: ...
 
@@ -190,10 +193,12 @@ class SharedFlight(NoInjection):
 
     def further(self) -> Iterator[SharedFlight]:
         """Yield the flights of the missions whose nodes end or hang."""
-        deaths: dict[tuple[str, int, str], dict[int, StruckNode]] = {}
+        deaths: dict[tuple[object, ...], dict[int, StruckNode]] = {}
         for number, node in self._struck.items():
             how = node.how or f"fault {number}"  # no two faults change a node in the same way
-            deaths.setdefault((node.node, node.order, how), {})[number] = node
+            config, _ = self._branches[number]
+            rules = config.node_restart_s, config.node_watchdog_s
+            deaths.setdefault((node.node, node.order, how, rules), {})[number] = node
         alone = dict[int, StruckNode]()
         for struck in deaths.values():
             if len(struck) == 1:
@@ -211,7 +216,8 @@ class SharedFlight(NoInjection):
         if self._strike_nodes is None or self.recorder is None or not self.recorder.sequence:
             return {}
         config, _ = next(iter(self._branches.values()))
-        flown = replace(config, fault=None, instruction=None)
+        flown = config.shared_flight
+        assert flown is not None
         struck = self._strike_nodes(flown, self._requests, self.recorder)
         self._struck = {number: node for number, node in struck.items() if node.process is not None}
         return {number: node for number, node in struck.items() if node.process is None}
@@ -294,6 +300,7 @@ class _LostFlight(_FurtherFlight):
     def _lose(self, node: str, order: int) -> None:
         """Lose the node over this order."""
         if (self._first.node, self._first.order) == (node, order):
+            self.flight.lose_nodes_as(next(iter(self._branches.values()))[0])
             self.flight.isolate_late(node, self._first.process)
 
     def news(self) -> list[str]:

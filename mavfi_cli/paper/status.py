@@ -11,7 +11,7 @@ from pathlib import Path
 from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.kernels import KERNELS, OUTCOMES, IsolatedKernel, KernelSummary
 from mavfi_cli.analysis.pairs import Flights
-from mavfi_cli.analysis.summary import groups
+from mavfi_cli.analysis.summary import Group, groups
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import duration
 from mavfi_cli.campaigns.specification_file import PRESETS
@@ -28,12 +28,13 @@ from mavfi_cli.paper.items import (
 )
 from mavfi_cli.paper.layouts import of_flights, of_kind
 from mavfi_cli.report.paper import PaperCell, PaperColumn, PaperRow, PaperTable
-from mavfi_cli.report.setting_table import BY_WEIGHT, SettingColumns
+from mavfi_cli.report.setting_table import BY_WEIGHT, UNPAIRED, SettingColumns
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 
 _ROWS = 14  # of a table on one screen
 _WIDE = 2  # columns of settings on one screen
+_DEVIATION = "SD of time, s"  # of flights that do not repeat; on one screen as well
 _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
@@ -172,18 +173,25 @@ _MEANS = {
 
 def _settings_table(ledger: Ledger) -> PaperTable:
     merged = groups(ledger)
+    apart = bool(Group.parts(merged, repeats=False))
     settings = SettingColumns.of([group.labels for group in merged])
     rows = []
     for group in merged:
         share = group.share(group.succeeded, group.counted)
         success = PaperCell.of_share(share)
         means = [PaperCell.of_interval(group.mean(name), k) for name, k in _MEANS.values()]
+        if apart:
+            deviation_s = group.deviation("flight_time_s")
+            means.insert(1, PaperCell(value=deviation_s, count=means[0].count))
         if ledger.stratified:
             means.insert(0, PaperCell(value=float(share.effective), count=share.total))
         labels = tuple(settings.cells(group.labels, group.name))
         rows.append(PaperRow(labels=labels, cells=(success, *means)))
     about = "success: golden missions and faults that struck; means: the successful of them"
     by_weight = [PaperColumn(title="effective n", digits=0)] if ledger.stratified else []
+    means_of = [PaperColumn(title=x) for x in _MEANS]
+    if apart:
+        means_of.insert(1, PaperColumn(title=_DEVIATION, digits=2))
     return PaperTable(
         name=_SETTINGS,
         title=f"{ledger.meta('name') or ledger.folder.name}: settings",
@@ -191,10 +199,15 @@ def _settings_table(ledger: Ledger) -> PaperTable:
         columns=(
             PaperColumn(title="success, %", ends=0),
             *by_weight,
-            *(PaperColumn(title=x) for x in _MEANS),
+            *means_of,
         ),
         rows=tuple(rows),
-        notes=(*settings.notes, about, *([BY_WEIGHT] if ledger.stratified else [])),
+        notes=(
+            *settings.notes,
+            about,
+            *([BY_WEIGHT] if ledger.stratified else []),
+            *([UNPAIRED] if apart else []),
+        ),
     )
 
 
@@ -220,8 +233,9 @@ def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
 
 def short(table: PaperTable) -> PaperTable:
     """The table cut to one screen: its first rows, and the first columns of a table of settings."""
-    wide = len(table.columns) if table.name != _SETTINGS else _WIDE
-    left = [column.title.partition(",")[0] for column in table.columns[wide:]]
+    titles = [column.title for column in table.columns]
+    wide = _WIDE + (_DEVIATION in titles) if table.name == _SETTINGS else len(titles)
+    left = [title.partition(",")[0] for title in titles[wide:]]
     left += [f"{len(table.rows) - _ROWS} more rows"] if len(table.rows) > _ROWS else []
     if not left:
         return table

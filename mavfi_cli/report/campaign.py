@@ -21,6 +21,7 @@ from mavfi_cli.analysis.summary import (
     Comparison,
     Quality,
     SettingSummary,
+    UnpairedComparison,
     groups,
     qualities,
     summarise,
@@ -33,12 +34,13 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.files import Json
 from mavfi_cli.core.types import Stage
 from mavfi_cli.mission.measures import HOST_CHECKS
-from mavfi_cli.report.setting_table import BY_WEIGHT, SettingColumns, SettingRow
-from mavfi_cli.report.table import number, percent, rate, spread
+from mavfi_cli.report.setting_table import BY_WEIGHT, UNPAIRED, SettingColumns, SettingRow
+from mavfi_cli.report.table import number, percent, rate, spread, with_ends
 from mavfi_cli.stats.paired import WorstCase
 from mavfi_cli.stats.shares import Interval, Share
 
 _STAGES = tuple(stage.value for stage in Stage)
+_UNPAIRED_HEAD = ("flights", "success, points", "p", "time, s", "golden")
 _TITLES = {
     "flight_time_s": ("flight time, s", 1.0),
     "distance_m": ("distance, m", 1.0),
@@ -151,7 +153,8 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
         "",
         *settings.lines(["mean time", "mean distance", "mean energy", "mean replans"], means),
     ]
-    if not summary.faults and any(setting.faulty for setting in summary.cells):
+    compared = [*summary.faults, *summary.unpaired_faults]
+    if not compared and any(setting.faulty for setting in summary.cells):
         lines += ["", "nothing to compare: no mission with a fault has a golden flight"]
     for title, comparisons in (
         ("against the golden flights of the same missions:", summary.faults),
@@ -159,7 +162,28 @@ def _summary_lines(summary: CampaignSummary) -> list[str]:
     ):
         if comparisons:
             lines += ["", title, *_comparison_lines(settings, comparisons)]
+    unpaired = (
+        ("against golden flights:", summary.unpaired_faults),
+        ("against the same faults without protection:", summary.unpaired_protection),
+    )
+    lines += ["", UNPAIRED] if any(rows for _, rows in unpaired) else []
+    for title, rows in unpaired:
+        if rows:
+            cells = [SettingRow(row.second, row.name, _unpaired_cells(row)) for row in rows]
+            lines += [title, *settings.lines(_UNPAIRED_HEAD, cells)]
     return lines
+
+
+def _unpaired_cells(row: UnpairedComparison) -> list[str]:
+    own = row.difference
+    deviation = number(row.golden_deviation["flight_time_s"], ".2f", unit=" s")
+    return [
+        f"{row.second_success.total}, {row.first_success.total}",
+        with_ends((own.value, own.low, own.high), "+.1f", "+.0f", scale=100.0),
+        f"{row.corrected_p:.3g}",
+        spread(row.differences["flight_time_s"], 2, sign="+"),
+        f"{rate(row.golden, 0)}, SD {deviation}",
+    ]
 
 
 def _weighted_cells(share: Share) -> list[str]:
@@ -309,7 +333,9 @@ def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
 
 def failure_lines(failures: Sequence[SettingFailures]) -> list[str]:
     """Return a paragraph for each setting."""
-    lines = ["", "injected faults that fail missions whose golden flights succeed:"]
+    paired = any(row.golden is None for row in failures) or not failures
+    which = " whose golden flights succeed" if paired else ""
+    lines = ["", f"injected faults that fail missions{which}:"]
     if not failures:
         lines.append("  none: no setting has injected faults and golden flights of their missions")
     for row in failures:
@@ -321,6 +347,9 @@ def _failure_parts(row: SettingFailures) -> list[str]:
     failure, layers = row.failure, row.layers
     share = rate(failure, ends=1)
     parts = [f"{failure.count} of {failure.total} faults fail the mission, {share}"]
+    if row.golden is not None:
+        failed = f"{row.golden.count} of {row.golden.total} golden flights fail"
+        parts.append(f"{failed}, {rate(row.golden, ends=1)}")
     if layers is not None:
         parts.append(f"{row.kernel} corrupted by {rate(layers.corruption, ends=1)} of its faults")
         given = layers.failure_given_corruption

@@ -14,6 +14,11 @@ BY_WEIGHT = (
     "same interval"
 )
 
+UNPAIRED = (
+    "a user's companion: the fault repeats and the flight does not, so settings are compared "
+    "unpaired"
+)
+
 
 class SettingRow(NamedTuple):
     """The labels and the name of a setting with its cells of a table."""

@@ -438,7 +438,7 @@ def _explain_marks(figure: Figure) -> None:
 
 def _golden_s(flights: _Flights) -> float | None:
     for _, run in flights:
-        if (flight := run.record).golden:
+        if (flight := run.record).golden and not flight.config.get("companion"):
             return flight.quality_of_flight.flight_time_s if flight.succeeded else None
     return None
 

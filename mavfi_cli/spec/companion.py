@@ -172,6 +172,8 @@ class CompanionConfig:
             that a fault changes is signed again with it.
         gate: Behaviour of the gate with `--detector`.
         name: Name in the models of its detectors.
+        own_network: In a campaign, each mission has a network of its own with only a loopback, if
+            the operating system allows it, so that fixed ports do not collide.
     """
 
     program: dict[str, ProgramConfig]
@@ -184,6 +186,7 @@ class CompanionConfig:
     key_file: str | None = None
     gate: GateConfig = field(default_factory=GateConfig)
     name: str = "companion"
+    own_network: bool = True
 
     def __post_init__(self) -> None:
         if not self.program:

@@ -38,10 +38,11 @@ OF_THE_COMPANION = (
 )  # fmt: skip
 """Settings of mavfi's own companion."""
 
+_OF_LOST_NODES: Mapping[str, Any] = {"node_restart_s": 1.0, "node_watchdog_s": 5.0}
 NOT_OF_GOLDEN: Mapping[str, Any] = {
-    "fault": None, "instruction": None, "detector": None, "isolate": (),
+    "fault": None, "instruction": None, "detector": None, "isolate": (), **_OF_LOST_NODES,
 }  # fmt: skip
-"""Settings that a golden mission does not have, and their values in it."""
+"""Settings that a golden mission does not have or need, and their values in it."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
 REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
@@ -138,8 +139,8 @@ class MissionConfig:
     key_file: str | None = None
     loss_limit_s: float = _LOSS_LIMIT_S
     land: bool = False
-    node_restart_s: float = 1.0
-    node_watchdog_s: float = 5.0
+    node_restart_s: float = _OF_LOST_NODES["node_restart_s"]
+    node_watchdog_s: float = _OF_LOST_NODES["node_watchdog_s"]
     fault: FaultConfig | None = None
     instruction: InstructionConfig | None = None
     detector: DetectorConfig | None = None
@@ -269,6 +270,8 @@ class MissionConfig:
     def shared_flight(self) -> MissionConfig | None:
         """The flight from which the mission can be forked: the mission without its fault.
 
+        What becomes of lost nodes does not matter in it.
+
         It is None for a mission whose flight other processes or the wall clock affect.
         """
         alone = (
@@ -278,7 +281,9 @@ class MissionConfig:
             or self.companion is not None
             or self.autopilot != OWN_AUTOPILOT
         )
-        return None if alone else replace(self, fault=None, instruction=None)
+        if alone:
+            return None
+        return replace(self, fault=None, instruction=None, **_OF_LOST_NODES)
 
     @property
     def seed_of_world(self) -> int:

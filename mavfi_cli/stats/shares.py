@@ -10,11 +10,15 @@ the quantiles are Student's, with the degrees of freedom of F. E. Satterthwaite 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavfi_cli.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from mavfi_cli.core.types import FloatArray  # loads numpy
 
 _LEAST = 1e-6  # margins and differences below take more missions than anybody flies
 
@@ -35,6 +39,29 @@ class Interval:
         above = math.hypot(self.high - self.value, other.value - other.low)
         count = min(self.count, other.count)
         return Interval(value=value, low=value - below, high=value + above, count=count)
+
+    @staticmethod
+    def welch(first: FloatArray, second: FloatArray, confidence: float = 0.95) -> Interval:
+        """The mean of the second sample minus that of the first (B. L. Welch, Biometrika 34, 1947).
+
+        NaN if a sample is empty; the ends are NaN if one has a single value.
+
+        Args:
+            first, second: (n,) and (m,) independent values.
+        """
+        from scipy.stats import ttest_ind
+
+        count = min(len(first), len(second))
+        if not count:
+            return NO_INTERVAL
+        first, second = first - first[0], second - first[0]  # equal values differ by exactly 0
+        value, low, high = float(second.mean() - first.mean()), math.nan, math.nan
+        if count > 1:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of equal values
+                test = ttest_ind(second, first, equal_var=False)
+                low, high = map(float, test.confidence_interval(confidence))
+        return Interval(value=value, low=low, high=high, count=count)
 
 
 NO_INTERVAL = Interval(value=math.nan, low=math.nan, high=math.nan, count=0)
@@ -75,6 +102,19 @@ class Share:
             return NO_INTERVAL
         difference = self.effect.minus(other.effect)
         return replace(difference, low=max(-1.0, difference.low), high=min(1.0, difference.high))
+
+    def fisher(self, other: Share) -> float:
+        """The two-sided p-value of Fisher's exact test of two independent rates; 1 if one is NaN.
+
+        A stratified sample counts with its effective number.
+        """
+        from scipy.stats import fisher_exact
+
+        if not (self.total and other.total):
+            return 1.0
+        hits = [round(rate.share * rate.effective) for rate in (self, other)]
+        misses = [self.effective - hits[0], other.effective - hits[1]]
+        return float(fisher_exact([hits, misses]).pvalue)
 
     def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
         """Failed missions per flight hour, low and high, of a share of missions that fail.

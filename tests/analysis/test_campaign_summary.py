@@ -1,21 +1,30 @@
 """What a summary counts where, and which missions it compares."""
 
+import contextlib
 import json
 import math
 import re
+from dataclasses import astuple
 
+import numpy as np
 import pytest
+from made_flights import Book
+from scipy import stats
 
 from mavfi_cli.analysis.failures import setting_failures
+from mavfi_cli.analysis.flights import flights
 from mavfi_cli.analysis.kernels import OUTCOMES
+from mavfi_cli.analysis.pairs import Flights
 from mavfi_cli.analysis.summary import METRICS, groups, qualities
 from mavfi_cli.campaigns.begin import stopped
 from mavfi_cli.campaigns.missions import Injected
 from mavfi_cli.core.errors import ConfigError, RecordError, UnknownName
 from mavfi_cli.core.files import plain
 from mavfi_cli.fi.tracer.fault import FaultModel
+from mavfi_cli.paper.status import short, shown
 from mavfi_cli.report.campaign import CampaignReport, failure_lines, quality_lines
-from mavfi_cli.spec.fault import InstructionConfig
+from mavfi_cli.report.setting_table import UNPAIRED
+from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
 ACTIVE, GOLDEN = Injected.ACTIVE, Injected.GOLDEN
@@ -278,6 +287,127 @@ def test_failures_are_of_missions_that_succeed_without_the_fault(book):
                                              2 * faulty.failure.high))  # fmt: skip
     assert faulty.layers is None
     assert re.search(r"3 of 11 .* 27\.3 %", "\n".join(failure_lines([faulty])))
+
+
+# Flights that do not repeat -----------------------------------------------------------------------
+
+HOP = {"setting": "golden", "who": "hop"}
+HOP_FI, HOP_SAVED = ({"setting": name, "site": "vx"} for name in ("FI", "D&R"))
+
+
+def hop(seed, *, fault=True):
+    """A mission of a user's companion."""
+    vx = FaultConfig(target="SET_POSITION_TARGET_LOCAL_NED.vx", seed=seed) if fault else None
+    return MissionConfig(seed=seed, companion="hop.toml", fault=vx)
+
+
+def fill_companion(book, order=range(12)):
+    """Golden flights of 20 and 22 s by turns, one lost; faulty ones of 30 s, 6 lost; saved 2."""
+    for seed, place in enumerate(order):
+        book.add(HOP, seed, 20.0 + 2 * (seed % 2), injected=GOLDEN, config=hop(seed, fault=False),
+                 outcome="timeout" if seed == 11 else "success")  # fmt: skip
+        book.add(HOP_FI, seed, 30.0 + place % 3, outcome="crash" if place < 6 else "success",
+                 config=hop(seed))  # fmt: skip
+        book.add({**HOP_SAVED, "detector": "gad"}, seed, 21.0 + place % 2, config=hop(seed),
+                 outcome="failsafe" if place < 2 else "success")  # fmt: skip
+
+
+def test_flights_that_do_not_repeat_are_independent_samples(book):
+    fill_companion(book)
+    found = summary(book.ledger)
+    assert found.faults == found.protection == []
+    faulty, saved = found.unpaired_faults
+    assert (faulty.first, faulty.second) == (HOP, HOP_FI)
+    assert (faulty.first_success.counts, faulty.second_success.counts) == ("11 of 12", "6 of 12")
+    assert faulty.p_value == pytest.approx(stats.fisher_exact([[11, 1], [6, 6]]).pvalue)
+    assert faulty.corrected_p == pytest.approx(2 * faulty.p_value)
+    assert faulty.difference.value == pytest.approx(-5 / 12)
+    golden_s = [20.0 + 2 * (seed % 2) for seed in range(11)]
+    faulty_s = [30.0 + seed % 3 for seed in range(6, 12)]
+    ends = stats.ttest_ind(faulty_s, golden_s, equal_var=False).confidence_interval()
+    time = faulty.differences["flight_time_s"]
+    assert (time.low, time.high) == pytest.approx(tuple(ends))
+    assert faulty.golden == faulty.first_success
+    assert faulty.golden_deviation["flight_time_s"] == pytest.approx(np.std(golden_s, ddof=1))
+    assert saved.golden == faulty.golden
+    (protection,) = found.unpaired_protection
+    assert (protection.first, protection.difference.value) == (HOP_FI, pytest.approx(4 / 12))
+    assert protection.golden == faulty.golden
+
+
+def test_no_number_of_flights_that_do_not_repeat_depends_on_the_pairs(book, tmp_path):
+    other = Book(tmp_path / "other")
+    fill_companion(book)
+    fill_companion(other, reversed(range(12)))
+    with contextlib.closing(other.ledger):
+        ours, theirs = (
+            [
+                (
+                    row.p_value,
+                    *astuple(row.difference),
+                    *astuple(row.differences["flight_time_s"]),
+                    row.golden_deviation["flight_time_s"],
+                )
+                for row in (*found.unpaired_faults, *found.unpaired_protection)
+            ]
+            for found in (summary(book.ledger), summary(other.ledger))
+        )
+        assert len(ours) == 3
+        assert ours == [pytest.approx(row) for row in theirs]
+
+
+def test_a_mixed_campaign_compares_each_kind_in_its_own_way(book):
+    fill(book)
+    fill_companion(book)
+    found = summary(book.ledger)
+    assert [row.second for row in found.faults] == [FI, SAVED]
+    assert [row.success.pairs for row in (*found.faults, *found.protection)] == [10, 10, 10]
+    assert [row.second["site"] for row in found.unpaired_faults] == ["vx", "vx"]
+    merged = summary(book.ledger, ["setting"])
+    assert [row.success.pairs for row in merged.faults] == [10, 10]
+    assert [row.second_success.total for row in merged.unpaired_faults] == [12, 12]
+    assert [row.success.total for row in merged.cells] == [22, 22, 22]
+    told = CampaignReport.of(book.ledger).lines()
+    assert told.count(UNPAIRED) == 1
+    assert max(map(len, told)) <= 100
+
+
+def test_quality_is_held_against_all_golden_flights_that_do_not_repeat(book):
+    fill(book)
+    fill_companion(book)
+    times = [row for row in qualities(groups(book.ledger)) if row.metric == METRICS[0]]
+    by_labels = {row.name: row.difference for row in times}
+    assert by_labels["setting=FI stage=control"].count == 7
+    assert by_labels["setting=FI site=vx"].count == 6
+    merged = qualities(groups(book.ledger, ["setting"]))
+    assert {row.difference for row in merged} == {None}  # flights of both kinds
+
+
+def test_failures_of_flights_that_do_not_repeat_stand_beside_those_of_all_golden_ones(book):
+    fill_companion(book)
+    faulty, _ = setting_failures(book.ledger, groups(book.ledger), upsets_per_hour=2.0)
+    assert (faulty.failure.counts, faulty.golden.counts) == ("6 of 12", "1 of 12")
+    excess = faulty.failure.minus(faulty.golden)
+    assert faulty.per_hour == pytest.approx((2 * 5 / 12, 2 * max(0, excess.low), 2 * excess.high))
+    assert "1 of 12 golden flights" in "\n".join(failure_lines([faulty]))
+
+
+def test_flights_that_do_not_repeat_have_no_golden_flight_of_their_own(book):
+    fill(book)
+    fill_companion(book)
+    table = Flights.of(flights(book.ledger))
+    assert table.numbers("own_flight_time_s").shape == (66,)
+    assert len(table.known("own_flight_time_s")) == 30
+    assert sum(lost is not None for lost in table["bare_lost"]) == 30
+
+
+def test_the_short_table_has_the_spread_of_flights_that_do_not_repeat(book):
+    fill_companion(book)
+    table, _ = shown(book.ledger)
+    golden, faulty, _ = short(table).rows
+    assert golden.cells[-1].value == pytest.approx(np.std([20, 22] * 5 + [20], ddof=1))
+    assert faulty.cells[-1].value == pytest.approx(np.std([0, 1, 2] * 2, ddof=1))
+    assert UNPAIRED in table.notes
 
 
 def native(book, seeds, **fault):

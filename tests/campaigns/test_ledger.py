@@ -2,6 +2,7 @@
 
 import contextlib
 import sqlite3
+from dataclasses import replace
 
 import pytest
 from plans import planned
@@ -58,11 +59,14 @@ def test_a_mission_comes_back_as_it_was(tmp_path, config):
 
 @pytest.mark.parametrize("config", CONFIGS[2:])
 def test_a_pair_is_named_by_its_golden_flight(config):
-    flown, golden, bare, other = (
+    flown, restarted, golden, bare, other = (
         PlannedMission(config=each).pair
-        for each in (config, config.golden, MissionConfig(), MissionConfig(seed=4))
+        for each in (
+            *(config, replace(config, node_restart_s=9.0), config.golden, MissionConfig()),
+            MissionConfig(seed=4),
+        )
     )
-    assert flown == golden == bare
+    assert flown == restarted == golden == bare
     assert other != flown
 
 

@@ -89,7 +89,7 @@ def test_a_forked_mission_is_that_flown_alone(missions, tmp_path):
         assert files == files_of(alone.path)[0], row.number
         assert row.injected is alone.injected
         forked += "forked_s" in host
-    assert forked == len(missions) - 2  # one has another restart time; one is left for a job
+    assert forked == len(missions) - 1  # one is left for a job
 
 
 STRUCK = {  # node and seed, of each stack, by the effect on the node

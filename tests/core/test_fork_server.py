@@ -9,7 +9,8 @@ import pytest
 from live_processes import LONG_S, children, gone
 
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.fork_server import PACKET, SERVER, ForkServer
+from mavfi_cli.core.fork_server import PACKET, SERVER, ForkServer, _isolate_streams
+from mavfi_cli.core.processes import fork
 
 
 @pytest.fixture
@@ -101,3 +102,10 @@ def test_a_server_that_cannot_load_its_module_says_so(server, tmp_path, monkeypa
     monkeypatch.setenv("MAVFI_TEST_UNPREPARED", "1")
     with pytest.raises(MavfiError, match="could not start"):
         server.start({}, tmp_path, LONG_S)
+
+
+def test_a_folder_that_the_client_has_removed_is_not_made_again(tmp_path):
+    gone_folder = tmp_path / "gone"
+    pid = fork(lambda: _isolate_streams(gone_folder) or 0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 1
+    assert not gone_folder.exists()

@@ -1,14 +1,20 @@
 """Flights of a user's own companion: the outcome, the record, and what becomes of bad ones."""
 
+import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mavfi_cli import library
+from mavfi_cli.campaigns.missions import PlannedMission
+from mavfi_cli.campaigns.run import Options, run_campaign
+from mavfi_cli.campaigns.specification import Keep
 from mavfi_cli.core.errors import ConfigError, MavfiError, RecordError, UnknownName
 from mavfi_cli.core.flight_record import ProgramEnds
+from mavfi_cli.core.processes import fork, leave_network
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.run import fly_again
 from mavfi_cli.report.summary import summary_lines
@@ -145,3 +151,25 @@ def test_the_port_of_another_program_is_told(tmp_path):
         )
         with pytest.raises(MavfiError, match="is in use"):
             library.fly(companion=str(path), world="farm", out=tmp_path)
+
+
+def is_allowed():
+    pid = fork(lambda: 0 if leave_network() else 1)
+    return os.waitpid(pid, 0)[1] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not is_allowed(), reason="no network namespaces here")
+@pytest.mark.parametrize("own", [True, False])
+def test_missions_of_a_campaign_have_networks_of_their_own(tmp_path, own):
+    companion, here = tmp_path / "looks.toml", os.readlink("/proc/self/ns/net")
+    key = "" if own else "own_network = false\n"
+    companion.write_text(f"{key}[program.looks]\ncommand = 'readlink /proc/self/ns/net'\n")
+    config = MissionConfig(companion=str(companion), world="farm", speed=SPEED)
+    missions = [PlannedMission(config=replace(config, seed=seed)) for seed in (1, 2)]
+    options = Options(jobs=2, keep=Keep.ALL)
+    with run_campaign(missions, tmp_path / "campaign", options) as ledger:
+        results = list(ledger.results())
+    assert [row.outcome for row in results] == ["success", "success"]
+    networks = [(row.path / "programs/looks/stdout").read_text().strip() for row in results]
+    assert len({here, *networks}) == (3 if own else 1)

@@ -14,6 +14,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.stats.bootstrap import FEW, LARGE, interval, mean, median
 from mavfi_cli.stats.paired import McNemar, WorstCase, holm, sign_flips
 from mavfi_cli.stats.shares import (
+    Interval,
     cross_layer,
     missions_for_margin,
     mixture,
@@ -83,6 +84,40 @@ def test_sign_flips_count_all_patterns(differences):
     patterns = itertools.product(*([d, -d] for d in differences))
     extreme = [abs(sum(pattern)) >= abs(sum(differences)) for pattern in patterns]
     assert sign_flips([d / 10 for d in differences]) == pytest.approx(np.mean(extreme))
+
+
+SAMPLES = st.lists(st.floats(-1e3, 1e3).map(lambda x: round(x, 3)), min_size=2, max_size=9)
+
+
+@given(SAMPLES, SAMPLES)
+def test_the_difference_of_means_is_welchs(first, second):
+    a, b = np.array(first), np.array(second)
+    found = Interval.welch(a, b)
+    errors = np.array([own.var(ddof=1) / len(own) for own in (a, b)])
+    assert found.value == pytest.approx(b.mean() - a.mean(), abs=1e-9)
+    if not errors.any():
+        assert (found.low, found.high) == (found.value, found.value)
+        return
+    freedom = errors.sum() ** 2 / (errors**2 / (len(a) - 1, len(b) - 1)).sum()
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(errors.sum())
+    assert found.high - found.value == pytest.approx(half, rel=1e-6, abs=1e-9)
+
+
+def test_the_difference_of_means_of_few_values_has_no_ends():
+    one, two = np.array([1.0]), np.array([2.0, 4.0])
+    assert Interval.welch(one, two).value == 2.0
+    assert math.isnan(Interval.welch(one, two).low)
+    assert math.isnan(Interval.welch(one[:0], two).value)
+    same = Interval.welch(np.full(36, 16.02), np.full(13, 16.02))
+    assert (same.value, same.low, same.high) == (0.0, 0.0, 0.0)
+
+
+@given(COUNTS, COUNTS)
+def test_independent_rates_are_tested_as_by_fisher(first, second):
+    table = [[hits, total - hits] for hits, total in (first, second)]
+    p_value = wilson(*first).fisher(wilson(*second))
+    assert p_value == pytest.approx(stats.fisher_exact(table).pvalue)
+    assert wilson(0, 0).fisher(wilson(*second)) == 1.0
 
 
 def test_sign_flips_of_many_differences_are_near_the_t_test():
