@@ -22,6 +22,7 @@ from mavfi_cli.core.terminal import exit_code, leave
 # vehicle's side replaces this process.
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
+    "companion": ("mavfi_cli.cli.companion", "Fly a vehicle as a program, for fly --companion."),
     "sitl": ("sitl", "Run the simulated vehicle alone, for any MAVLink client."),
     "world": ("sitl.world", "List, make, check and draw worlds."),
     "replay": ("mavfi_cli.cli.runs", "Repeat a run and compare the records."),

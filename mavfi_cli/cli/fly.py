@@ -43,17 +43,6 @@ _LARGE = [
 _OUTCOMES = ["success", "collision", "no_path", "timeout", "failsafe", "link_lost", "crash", "hang"]
 
 
-def _place(_ctx: Any, _param: Any, value: str | None) -> tuple[float, float, float] | None:
-    """(east, north, up) in metres, or a usage error."""
-    if value is None:
-        return None
-    try:
-        x, y, z = (float(part) for part in value.split(","))
-    except ValueError:
-        raise click.BadParameter(f"must be three numbers such as 30,40,5, got {value!r}") from None
-    return x, y, z
-
-
 _mission, _fault = section("Mission"), section("Fault")
 _instruction = section("Instruction level")
 _detector, _output = section("Detector"), section("Output")
@@ -78,9 +67,9 @@ _detector, _output = section("Detector"), section("Output")
                "stacks.")  # fmt: skip
 @_mission("--vehicle", type=types.VEHICLE, default="solo", metavar="NAME|FILE",
           help="Simulated vehicle: solo, spark, or a TOML file.")  # fmt: skip
-@_mission("--start", metavar="X,Y,Z", callback=_place,
+@_mission("--start", metavar="X,Y,Z", type=types.PLACE,
           help="Take-off position, ENU, m  [the world's].")  # fmt: skip
-@_mission("--goal", metavar="X,Y,Z", callback=_place,
+@_mission("--goal", metavar="X,Y,Z", type=types.PLACE,
           help="Goal, ENU, m  [the world's]. A generated world is built around start and goal: "
                "other positions move its bounds, and towers within 3 m of them are left "
                "out.")  # fmt: skip
@@ -101,7 +90,7 @@ _detector, _output = section("Detector"), section("Output")
 @_mission("--eyes", is_flag=True,
           help="Start a depth camera and a referee of --world beside the autopilot on --link, with "
                "the body of --vehicle.")  # fmt: skip
-@_mission("--origin", metavar="X,Y,Z", callback=_place,
+@_mission("--origin", metavar="X,Y,Z", type=types.PLACE,
           help="Local origin of the autopilot in the world, ENU, m  [the world's start; with mavfi "
                "sitl, the world's origin].")  # fmt: skip
 @_mission("--autopilot", type=types.AUTOPILOT, default="ours", metavar="ours|px4|ardupilot",

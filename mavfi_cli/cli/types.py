@@ -32,6 +32,25 @@ SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)
 NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its list
 UPSETS = Number(0.0, 1.0e12)
 
+
+Vector3 = tuple[float, float, float]
+
+
+class _Place(click.ParamType[Vector3]):
+    """Coordinates (east, north, up), m."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Vector3:
+        try:
+            x, y, z = (float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"must be three numbers such as 30,40,5, got {value!r}", param, ctx)
+        return x, y, z
+
+
+PLACE = _Place()
+
 # Names --------------------------------------------------------------------------------------------
 
 

@@ -158,14 +158,17 @@ class Peers(Generic[P]):
             listener.close()
 
     def _accept(self) -> None:
+        fresh = []
         for scheme, listener, make in self._endpoints:
             for transport in listener.accept_ready():
                 peer = make(transport)
                 peer.scheme = scheme
                 peer.last_received_s = peer.last_sent_s = self._clock()
-                self._peers.append(peer)
-                self._receive(peer)  # at once, else a replay of its signed frame would be as new
-                peer.full_rate_s = _AFTER_FIRST_S
+                fresh.append(peer)
+        self._peers += fresh
+        for peer in fresh:
+            self._receive(peer)  # at once, else a replay of its signed frame would be as new
+            peer.full_rate_s = _AFTER_FIRST_S
 
     def _receive(self, peer: P) -> bool:
         """Handle a few waiting bytes of a peer. Return True if there were any."""

@@ -48,7 +48,8 @@ class Router:
 
     Args:
         autopilot: URL or open transport of the autopilot.
-        companion: URL of the companion's link; a listening one takes several programs.
+        companion: URL of the companion's link; a listening one takes several programs. An open
+            transport takes one.
         passes: Decides which frames to pass on; None passes every frame.
         signing: Refuses frames without a good signature, on both sides.
         allow_unsigned: Allow an unsigned link to reach beyond this machine.
@@ -63,7 +64,7 @@ class Router:
     def __init__(
         self,
         autopilot: str | Transport,
-        companion: str,
+        companion: str | Transport,
         *,
         passes: Pass | None = None,
         signing: Signing | None = None,
@@ -75,7 +76,7 @@ class Router:
         make = partial(_Program, router=self)
         self.peers.open(autopilot, partial(make, side=Side.AUTOPILOT))
         listener = self.peers.open(companion, partial(make, side=Side.COMPANION))
-        self.port = int(getattr(listener, "port", 0))
+        self.port = int(getattr(companion, "port", getattr(listener, "port", 0)))
 
     def turn(self, timeout_s: float, until_s: float) -> None:
         """Wait for frames, then pass on those that have arrived.

@@ -69,6 +69,10 @@ class Transport(ABC):
             data = self._pull()
         return data
 
+    def await_peer(self, timeout_s: float) -> bool:
+        """Wait for a peer at most `timeout_s`. Return True if there is one."""
+        return timeout_s >= 0.0
+
     @abstractmethod
     def fileno(self) -> int:
         """Return the descriptor that is readable when `receive` would return data; -1: none."""
@@ -318,6 +322,11 @@ class _FirstClient(Transport):
             for client in others:
                 client.close()
         return self._client
+
+    def await_peer(self, timeout_s: float) -> bool:
+        if self._client is None:
+            self._await(select.POLLIN, timeout_s)
+        return self._serve() is not None
 
     def send(self, data: bytes) -> None:
         if (client := self._serve()) is not None:

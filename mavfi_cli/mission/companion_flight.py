@@ -1,13 +1,17 @@
 """One flight of a user's own companion, which mavfi starts, connects and judges.
 
 The vehicle's clock is simulated time. Programs run by the wall clock, so a flight does not repeat.
+
+A flight in lockstep repeats if its companion does. The vehicle sends all messages of a tick,
+LOCAL_POSITION_NED last, and waits. The companion sends its own, SET_POSITION_TARGET_LOCAL_NED with
+the same time_boot_ms last, and the next tick begins. Programs, fault and outcome are looked at only
+at a tick or while the companion is gone, so the wall clock decides only when to give up.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-import signal
 import socket
 import time
 from collections.abc import Iterable, Sequence
@@ -17,35 +21,38 @@ from typing import Any
 import numpy as np
 
 from mavfi_cli.companion.injection import NoInjection
-from mavfi_cli.core.errors import ConfigError, LinkLost, MavfiError
+from mavfi_cli.core.errors import ConfigError, LinkLost
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.flight_record import ProgramEnds
 from mavfi_cli.core.frames import norm
 from mavfi_cli.core.types import Briefing, Command, FloatArray, Outcome, VehicleState
 from mavfi_cli.core.wall import WallClock
+from mavfi_cli.fi.fault import Effect
 from mavfi_cli.fi.injector import Moment
-from mavfi_cli.link.codec import Message, dialect, frame_of
+from mavfi_cli.link.codec import Codec, Message, dialect, frame_of
 from mavfi_cli.link.endpoint import LISTENING, parse_endpoint
 from mavfi_cli.link.router import Router, Side
 from mavfi_cli.link.telemetry import AUTOPILOT, Telemetry
 from mavfi_cli.link.tlog import EPOCH_UNIX_S, TlogWriter
-from mavfi_cli.link.transport import Transport, signing_from_file
-from mavfi_cli.mission.companion_faults import CompanionFault, Throttle
-from mavfi_cli.mission.programs import Programs, RunningProgram
+from mavfi_cli.link.transport import Transport, open_transport, signing_from_file
+from mavfi_cli.mission.companion_faults import CompanionFault
+from mavfi_cli.mission.crew import Crew
+from mavfi_cli.mission.programs import Programs
 from mavfi_cli.mission.progress import FlightLogger, FlightProgress, Watcher
 from mavfi_cli.mission.run_folder import RunFolder, Trace
 from mavfi_cli.mission.setpoint_gate import SetpointGate
 from mavfi_cli.mission.setpoints import command_of
-from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig, SuccessConfig
-from mavfi_cli.spec.mission import MissionConfig
+from mavfi_cli.spec.companion import CompanionConfig, SuccessConfig
+from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 
 _TURN_S = 0.02
 _SERVE_S = 0.02  # longest service of the links in a turn
 _BOOT_S = 60.0  # simulated time after which programs start although the vehicle cannot arm yet
 _SILENCE_S = 60.0  # wall-clock time without a message after which the vehicle counts as lost
 _REST_MPS, _REST_S = 0.5, 1.0  # largest speed of a vehicle at rest, and how long it lasts
-_PORT_LOOK_S = 0.1
 _MOST_EVENTS = 1000
+_NO_SYSTEM = 255  # target of a setpoint that ends a tick and commands nothing
+_NO_TARGET = (0x0FFF, *[0.0] * 11)  # type mask that ignores all fields, and the fields
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 
@@ -76,8 +83,10 @@ class CompanionFlight:
         self.telemetry = Telemetry()
         self.logger, self.trace, self.wall = FlightLogger(watcher), Trace(), WallClock()
         self._tlog = TlogWriter(EPOCH_UNIX_S)
-        self._router = Router(link, companion.link, passes=self._pass)
+        self._link = link
+        self._router = Router(link, self._open_companion(companion.url), passes=self._pass)
         self.stamp_s = self.begun_s = self.end_s = 0.0
+        self._begun = False
         self.takeover_s = math.inf  # of the first arming
         self.outcome: Outcome | None = None
         self.reason = ""
@@ -90,10 +99,14 @@ class CompanionFlight:
         self._faults = injection if isinstance(injection, CompanionFault) else None
         self._mode, self._failsafe = "", False
         self._next_progress_s = 0.0
-        self._crew = _Crew(companion, self.logger)
+        self._crew = Crew(companion, self.logger.note)
         self._verdict = _Verdict(companion.success, self._crew)
         self._time_limit_s = min(config.time_limit_s, companion.time_limit_s or math.inf)
         self._goal_enu_m: FloatArray | None = None
+
+    def _open_companion(self, url: str) -> str | Transport:
+        """Return the companion's end of the router."""
+        return url
 
     def _planned_gate(self) -> SetpointGate | None:
         detector = self._config.detector
@@ -135,21 +148,28 @@ class CompanionFlight:
             contextlib.closing(self._crew),
             contextlib.closing(self.injection),
         ):
-            self._crew.prepare(programs, self._placeholders(briefing, depth))
+            folder.write_briefing(briefing)
+            values = self._placeholders(briefing, depth)
+            values["briefing"] = str(folder.briefing.resolve())
+            self._crew.prepare(programs, values)
             if self._faults is not None:
                 self._faults.running = self._crew.running
                 self._faults.aim_at(self._shortest_flight_s(briefing))
                 self._faults.begin(folder.fault)
             try:
                 while self.outcome is None:
-                    self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
-                    if self.telemetry.ready or self.stamp_s > _BOOT_S:
-                        self._crew.manage(self.stamp_s, self.telemetry.state)
-                    self._strike()
-                    self._judge()
+                    self._turn()
             except LinkLost as error:
                 self._end(Outcome.LINK_LOST, str(error))
             self.programs = self._crew.summary()  # before they are ended
+
+    def _turn(self) -> None:
+        """Pass frames on for a moment, then look after programs, fault and outcome."""
+        self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
+        if self.telemetry.ready or self.stamp_s > _BOOT_S:
+            self._crew.manage(self.stamp_s, self.telemetry.state)
+        self._strike()
+        self._judge()
 
     def explain(self, why: str) -> None:
         """Add the failure of the vehicle's process to the reason for a lost link."""
@@ -163,7 +183,7 @@ class CompanionFlight:
 
     def _placeholders(self, briefing: Briefing, depth: Path | None) -> dict[str, str]:
         """Return the text of every placeholder of a command."""
-        end = parse_endpoint(self._companion.link)
+        end = parse_endpoint(self._companion.url)
         port = self._router.port if end.scheme in LISTENING else end.port
         called = end.scheme in LISTENING
         udp = end.scheme.startswith("udp")
@@ -242,7 +262,8 @@ class CompanionFlight:
             return
         stamp_ms = getattr(message, "time_boot_ms", None)
         if stamp_ms is not None:
-            self.begun_s = self.begun_s or stamp_ms / 1e3
+            if not self._begun:
+                self._begun, self.begun_s = True, stamp_ms / 1e3
             self.stamp_s = telemetry.now_s = max(self.stamp_s, stamp_ms / 1e3)
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._note_mode(message)
@@ -336,131 +357,6 @@ class CompanionFlight:
         self.logger.note(self.stamp_s, "outcome", text, self.telemetry.state)
 
 
-class _Crew:
-    """The programs of a companion during a flight: their order, readiness and ends.
-
-    Attributes:
-        begun_s: Stamp of the start of the first program; infinite before.
-        running: Started programs by name.
-        heartbeat: A MAVLink heartbeat has arrived from the companion.
-        unready: Why the companion never became ready; empty while it may.
-    """
-
-    def __init__(self, companion: CompanionConfig, logger: FlightLogger) -> None:
-        self._companion, self._logger = companion, logger
-        self._waiting: list[tuple[str, ProgramConfig]] = list(companion.program.items())
-        self.begun_s = math.inf
-        self.running: dict[str, RunningProgram] = {}
-        self.heartbeat = False
-        self.unready = ""
-        self._started_s = self._looked_s = 0.0  # of the newest program; wall clock
-        self._known: dict[str, tuple[int, int]] = {}  # starts and ends that the log has
-        self._throttles: list[Throttle] = []
-
-    def prepare(self, programs: Programs, values: dict[str, str]) -> None:
-        """Fill in the placeholders of all commands. Raises UnknownName for an unknown one."""
-        self._programs = programs
-        self._tasks = {name: _task(program, values) for name, program in self._waiting}
-
-    def _start(self) -> None:
-        name, _ = self._waiting[0]
-        self.running[name] = self._programs.start(name, self._tasks[name])
-        self._started_s = time.monotonic()
-        if (share := self._companion.program[name].share) < 1.0:
-            self._throttles.append(Throttle(self.running[name], share))
-
-    def close(self) -> None:
-        """Let slowed programs run, so that they can end."""
-        for throttle in self._throttles:
-            throttle.end()
-
-    def manage(self, stamp_s: float, state: VehicleState | None) -> None:
-        """Log starts and ends of programs, and start the next one if the newest is ready.
-
-        Raises:
-            MavfiError: A program cannot be started.
-        """
-        if not self.running:
-            self.begun_s = stamp_s
-            self._start()
-        for name, program in self.running.items():
-            if not program.poll():
-                raise MavfiError(f"the program {name} cannot run: {program.failure()}")
-            starts, ends = self._known.get(name, (0, 0))
-            if program.starts > starts:
-                again = " again" if program.starts > 1 else ""
-                self._logger.note(stamp_s, "program", f"{name} starts{again}", state)
-            for code in program.codes[ends:]:
-                self._logger.note(stamp_s, "program", f"{name} {_how(code)}", state)
-            self._known[name] = program.starts, len(program.codes)
-        if self._waiting and not self.unready:
-            self._await_ready()
-
-    def _await_ready(self) -> None:
-        name, config = self._waiting[0]
-        program = self.running[name]
-        if self._is_ready(config, program):
-            del self._waiting[0]
-            if self._waiting:
-                self._start()
-        elif program.codes and program.pid is None and self._is_over(name):
-            self.unready = f"{name} {_how(program.codes[-1])} before it was ready"
-        elif time.monotonic() - self._started_s > config.ready_limit_s:
-            self.unready = f"{name} was not ready within {config.ready_limit_s:g} s"
-
-    def _is_ready(self, config: ProgramConfig, program: RunningProgram) -> bool:
-        return (
-            program.starts > 0
-            and (config.ready_line is None or program.ready)
-            and (not config.ready_heartbeat or self.heartbeat)
-            and (config.ready_port is None or self._is_open(config.ready_port))
-        )
-
-    def _is_open(self, port: int) -> bool:
-        """Return True if a local TCP port accepts connections."""
-        if time.monotonic() < self._looked_s + _PORT_LOOK_S:
-            return False
-        self._looked_s = time.monotonic()
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-            return probe.connect_ex(("127.0.0.1", port)) == 0
-
-    def summary(self) -> dict[str, ProgramEnds]:
-        """Return how often each program has started, and the exit codes of its processes."""
-        return {
-            name: ProgramEnds(starts=program.starts, codes=[*program.codes])
-            for name, program in self.running.items()
-        }
-
-    @property
-    def over(self) -> bool:
-        """True once every program has ended for good."""
-        return not self._waiting and all(map(self._is_over, self.running))
-
-    def _is_over(self, name: str) -> bool:
-        program, rule = self.running[name], self._companion.program[name].restart
-        if program.pid is not None or not program.codes:
-            return False
-        return rule == "never" or (rule == "on-failure" and program.codes[-1] == 0)
-
-    def failure(self) -> str:
-        """Return how a program failed for good; empty if none has."""
-        for name, program in self.running.items():
-            if program.codes and program.codes[-1] and self._is_over(name):
-                return f"{name} {_how(program.codes[-1])}"
-        return ""
-
-    def ended(self) -> str:
-        """Return which program has ended, or does not run at present; empty if all run."""
-        for name, program in self.running.items():
-            if program.codes and program.pid is None:
-                return f"the program {name} is gone"
-        return ""
-
-    def succeeded(self, name: str) -> bool:
-        """Return True if a program has ended for good with code 0."""
-        return name in self.running and self._is_over(name) and self.running[name].codes[-1] == 0
-
-
 def _free_port() -> int:
     """Return a TCP port of this machine that is free now."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -468,24 +364,123 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _how(code: int) -> str:
-    """Describe the end of a process."""
-    if code >= 0:
-        return f"ended with code {code}"
-    with contextlib.suppress(ValueError):
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"was killed by signal {-code}"
+class LockstepFlight(CompanionFlight):
+    """A flight in which simulated time stands still while the companion computes.
 
+    Raises:
+        ConfigError: The mission's autopilot, speed or fault needs the wall clock.
+    """
 
-def _task(program: ProgramConfig, values: dict[str, str]) -> dict[str, Any]:
-    return {
-        "argv": program.argv(values),
-        "folder": program.folder,
-        "environment": program.environment,
-        "restart": program.restart,
-        "restart_s": program.restart_s,
-        "ready_line": program.ready_line,
-    }
+    _end_of_link: Transport
+    _tick_ms = 0  # stamp of the vehicle's newest tick
+    _awaited_ms: int | None = None  # stamp that the companion has to answer; None: none
+    _since_s = 0.0  # when the present wait began
+
+    def _open_companion(self, url: str) -> Transport:
+        self._require_lockstep()
+        self._end_of_link = open_transport(url)
+        return self._end_of_link
+
+    def _require_lockstep(self) -> None:
+        config, fault = self._config, self._config.fault
+        stops = fault is not None and bool(fault.killed_node)
+        for key, by_wall in (
+            ("autopilot", config.autopilot != OWN_AUTOPILOT),
+            ("speed", config.speed != 1.0),
+            ("effect", stops and fault is not None and fault.effect != Effect.FLIP.value),
+        ):
+            if by_wall:
+                raise ConfigError("needs a companion with time = 'wall'", key=key)
+
+    def _turn(self) -> None:
+        """Start the program and await its connection; later await the next answer or tick."""
+        if self._crew.ready:
+            self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
+            self._look_after()
+            return
+        self._crew.connected = self._end_of_link.await_peer(_TURN_S)
+        self._crew.manage(self.stamp_s, self.telemetry.state)
+        self._heard_s = self._since_s = time.monotonic()
+        self._judge()
+
+    def _look_after(self) -> None:
+        """Give up a wait that is too long, and let the vehicle go on without an ended companion."""
+        waited_s, limit_s = time.monotonic() - self._since_s, self._companion.answer_limit_s
+        if self.outcome is not None:
+            pass
+        elif self._interrupts:
+            self._end(Outcome.INTERRUPTED)
+        elif self._awaited_ms is None:
+            if waited_s > _SILENCE_S:
+                self._end(Outcome.LINK_LOST, f"the vehicle said nothing for {_SILENCE_S:g} s")
+        elif waited_s > limit_s:
+            name, *_ = self._crew.running
+            text = f"{name} did not answer the tick at {self._tick_ms} ms within {limit_s:g} s"
+            self._end(Outcome.HANG, text)
+        elif not any(peer.side is Side.COMPANION for peer in self._router.peers):
+            self._crew.manage(self.stamp_s, self.telemetry.state)
+            if self._crew.over:
+                self._heard_s = time.monotonic()
+                self._judge()
+                self._go_on()
+
+    # Frames ---------------------------------------------------------------------------------------
+
+    def _pass(self, message: Message, side: Side) -> Iterable[bytes]:
+        ends_tick = side is Side.AUTOPILOT and self._is_tick(message)
+        answers = self._answers(message, side)
+        if ends_tick:
+            self._tick_ms, self._awaited_ms = message.time_boot_ms, None
+        frames = [*super()._pass(message, side)]
+        if self.outcome is not None:
+            return ()
+        if ends_tick:
+            self._since_s = time.monotonic()
+            if self._awaited_ms is None:  # a fault has kept the tick from the companion
+                self._go_on()
+        elif answers:
+            reaches = message.time_boot_ms == self._tick_ms and frame_of(message) in frames
+            self._awaited_ms, self._since_s = None, time.monotonic()
+            if not reaches:  # a fault or the gate has changed it
+                frames.append(self._release())
+        return frames
+
+    def _is_tick(self, message: Message) -> bool:
+        return message.get_msgId() == _POSITION and self.telemetry.is_from(message, AUTOPILOT)
+
+    def _answers(self, message: Message, side: Side) -> bool:
+        return (
+            side is Side.COMPANION
+            and message.get_msgId() == _SETPOINT
+            and message.time_boot_ms == self._awaited_ms
+        )
+
+    def _go_on(self) -> None:
+        """Answer the tick in place of the companion, unless the flight has ended."""
+        if self.outcome is None:
+            self._awaited_ms, self._since_s = None, time.monotonic()
+            self._link.send(self._release())
+
+    def _release(self) -> bytes:
+        """Return a setpoint that ends the tick, and that the autopilot ignores."""
+        return Codec(_NO_SYSTEM, 0).encode(
+            dialect.MAVLink_set_position_target_local_ned_message(
+                self._tick_ms, _NO_SYSTEM, 0, dialect.MAV_FRAME_LOCAL_NED, *_NO_TARGET
+            )
+        )
+
+    def _hear(self, message: Message) -> None:
+        """Handle a message of the vehicle. With the last of a tick, strike and judge."""
+        super()._hear(message)
+        if self._is_tick(message):
+            self._strike()
+            self._awaited_ms = None  # late messages are no ticks
+            self._judge()
+
+    def _deliver(self, message: Message, side: Side) -> Iterable[bytes]:
+        if side is Side.AUTOPILOT and self._is_tick(message):
+            self._awaited_ms = message.time_boot_ms
+        return super()._deliver(message, side)
 
 
 class _Verdict:
@@ -501,7 +496,7 @@ class _Verdict:
         ConfigError: It has no trace.
     """
 
-    def __init__(self, success: SuccessConfig, crew: _Crew) -> None:
+    def __init__(self, success: SuccessConfig, crew: Crew) -> None:
         self._success, self._crew = success, crew
         self.goal_enu_m: FloatArray | None = None
         self.landed = self.flew = False

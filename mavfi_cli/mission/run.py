@@ -40,7 +40,7 @@ from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.link.transport import signing_from_file
 from mavfi_cli.mission.companion_faults import CompanionInjection
-from mavfi_cli.mission.companion_flight import CompanionFlight
+from mavfi_cli.mission.companion_flight import CompanionFlight, LockstepFlight
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
 from mavfi_cli.mission.measures import quality_of
@@ -149,9 +149,12 @@ def _fly_companion(
         from mavfi_cli.mission.instruction.companion import ProcessInjection  # loads the tracer
 
         injection = ProcessInjection(config.instruction, programs.program, repeat)
-    with interruptible() as interrupt, other_end(config) as (link, vehicle):
+    kind, launch = CompanionFlight, Vehicle.start
+    if programs.in_lockstep:
+        kind, launch = LockstepFlight, Vehicle.start_in_lockstep
+    with interruptible() as interrupt, other_end(config, launch) as (link, vehicle):
         assert vehicle is not None
-        flight = CompanionFlight(config, programs, link, watcher, interrupt, injection)
+        flight = kind(config, programs, link, watcher, interrupt, injection)
         with contextlib.closing(flight):
             briefing = vehicle.await_briefing(interrupt)
             folder = RunFolder.new(out, config.world, config.seed)

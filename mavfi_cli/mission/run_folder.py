@@ -14,9 +14,11 @@ from mavfi_cli.core.errors import RecordError
 from mavfi_cli.core.files import (
     Json,
     file_digest,
+    own_folder,
     read_json,
     read_parquet,
     reading,
+    write_json,
     write_parquet,
     writing,
 )
@@ -24,6 +26,7 @@ from mavfi_cli.core.types import (
     BY_NAME,
     STATES,
     WAYPOINT_FIELDS,
+    Briefing,
     CollisionReport,
     Command,
     DType,
@@ -48,6 +51,9 @@ _NEEDED = (
     "outcome", "config", "quality_of_flight", "pilot", "events", "simulated_s", "versions", "host",
 )  # fmt: skip
 _PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_seq": np.int32}
+BRIEFING = "briefing.json"
+# Numbers in a briefing's file. The camera itself reports its field of view.
+BRIEFED = {"start_enu_m": 3, "goal_enu_m": 3, "bounds_enu_m": 6, "camera_offset_flu_m": 3}
 COMPANION_VARIES = "a flight of a user's companion does not repeat"
 _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
 
@@ -66,6 +72,7 @@ class RunFolder:
         self.fault = path / FAULT  # fault record, on disk before the fault strikes
         self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
         self.programs = path / "programs"  # outputs of a user's companion, by program
+        self.briefing = self.programs / BRIEFING
         self.golden = path / "golden"  # run folder of the golden run of the pair
 
     @classmethod
@@ -92,6 +99,11 @@ class RunFolder:
                 except FileExistsError:
                     number += 1
         raise AssertionError("unreachable")
+
+    def write_briefing(self, briefing: Briefing) -> None:
+        """Write the briefing for the programs of a user's companion. Raises RecordError."""
+        own_folder(self.programs)
+        write_json(self.briefing, {name: getattr(briefing, name) for name in BRIEFED})
 
     def write_plans(self, plans: Sequence[Trajectory]) -> None:
         """Write all plans that the mission logic received, with one row per waypoint."""

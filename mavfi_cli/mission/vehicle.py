@@ -25,12 +25,14 @@ import numpy as np
 
 from mavfi_cli.core.errors import Interrupted, MavfiError, VehicleProcessError, described
 from mavfi_cli.core.files import ScratchFolder
+from mavfi_cli.core.frames import is_within
 from mavfi_cli.core.processes import PYTHON
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing, FlightTruth
 from mavfi_cli.link.transport import Transport, open_transport, signing_from_file
+from mavfi_cli.mission.run_folder import BRIEFED, BRIEFING
 from mavfi_cli.spec.companion import CompanionConfig
-from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, MissionConfig
+from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, REMOTE_M, MissionConfig
 
 _START_LIMIT_S = 120.0  # of a camera; its first start compiles
 _END_LIMIT_S = 20.0
@@ -57,6 +59,21 @@ class Vehicle(ABC):
         by_wall = config.realtime or config.companion is not None
         return (VehicleProcess if by_wall else VehicleInProcess)(config)
 
+    @staticmethod
+    def start_in_lockstep(config: MissionConfig) -> Vehicle:
+        """Start the vehicle in its own process, in lockstep with a user's companion."""
+        return _LockstepProcess(config)
+
+    @staticmethod
+    def at(url: str, briefing: Path) -> StartVehicle:
+        """Return what connects to a vehicle in lockstep that another process has started.
+
+        Args:
+            url: Endpoint of the link.
+            briefing: File of the vehicle's briefing.
+        """
+        return lambda _: _VehicleElsewhere(url, briefing)
+
     @abstractmethod
     def briefing(self) -> Briefing:
         """Return start, goal, bounds and camera, which the world determines.
@@ -64,6 +81,23 @@ class Vehicle(ABC):
         Raises:
             VehicleProcessError: There is no briefing.
         """
+
+    @staticmethod
+    def read_briefing(path: Path) -> Briefing:
+        """Read a briefing that the vehicle's side has written.
+
+        Raises:
+            VehicleProcessError: There is none, or it is damaged.
+        """
+        try:
+            data = json.loads(path.read_text())
+            arrays: Any = {name: np.array(data[name], np.float64) for name in BRIEFED}
+            for name, values in arrays.items():
+                if values.shape != (BRIEFED[name],) or not is_within(REMOTE_M, values):
+                    raise ValueError(f"{name} must be {BRIEFED[name]} numbers below {REMOTE_M:g}")
+            return _at_flight_levels(Briefing(**arrays))
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise VehicleProcessError(f"{path.name}: there is no briefing ({error})") from None
 
     def await_briefing(self, interrupts: Sequence[int]) -> Briefing:
         """Wait for the vehicle's first bytes, and return its briefing.
@@ -151,20 +185,6 @@ def _at_flight_levels(briefing: Briefing) -> Briefing:
     return replace(briefing, bounds_enu_m=bounds)
 
 
-def read_briefing(folder: Path) -> Briefing:
-    """Read the briefing that a vehicle process wrote.
-
-    Raises:
-        VehicleProcessError: There is none.
-    """
-    try:
-        data = json.loads((folder / "briefing.json").read_text())
-        arrays: Any = {name: np.array(values, np.float64) for name, values in data.items()}
-        return _at_flight_levels(Briefing(**arrays))
-    except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise VehicleProcessError(f"the vehicle process wrote no briefing ({error})") from None
-
-
 def _read_truth(folder: Path) -> FlightTruth | None:
     """Read the truth that a vehicle process wrote; None if there is none."""
     report, host = folder / "truth.json", folder / "host.json"
@@ -223,7 +243,7 @@ class VehicleProcess(Vehicle):
 
     def briefing(self) -> Briefing:
         """See `Vehicle`."""
-        return read_briefing(self._scratch.path)
+        return self.read_briefing(self._scratch.path / BRIEFING)
 
     def end(self) -> VehicleProcessError | None:
         """See `Vehicle`; a vehicle that does not end is killed."""
@@ -253,6 +273,35 @@ class VehicleProcess(Vehicle):
             how = f"was killed by {signal.Signals(-code).name}"
         last = f": {lines[-1]}" if lines else ""
         return VehicleProcessError(f"the {self._name} process {how}{last}")
+
+
+class _LockstepProcess(VehicleProcess):
+    """The vehicle of a user's companion in lockstep, whose flight limits the time of an answer."""
+
+    @staticmethod
+    def _line(config: MissionConfig, descriptor: int) -> list[str]:
+        line = ["sitl", *_arguments(config), "--fd", str(descriptor), "--lockstep"]
+        return [*line, "--answer-limit", "1e6"]
+
+
+class _VehicleElsewhere(Vehicle):
+    """A vehicle of another process. Arguments as for `Vehicle.at`.
+
+    Raises:
+        LinkError: The link cannot be opened.
+    """
+
+    def __init__(self, url: str, briefing: Path) -> None:
+        self._briefing = briefing
+        self.link = open_transport(url)
+
+    def briefing(self) -> Briefing:
+        """See `Vehicle`."""
+        return self.read_briefing(self._briefing)
+
+    def end(self) -> None:
+        """Close the link."""
+        self.link.close()
 
 
 class _EyesProcess(VehicleProcess):

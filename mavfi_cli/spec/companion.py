@@ -20,7 +20,8 @@ from mavfi_cli.spec.detector import COMPANION
 
 RESTARTS = ("never", "on-failure", "always")
 ACTIONS, ON_ERROR = ("hold", "brake", "autopilot"), ("open", "closed")
-ANY_PORT = "udpin:127.0.0.1:0"
+TIMES = ("wall", "lockstep")
+ANY_PORT = {"wall": "udpin:127.0.0.1:0", "lockstep": "tcpin:127.0.0.1:0"}
 _PLACEHOLDER = re.compile(r"\{([a-z]+)\}")
 _LONGEST_S = 3600.0
 
@@ -157,8 +158,12 @@ class CompanionConfig:
     Attributes:
         program: Programs in the order in which they start; each waits until the one before is
             ready.
-        link: mavfi's end of the companion's MAVLink link. `udpin` with port 0 listens on a free
-            port; `udpout` calls a program that listens on a fixed one, as PX4 does.
+        time: Clock of the flight: `wall`, the wall clock, or `lockstep`, in which every tick waits
+            for the companion's answer.
+        answer_limit_s: Longest wall-clock time until an answer in lockstep, s.
+        link: mavfi's end of the companion's MAVLink link. By default it listens on a free port, of
+            UDP by the wall clock and of TCP in lockstep. `udpout` calls a program that listens on
+            a fixed port, as PX4 does.
         success: Conditions of success; by default the last program has ended with code 0.
         time_limit_s: Limit of simulated time from arming, s; None for the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
@@ -172,7 +177,9 @@ class CompanionConfig:
     """
 
     program: dict[str, ProgramConfig]
-    link: str = ANY_PORT
+    time: str = TIMES[0]
+    answer_limit_s: float = 60.0
+    link: str | None = None
     success: SuccessConfig = field(default_factory=SuccessConfig)
     time_limit_s: float | None = None
     flight_s: float | None = None
@@ -191,9 +198,39 @@ class CompanionConfig:
         _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
         if self.success.exit is not None and self.success.exit not in self.program:
             raise UnknownName("program", self.success.exit, self.program)
+        _require_range("answer_limit_s", self.answer_limit_s, 0.1, _LONGEST_S)
+        if self.time not in TIMES:
+            raise UnknownName("time", self.time, TIMES)
+        if self.link is None:
+            object.__setattr__(self, "link", ANY_PORT[self.time])
+        if self.in_lockstep:
+            self._check_lockstep()
         if self.success == SuccessConfig():
             last = SuccessConfig(exit=list(self.program)[-1])
             object.__setattr__(self, "success", last)
+
+    def _check_lockstep(self) -> None:
+        """Refuse what the wall clock or a second program would decide."""
+        if not self.url.startswith("tcpin:"):
+            raise ConfigError("must be tcpin: in lockstep, because UDP may lose ticks", key="link")
+        if len(self.program) > 1:
+            raise ConfigError("must be a single one in lockstep", key="program")
+        plain = ProgramConfig(command="true")
+        for name, program in self.program.items():
+            for key in ("restart", "ready_line", "ready_port", "ready_heartbeat", "share"):
+                if getattr(program, key) != getattr(plain, key):
+                    raise ConfigError("needs time = 'wall'", key=f"program.{name}.{key}")
+
+    @property
+    def in_lockstep(self) -> bool:
+        """True if every tick waits for the companion's answer."""
+        return self.time == "lockstep"
+
+    @property
+    def url(self) -> str:
+        """URL of mavfi's end of the link."""
+        assert self.link is not None
+        return self.link
 
     @property
     def mark(self) -> StackMark:

@@ -45,7 +45,7 @@ NOT_OF_GOLDEN: Mapping[str, Any] = {
 """Settings that a golden mission does not have or need, and their values in it."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
-_REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
+REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
 MARGIN_M = 30.0  # flight bounds around home and goal without a known world
 _MOUNT_FLU_M = (0.1, 0.0, 0.0)  # default of the stand-alone camera
@@ -160,9 +160,9 @@ class MissionConfig:
             place = getattr(self, name) or ()
             if not all(map(math.isfinite, place)):
                 raise ConfigError(f"must be three finite numbers, got {place}", key=name)
-            if not all(abs(coordinate) <= _REMOTE_M for coordinate in place):
+            if not all(abs(coordinate) <= REMOTE_M for coordinate in place):
                 raise ConfigError(
-                    f"must be within {_REMOTE_M:g} m of the origin, got {place}", key=name
+                    f"must be within {REMOTE_M:g} m of the origin, got {place}", key=name
                 )
         if self.fault is not None and self.instruction is not None:
             raise ConfigError(

@@ -31,7 +31,7 @@ from mavfi_cli.core.types import (
 from mavfi_cli.mission.measures import quality_of
 from mavfi_cli.mission.run import response_times
 from mavfi_cli.mission.run_folder import RunFolder, Trace, load_run
-from mavfi_cli.mission.vehicle import read_briefing
+from mavfi_cli.mission.vehicle import Vehicle
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, MARGIN_M, OF_THE_WORLD, MissionConfig
 
 # Configuration -------------------------------------------------------------------------------
@@ -121,10 +121,11 @@ def test_a_foreign_mission_may_fly_between_start_and_goal_with_a_margin(start, g
 
 @pytest.mark.parametrize("text", [None, "", "{", "{}", '{"goal_enu_m": "x"}'])
 def test_a_vehicle_that_left_no_briefing(tmp_path, text):
+    path = tmp_path / "briefing.json"
     if text is not None:
-        (tmp_path / "briefing.json").write_text(text)
+        path.write_text(text)
     with pytest.raises(VehicleProcessError, match="no briefing"):
-        read_briefing(tmp_path)
+        Vehicle.read_briefing(path)
 
 
 # Files ---------------------------------------------------------------------------------------

@@ -111,6 +111,15 @@ def test_interrupt_saves_the_truth(companion, tmp_path):
     assert json.loads((tmp_path / "truth" / "truth.json").read_text())["collision"] is None
 
 
+def test_an_answer_for_another_system_ends_the_tick_and_commands_nothing(companion, take_off):
+    vehicle = companion()
+    vehicle.fly(900, take_off, lambda _tick: {"target_system": 255, "vx": 2.0})
+    assert vehicle.stamp_ms == 899 * 20
+    modes = {m.custom_mode for m in vehicle.take("HEARTBEAT") if m.get_srcComponent() == 1}
+    assert 6 << 16 not in modes  # OFFBOARD needs setpoints of its own
+    assert vehicle.finish() == (0, "")
+
+
 def test_silent_companion_is_an_error_in_one_line(companion):
     vehicle = companion("--answer-limit", "0.3")
     vehicle.receive_tick()
