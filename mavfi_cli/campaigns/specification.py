@@ -258,6 +258,12 @@ class Spec:
                 "faults_per_invocation: must be 1 with a stop rule or stratified sampling, which "
                 f"count missions as independent, got {self.faults_per_invocation}"
             )
+        named = {*self.fixed, *self.axes, *(name for own in self.settings for name in own.axes)}
+        if self.sampling is not Sampling.UNIFORM and "companion" in named:
+            raise ValueError(
+                f"sampling: must be {Sampling.UNIFORM.value} with a user's companion, whose faults "
+                f"have no strata, got {self.sampling.value}"
+            )
 
     def scaled(self, scale: float) -> Spec:
         """Return the same campaign with a fraction of its repetitions, but at least one.
@@ -422,10 +428,17 @@ class Spec:
         return toml_text({**plain, **tables})
 
     def sampled(self, sampling: Sampling) -> Spec:
-        """Return the same campaign with another sampling of faults, which its name includes."""
+        """Return the same campaign with another sampling of faults, which its name includes.
+
+        Raises:
+            ConfigError: its faults cannot be drawn so.
+        """
         if sampling is self.sampling:
             return self
-        return replace(self, name=f"{self.name}-{sampling.value}", sampling=sampling)
+        try:
+            return replace(self, name=f"{self.name}-{sampling.value}", sampling=sampling)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
 
 
 def _listed(values: Sequence[Any] | None) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mavfi_cli.campaigns.begin import flyable
-from mavfi_cli.campaigns.specification import Keep, Stop
+from mavfi_cli.campaigns.specification import Keep, Sampling, Stop
 from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec
 from mavfi_cli.core.errors import ConfigError, MavfiError, UnknownName
 from mavfi_cli.spec.stack import Stack, load_stack
@@ -95,6 +95,15 @@ def test_several_faults_share_an_invocation_and_everything_else_is_flown_once_fo
     assert spec_of(spec_of(text).to_toml()) == spec_of(text)
     with pytest.raises(ConfigError, match="must be 1 with a stop rule"):
         spec_of(f"{text}\n[stop]\nmargin = 0.1")
+
+
+def test_a_user_s_companion_has_no_strata():
+    text = 'sampling = "{}"\n[mission]\ncompanion = "true"\n[[setting]]\nname = "golden"\n'
+    assert spec_of(text.format("uniform")).fixed["companion"] == "true"
+    with pytest.raises(ConfigError, match="must be uniform with a user's companion"):
+        spec_of(text.format("stratified"))
+    with pytest.raises(ConfigError, match="must be uniform with a user's companion"):
+        spec_of(text.format("uniform")).sampled(Sampling.STRATIFIED)
 
 
 def test_the_list_is_a_function_of_the_specification():
