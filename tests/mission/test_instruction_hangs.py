@@ -125,4 +125,7 @@ def test_a_flip_hangs_a_rehearsed_node_in_the_same_way(
     struck = TracerThread(strike).result()
     assert struck.effect is NodeEffect.HUNG
     assert struck.record["injection"]["applied"]
-    assert (struck.loss.hung, struck.loss.how) == (True, "hung: killed by the watchdog")
+    assert struck.how == "hung: killed by the watchdog"
+    with pytest.raises(node_process.NodeLost) as lost:
+        struck.process.take(struck.process.order("planner", None, 0.0))
+    assert lost.value.hung

@@ -116,9 +116,10 @@ from pathlib import Path
 from mavfi_cli.mission.programs import Programs
 task = {"argv": [sys.executable, "-c", "import time; time.sleep(600)"], "folder": ".",
         "environment": {}, "restart": "always", "restart_s": 0.0, "ready_line": None}
-program = Programs(Path(sys.argv[1])).start("program", task)
+programs = Programs(Path(sys.argv[1]))  # whose end would end its server
+program = programs.start("program", task)
 while program.pid is None:
-    program.poll()
+    assert program.poll(), program.failure()
 print(program.pid, flush=True)
 time.sleep(600)
 """
