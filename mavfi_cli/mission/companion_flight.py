@@ -149,9 +149,7 @@ class CompanionFlight:
             contextlib.closing(self.injection),
         ):
             folder.write_briefing(briefing)
-            values = self._placeholders(briefing, depth)
-            values["briefing"] = str(folder.briefing.resolve())
-            self._crew.prepare(programs, values)
+            self._crew.prepare(programs, self._placeholders(folder, briefing, depth))
             if self._faults is not None:
                 self._faults.running = self._crew.running
                 self._faults.aim_at(self._shortest_flight_s(briefing))
@@ -181,7 +179,9 @@ class CompanionFlight:
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
         return self._companion.flight_s or way_m / self._config.v_max_mps
 
-    def _placeholders(self, briefing: Briefing, depth: Path | None) -> dict[str, str]:
+    def _placeholders(
+        self, folder: RunFolder, briefing: Briefing, depth: Path | None
+    ) -> dict[str, str]:
         """Return the text of every placeholder of a command."""
         end = parse_endpoint(self._companion.url)
         port = self._router.port if end.scheme in LISTENING else end.port
@@ -194,6 +194,7 @@ class CompanionFlight:
             "mavsdk": f"{mavsdk}://{end.host}:{port}",
             "port": str(port),
             "free": str(_free_port()),
+            "briefing": str(folder.briefing.resolve()),
             **({} if depth is None else {"depth": str(depth)}),
             "world": self._config.world,
             "start": ",".join(f"{value:g}" for value in briefing.start_enu_m),
