@@ -351,7 +351,7 @@ class _Realtime:
             self._clients.wait(max(self._pace.remaining_s(), 0.0))
             self._clients.serve(now_s + time_s)
             self._forward(now_s + time_s)
-            self._clients.send_in_turn(Client.send_answers, now_s + time_s)
+            self._clients.send_in_turn(Client.send_answers)
             if self._pace.remaining_s() <= 0.0 or stopped() or self._clients.over:
                 break
 
@@ -359,7 +359,7 @@ class _Realtime:
         for sender in self._clients:
             while sender.texts and time.monotonic() < until_s:
                 forward = partial(Client.forward, frame=sender.texts.popleft(), sender=sender)
-                self._clients.send_in_turn(forward, until_s)
+                self._clients.send_in_turn(forward)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

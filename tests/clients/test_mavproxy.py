@@ -80,6 +80,14 @@ def shown(proxy, name):
     return float(proxy.expect(rf"{name}\s+([\d.]+)").group(1))
 
 
+def await_shown(proxy, name, value, timeout_s=40.0):
+    """MAVProxy shows the old value until the vehicle has confirmed the new one."""
+    deadline = time.monotonic() + timeout_s
+    while shown(proxy, name) != value:
+        assert time.monotonic() < deadline, f"{name} is not {value}"
+        time.sleep(0.1)
+
+
 @pytest.fixture
 def connect(tmp_path):
     with contextlib.ExitStack() as stack:
@@ -102,8 +110,7 @@ def test_mavproxy_sets_parameter_and_mode_arms_takes_off_and_lands(sitl, connect
     proxy.expect(r"Received \d+ parameters")
     assert shown(proxy, "MIS_TAKEOFF_ALT") == 2.5
     proxy.command("param set MIS_TAKEOFF_ALT 3.5")
-    # MAVProxy shows the old value until the vehicle has confirmed the new one.
-    assert any(shown(proxy, "MIS_TAKEOFF_ALT") == 3.5 for _ in range(50))
+    await_shown(proxy, "MIS_TAKEOFF_ALT", 3.5)
 
     proxy.command("long DO_SET_MODE 1 3 0 0 0 0 0")
     proxy.expect_mode("POSCTL")
@@ -174,7 +181,7 @@ def test_mavproxy_loads_its_modules_and_fetches_parameters_again(sitl, connect, 
     proxy.command("module list")
     proxy.expect(r"graph: ")
     proxy.command("param set MPC_XY_VEL_MAX 4")
-    assert any(shown(proxy, "MPC_XY_VEL_MAX") == 4.0 for _ in range(50))
+    await_shown(proxy, "MPC_XY_VEL_MAX", 4.0)
     proxy.command("param fetch")
     proxy.expect(r"Received \d+ parameters")
     assert shown(proxy, "MPC_XY_VEL_MAX") == 4.0

@@ -1,10 +1,16 @@
 """Clients of one simulation over links in memory: who gets the camera's frames."""
 
+import contextlib
+import dataclasses
+import socket
+
 import pytest
 
 from mavfi_cli.link.codec import Codec, dialect
 from mavfi_cli.link.transport import memory_pair
+from sitl import server
 from sitl.autopilot.telemetry import Preset
+from sitl.options import parse
 from sitl.server import Client
 from sitl.simulation import Simulation
 from sitl.vehicle.profile import load_profile
@@ -43,3 +49,23 @@ def test_frames_go_to_those_whose_capture_was_accepted(simulation, connect):
     heard = refused()
     assert "COMMAND_ACK" in heard
     assert "CAMERA_IMAGE_CAPTURED" not in heard
+
+
+def test_a_server_that_is_always_late_serves_every_client(simulation, free_port, monkeypatch):
+    """No tick has time for more than one client, and the answer to a reboot is not lost."""
+    monkeypatch.setattr(server, "_SHARE", 0.0)
+    link = (Preset.GCS, f"tcpin:127.0.0.1:{free_port}")
+    options = dataclasses.replace(parse([]), links=[link], speed=1e9)
+    realtime = server._Realtime(options, simulation)
+    calls, codec = iter(range(400)), Codec(245, 190)
+    with contextlib.closing(realtime), contextlib.ExitStack() as stack:
+        address = ("127.0.0.1", free_port)
+        clients = [stack.enter_context(socket.create_connection(address)) for _ in range(4)]
+        command = dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+        for client in clients:
+            order = dialect.MAVLink_command_long_message(1, 1, command, 0, 1, *[0.0] * 6)
+            client.sendall(codec.encode(order))
+        realtime.run(lambda: next(calls, None) is None)
+        for client in clients:
+            kinds = {m.get_type() for m in codec.decode(client.recv(1 << 20))}
+            assert kinds >= {"COMMAND_ACK", "ATTITUDE"}
