@@ -7,6 +7,9 @@ JOBS   ?= 3
 SOURCES := mavfi_cli sitl tests benchmarks examples
 SPHINX  := PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-going -E
 
+# Each of the thousand processes of the tests would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: fly test test-all docs man install install-dev lint clean
 
 fly: install
