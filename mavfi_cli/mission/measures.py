@@ -95,6 +95,7 @@ class FlightRecord:
         plan_failures: Number of failed plans by reason.
         state_fault, instruction_fault: The section `fault`, by its level.
         recorded_fault: The whole section as plain values.
+        in_lockstep: The flight was one of a user's companion in lockstep.
         referee: None if the vehicle left no truth.
         seeds: Seeds of the mission (`root`) and of its fault.
         files: SHA-256 of the user's files.
@@ -116,6 +117,7 @@ class FlightRecord:
     detection: Detection | None = None
     nodes: Mapping[str, NodeEnds] = field(default_factory=dict)
     programs: Mapping[str, ProgramEnds] = field(default_factory=dict)
+    in_lockstep: bool = False
     kernels: Mapping[str, KernelUse] = field(default_factory=dict)
     response_time_s: ResponseTime = field(default_factory=ResponseTime)
     measured_platform: MeasuredPlatform | None = None

@@ -176,6 +176,7 @@ def _fly_companion(
     guarded = {} if flight.detection is None else {"detection": flight.detection}
     ends = {name: asdict(program) for name, program in flight.programs.items()}
     result |= {"pilot": {}, "plans": [], "programs": ends, **guarded}
+    result |= {"in_lockstep": True} if programs.in_lockstep else {}
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))
     write_json(folder.result, result)

@@ -62,7 +62,8 @@ def summary_lines(flight: FlightRecord) -> list[str]:
         where = f" in {config['world']}" if config["world"] else ""
         flown = f"foreign autopilot at {config['link']}{where}, seed {config['seed']}"
     if config.get("companion"):
-        with_what = f"companion {config['companion']}, {config['speed']:g} x real time"
+        time = "in lockstep" if flight.in_lockstep else f"{config['speed']:g} x real time"
+        with_what = f"companion {config['companion']}, {time}"
     lines = [outcome_line(flight), "", f"Mission     {flown}; {with_what}", *_flight_lines(flight)]
     if pose := (flight.referee or {}).get("pose"):
         lines.append(f"Referee     on {pose}")

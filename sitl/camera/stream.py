@@ -8,6 +8,7 @@ in range. All numbers are little-endian. Readers send nothing.
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import socket
 import struct
@@ -49,7 +50,10 @@ class DepthStream:
             opened.listen()
         except OSError as error:  # a path that is too long has no strerror
             opened.close()
-            raise LinkError(f"{path}: {error.strerror or error}") from None
+            reason = error.strerror or error
+            if error.errno == errno.EADDRINUSE:
+                reason = "exists; remove it unless another process sends depth frames there"
+            raise LinkError(f"{path}: {reason}") from None
         self._listener = open_listener(opened, buffer=_HEADER.size + 4 * size[0] * size[1])
         self._readers: list[Transport] = []
 

@@ -10,8 +10,13 @@ from missions import SHORT
 
 from mavfi_cli import library
 from mavfi_cli.core.errors import ConfigError
+from mavfi_cli.detect.fit import fit
+from mavfi_cli.detect.offline import Dataset
+from mavfi_cli.detect.preprocess import PreprocessParams
 from mavfi_cli.link.tlog import tlog_messages
+from mavfi_cli.mission.setpoints import samples_of_tlog
 from mavfi_cli.spec.companion import CompanionConfig
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.fault import FaultConfig
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "companions"
@@ -66,6 +71,7 @@ def record(run):
 def test_two_flights_of_the_example_are_the_same_to_the_byte(fly):
     first, second = (fly(EXAMPLES / "lockstep.toml") for _ in range(2))
     assert (first.record.outcome, first.record.reason) == ("success", "landed")
+    assert first.record.in_lockstep
     assert 12.0 < first.record.quality_of_flight.distance_m < 20.0
     assert first.trace["truth_x_m"].null_count == 0
     assert record(first) == record(second)
@@ -115,6 +121,29 @@ def test_a_fault_repeats_and_does_not_stop_the_clock(fly, target, effect):
     assert first.result["simulated_s"] > 8.5
     assert first.record.strikes
     assert record(first) == record(second)
+
+
+@pytest.mark.slow
+def test_a_gate_holds_back_a_wild_setpoint_and_the_clock_goes_on(fly, tmp_path):
+    companion = EXAMPLES / "lockstep.toml"
+    learned = fly(companion)
+    flights = tuple(samples_of_tlog(learned.folder.tlog, "farm", seed) for seed in range(10))
+    mark = CompanionConfig.load(str(companion)).mark
+    model = tmp_path / "range.json"
+    fit("range", Dataset(flights=flights, preprocess=PreprocessParams(), stack=mark)).save(model)
+    wild = FaultConfig(  # 2 m/s become 512 m/s
+        target=f"{SETPOINT}.vx", at="time=6", exact_bits=(26,), persistence="stuck-at",
+        duration_s=0.5,
+    )  # fmt: skip
+    gate = DetectorConfig(name="range", model=str(model))
+    bare, *guarded = (fly(companion, fault=wild, detector=own) for own in (None, gate, gate))
+    assert bare.record.detection is None
+    assert guarded[0].record.detection.responses["hold"] > 0
+    assert guarded[0].record.outcome == "success"
+    assert record(guarded[0]) == record(guarded[1])
+    ends_m = [run.trace["truth_y_m"].to_numpy()[-1] for run in (learned, bare, guarded[0])]
+    assert ends_m[1] > ends_m[0] + 1.0
+    assert ends_m[0] - 1.5 < ends_m[2] < ends_m[0] + 0.1  # it holds, then brakes
 
 
 @pytest.fixture
