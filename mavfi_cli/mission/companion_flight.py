@@ -333,8 +333,12 @@ class CompanionFlight:
             self._end(Outcome.COLLISION, telemetry.collision_text.removeprefix("Collision: "))
         elif self._interrupts:
             self._end(Outcome.INTERRUPTED)
-        elif self._verdict.succeeded():
-            self._end(Outcome.SUCCESS, self._verdict.describe())
+        elif self._verdict.is_over():
+            if self._verdict.strayed:
+                text = f"up to {self._verdict.deviation_m:.1f} m from the golden path"
+                self._end(Outcome.TIMEOUT, text)
+            else:
+                self._end(Outcome.SUCCESS, self._verdict.describe())
         elif self._crew.unready:
             self._end(Outcome.CRASH, self._crew.unready)
         elif self._crew.over and (
@@ -535,16 +539,21 @@ class _Verdict:
         )
         return ", ".join(filter(None, parts))
 
-    def succeeded(self) -> bool:
-        """Return True if all given conditions hold. A corridor alone does not end the flight."""
+    @property
+    def strayed(self) -> bool:
+        """Whether the vehicle has left the corridor."""
+        corridor_m = self._success.corridor_m
+        return corridor_m is not None and self.deviation_m > corridor_m
+
+    def is_over(self) -> bool:
+        """Return True if all given conditions but that of the corridor hold."""
         success = self._success
         ends = (
             *([self._rests] if success.goal_m is not None else ()),
             *([self.landed] if success.landed else ()),
             *([self._crew.succeeded(success.exit)] if success.exit is not None else ()),
         )
-        inside = success.corridor_m is None or self.deviation_m <= success.corridor_m
-        return all(ends or (self._crew.over,)) and inside
+        return all(ends or (self._crew.over,))
 
 
 def path_of(folder: Path) -> FloatArray:

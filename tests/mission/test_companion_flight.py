@@ -93,8 +93,9 @@ def test_a_corridor_around_the_golden_path(fly):
     near = f"landed = true\ncorridor_m = 3.0\ngolden = '{golden.folder.path}'"
     assert fly("lands", success=near).record.outcome == "success"
     strict = near.replace("3.0", "0.01")
-    late = fly("lands", success=strict, limit_s=15.0)
-    assert late.record.outcome == "timeout"
+    strayed = fly("lands", success=strict)
+    assert strayed.record.outcome == "timeout"
+    assert strayed.record.reason.endswith("m from the golden path")
 
 
 @pytest.mark.parametrize(
