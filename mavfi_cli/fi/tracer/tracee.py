@@ -24,10 +24,12 @@ import signal
 import socket
 import struct
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
@@ -43,7 +45,7 @@ CLOSE, SENDTO = 3, 44
 _MMAP, _MUNMAP, _CLONE, _PERF_EVENT_OPEN = 9, 11, 56, 298
 _DUP2, _SOCKET, _CONNECT = 33, 41, 42
 _CLONE_PARENT = 0x8000
-_LOOK_S = 1e-3
+_LOOK_S, _POLL_S = 1e-3, 5e-4
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
 _NO_CALL = (1 << 64) - 1  # as the number of a system call that has begun, skips it
 _FREE = 512  # bytes below the stack pointer that no function uses, with room for a socket address
@@ -326,9 +328,18 @@ class Tracee:
         self.registers.forget()
         with contextlib.suppress(ProcessLookupError):  # killed at a stop: its end is reported next
             linux.request(linux.CONT, self.tid, 0, self._take_signal())
-        time.sleep(duration_s)
-        with contextlib.suppress(ProcessLookupError):
-            self.interrupt()
+        until_s = time.monotonic() + duration_s
+        while self.ended is None and (left_s := until_s - time.monotonic()) > 0.0:
+            status = self._wait(os.WNOHANG)
+            if not status.tid:
+                time.sleep(min(left_s, _POLL_S))
+            elif status.ended:
+                self._note_end(status)
+            else:
+                self._continue(status, linux.CONT)
+        if self.ended is None:
+            with contextlib.suppress(ProcessLookupError):
+                self.interrupt()
         return self.ended
 
     def count_to_end(self, address: int) -> int:
@@ -451,12 +462,41 @@ class Tracee:
         self.memory.write(place, kept)
 
     def detach(self) -> None:
-        """Let the process continue without a tracer; the target thread must be stopped."""
+        """Let the process and its children continue without a tracer, or note its end.
+
+        The target thread must be stopped. A thread that its process has lost, such as a killed one,
+        is waited for with all others, because Linux reports the main thread's end last.
+        """
         self.memory.close()
-        for thread in threads_of(self.pid):
-            if thread != self.tid:
-                self._detach_running(thread)
-        linux.request(linux.DETACH, self.tid, 0, self._take_signal())
+        while self.ended is None and (left := self._traced() - {self.tid}):
+            for thread in left:
+                with contextlib.suppress(ProcessLookupError):
+                    linux.request(linux.INTERRUPT, thread)
+            while left and self.ended is None:
+                status = self._wait()
+                left.discard(status.tid)
+                if status.ended:
+                    self._note_end(status)
+                elif status.tid != self.tid:
+                    with contextlib.suppress(ProcessLookupError):
+                        linux.request(linux.DETACH, status.tid, 0, _signal_of(status))
+        if self.ended is None:
+            try:
+                linux.request(linux.DETACH, self.tid, 0, self._take_signal())
+            except ProcessLookupError:  # it has been killed
+                self._await_end()
+
+    def _traced(self) -> set[int]:
+        """Return the threads that the calling thread traces, in the process and its children."""
+        if self.group == self.pid:
+            return {self.tid}
+        line = f"TracerPid:\t{threading.get_native_id()}\n"
+        found = set[int]()
+        for path in Path("/proc").glob("[0-9]*/task/[0-9]*/status"):
+            with contextlib.suppress(OSError):  # it has ended
+                if line in path.read_text():
+                    found.add(int(path.parent.name))
+        return found
 
     def kill(self) -> Ended:
         """Kill the process and its children, and wait until all are gone."""
@@ -514,8 +554,9 @@ class Tracee:
                 self._continue(status, linux.CONT)
             status = self._wait()
 
-    def _wait(self) -> linux.Status:
-        stopped, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS)
+    def _wait(self, options: int = 0) -> linux.Status:
+        """Wait for a report; with WNOHANG, return one of thread 0 if there is none."""
+        stopped, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS | options)
         return linux.Status(stopped, raw)
 
     def _note_end(self, status: linux.Status) -> bool:
@@ -568,13 +609,6 @@ class Tracee:
         # If it was killed meanwhile, its end is reported next.
         with contextlib.suppress(ProcessLookupError):
             linux.request(how, status.tid, 0, number)
-
-    def _detach_running(self, thread: int) -> None:
-        with contextlib.suppress(ProcessLookupError, ChildProcessError):
-            linux.request(linux.INTERRUPT, thread)
-            status = linux.wait(thread)
-            number = _signal_of(status)
-            linux.request(linux.DETACH, thread, 0, number)
 
     # -- counted stops
 

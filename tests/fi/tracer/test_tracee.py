@@ -1,9 +1,11 @@
 """Exact stops, clean resumption, every thread, no orphans."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -199,6 +201,54 @@ def test_attach_to_a_running_process_and_detach(native_program):
         assert (process.returncode, output) == (0, b"on")
 
 
+THREADS = """
+import os, threading, time
+for _ in range(4):
+    threading.Thread(target=time.sleep, args=(60,)).start()
+print(*os.listdir("/proc/self/task"), flush=True)
+"""
+
+
+@pytest.mark.parametrize("is_main", [True, False])
+def test_a_process_that_is_killed_before_it_is_detached_ends(native_program, is_main):
+    native_program("counting")
+    process = subprocess.Popen([sys.executable, "-c", THREADS], stdout=subprocess.PIPE, text=True)
+    threads = [int(thread) for thread in process.stdout.readline().split()]
+    process.stdout.close()
+    target = process.pid if is_main else max(threads)
+    tracee = Tracee.attach(process.pid, thread=target)
+    assert tracee.tid == target
+    process.kill()
+    tracee.detach()
+    assert tracee.ended == Ended(exit_code=None, signal=signal.SIGKILL)
+    process.wait()
+
+
+def test_what_a_process_starts_while_it_is_traced_outlives_the_tracer(native_program):
+    native_program("counting")
+    line = "read go; sleep 60 & echo $!; read go"
+    with subprocess.Popen(
+        ["sh", "-c", line], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    ) as process:
+        children = []
+
+        def trace():
+            tracee = Tracee.attach(process.pid)
+            process.stdin.write("go\n")
+            while not children:
+                tracee.run_for(0.05)
+                if select.select([process.stdout], [], [], 0)[0]:
+                    children.append(int(process.stdout.readline()))
+            tracee.detach()
+
+        tracer = threading.Thread(target=trace)
+        tracer.start()
+        tracer.join()
+        assert alive(process.pid)
+        assert alive(*children)
+        os.kill(*children, signal.SIGTERM)
+
+
 def test_attaching_to_nothing_is_a_clear_error():
     process = subprocess.Popen(["true"])
     process.wait()
@@ -222,6 +272,7 @@ def test_a_file_that_cannot_be_executed_is_a_clear_error(tmp_path, native_progra
 
 _TRACER = """
 import sys
+import threading
 from pathlib import Path
 from mavfi_cli.fi.tracer.spawn import Program, run_to_entry, spawn
 tracee = spawn(Program.of([sys.argv[1]]), stdout=Path(sys.argv[2]), stderr=Path(sys.argv[2]))
