@@ -35,6 +35,9 @@ from mavfi_cli.spec.fault import UNIFORM, InstructionConfig
 
 MOST_STEPS = 1000  # executed instructions between a moment and the fault
 _WINDOW = 64  # instructions for which a fault is followed
+# Time for which a thread is stepped to a fault, and for which the fault is followed. The program
+# runs by the wall clock, and PX4 misses a companion after 0.5 s.
+_STEPPED_S, _FOLLOWED_S = 0.15, 0.05
 _LOOK_S, _SEARCH_S = 1e-3, 10.0  # time between two looks for code in scope, and of all looks
 
 
@@ -138,9 +141,9 @@ def attack_moment(
 
     A thread is drawn by the CPU time that it has used so far, and stopped. By the rule
     `INSTRUCTION` it is stepped, and the fault strikes execution k of the instructions in scope; k
-    is drawn uniformly from 1 to `MOST_STEPS`. By a rule of time the fault strikes where the thread
-    is, or where a later look finds it in scope. The process runs by the wall clock, so neither
-    repeats.
+    is drawn uniformly from 1 to `MOST_STEPS`, and is less if the steps take too long. By a rule of
+    time the fault strikes where the thread is, or where a later look finds it in scope. The process
+    runs by the wall clock, so neither repeats.
 
     Args:
         objects: shared objects or executables in scope; empty for all files of the process,
@@ -179,7 +182,7 @@ def attack_moment(
             fault = replace(fault, corruption=None) if null else fault
             planned = record.planned(fault, image, **context)
             record.write(path, planned)
-            injection, followed = strike(tracee, fault, window=_WINDOW)
+            injection, followed = strike(tracee, fault, window=_WINDOW, patience_s=_FOLLOWED_S)
             reason = "" if injection is None else injection.reason
     finally:
         thread = _thread_name(tracee.tid)
@@ -237,6 +240,7 @@ class _Search:
     plan: Strategy
     rng: np.random.Generator
     _caller: int = -1  # stack pointer at the function's entry; a higher one is its caller's
+    _stepped_s: float = 0.0  # without the system calls, in which the thread waits by itself
 
     def fault(self) -> tuple[InstructionFault | None, str]:
         """Return the fault before which the thread has stopped, or None and why there is none."""
@@ -248,7 +252,7 @@ class _Search:
             if by_steps and not self._enter():
                 continue
             count += 1
-            if count >= drawn:
+            if count >= drawn or self._stepped_s > _STEPPED_S:
                 number = count if by_steps else 0
                 fault, reason = draw_fault_here(
                     self.tracee, self.image, self.scope, self.plan, self.rng, number
@@ -287,4 +291,8 @@ class _Search:
             return 0
 
     def _step(self) -> None:
-        clean_step(self.tracee, instruction_at(self.tracee, self.tracee.registers.ip))
+        begun_s = time.perf_counter()
+        instruction = instruction_at(self.tracee, self.tracee.registers.ip)
+        clean_step(self.tracee, instruction)
+        if instruction is None or instruction.mnemonic != "syscall":
+            self._stepped_s += time.perf_counter() - begun_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from enum import Enum
@@ -176,8 +177,9 @@ def _follow(
     injection: Injection,
     *,
     window: int,
+    patience_s: float,
 ) -> Followed:
-    """Step until the corrupted bits are read or overwritten, at most `window` instructions."""
+    """Step until the corrupted bits are read or overwritten, or until the window or time ends."""
     if not injection.applied:
         return NOTHING
     if corruption.role is Role.SOURCE or corruption.site is Site.INSTRUCTION_POINTER:
@@ -185,9 +187,13 @@ def _follow(
             activation=BitActivation.READ, after_instructions=0, instruction=instruction.text
         )
     remaining = bits.BitType.raw(VECTOR_BITS).mask(corruption.bits)
+    until_s = time.monotonic() + patience_s
     for distance in range(1, window + 1):
         current = instruction_at(tracee, tracee.registers.ip)
         if current is None:
+            break
+        if time.monotonic() > until_s:
+            window = distance - 1
             break
         read, remaining = _touch(tracee, current, corruption, injection.address, remaining)
         if read or (corruption.bits and not remaining):
@@ -200,7 +206,7 @@ def _follow(
 
 
 def strike(
-    tracee: Tracee, fault: InstructionFault, *, window: int
+    tracee: Tracee, fault: InstructionFault, *, window: int, patience_s: float = math.inf
 ) -> tuple[Injection | None, Followed]:
     """Corrupt the target at the stop before the attacked instruction; follow the bits.
 
@@ -208,6 +214,7 @@ def strike(
         tracee: the process, stopped there.
         fault: the fault; without a corruption nothing is done.
         window: number of instructions for which a destination fault is followed.
+        patience_s: wall-clock time for which it is followed.
 
     Raises:
         FaultError: another instruction is at the location.
@@ -220,7 +227,9 @@ def strike(
         return None, NOTHING
     injection = _apply(tracee, instruction, fault.corruption)
     steps = window if tracee.ended is None else 0
-    return injection, _follow(tracee, instruction, fault.corruption, injection, window=steps)
+    return injection, _follow(
+        tracee, instruction, fault.corruption, injection, window=steps, patience_s=patience_s
+    )
 
 
 def _touch(
