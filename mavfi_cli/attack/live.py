@@ -180,18 +180,19 @@ def attack_moment(
                 fault, reason = None, "the program ended before the instruction"
         if fault is not None:
             fault = replace(fault, corruption=None) if null else fault
-            planned = record.planned(fault, image, **context)
-            record.write(path, planned)
+            record.write(path, record.planned(fault, image, names_symbol=False, **context))
             injection, followed = strike(tracee, fault, window=_WINDOW, patience_s=_FOLLOWED_S)
             reason = "" if injection is None else injection.reason
     finally:
         thread = _thread_name(tracee.tid)
         if tracee.ended is None:
             tracee.detach()
+    traced_s = round(time.perf_counter() - begun_s, 6)
+    if fault is not None:
+        planned = record.planned(fault, image, **context)
     done = record.completed(
-        planned, injection, followed, not_injected_reason=reason, thread=thread,
-        traced_s=round(time.perf_counter() - begun_s, 6),
-    )  # fmt: skip
+        planned, injection, followed, not_injected_reason=reason, thread=thread, traced_s=traced_s
+    )
     record.write(path, done)
     return LiveAttack(
         injection=injection, followed=followed, reason=reason, ended=tracee.ended, record=done

@@ -31,11 +31,14 @@ VERSION = 2  # version 1 had whole registers as operands
 _LARGEST = 1 << 24  # bytes of a record
 
 
-def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecord:
+def planned(
+    fault: InstructionFault, image: Image, *, names_symbol: bool = True, **context: Any
+) -> FaultRecord:
     """Return the record of a fault before the flip.
 
     Args:
         image: image of the process, for symbols and build ids.
+        names_symbol: include the symbol; to read those of a large object takes seconds.
         context: further entries: seed, sampling rule, scope, kernel, program, run.
     """
     target = fault.target
@@ -45,7 +48,7 @@ def planned(fault: InstructionFault, image: Image, **context: Any) -> FaultRecor
         "level": "instruction",
         "object": target.object,
         "offset": target.offset,
-        "symbol": image.symbol(target),
+        "symbol": image.symbol(target) if names_symbol else "",
         "instruction": fault.instruction,
         "instruction_bytes": fault.instruction_bytes.hex(),
         "k": fault.execution,
