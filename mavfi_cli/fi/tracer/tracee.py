@@ -469,9 +469,11 @@ class Tracee:
         """
         self.memory.close()
         while self.ended is None and (left := self._traced() - {self.tid}):
-            for thread in left:
-                with contextlib.suppress(ProcessLookupError):
+            for thread in list(left):
+                try:
                     linux.request(linux.INTERRUPT, thread)
+                except ProcessLookupError:  # it is gone, and nothing will be reported
+                    left.discard(thread)
             while left and self.ended is None:
                 status = self._wait()
                 left.discard(status.tid)
@@ -491,12 +493,12 @@ class Tracee:
         if self.group == self.pid:
             return {self.tid}
         line = f"TracerPid:\t{threading.get_native_id()}\n"
-        found = set[int]()
+        threads = set[int]()
         for path in Path("/proc").glob("[0-9]*/task/[0-9]*/status"):
             with contextlib.suppress(OSError):  # it has ended
                 if line in path.read_text():
-                    found.add(int(path.parent.name))
-        return found
+                    threads.add(int(path.parent.name))
+        return threads
 
     def kill(self) -> Ended:
         """Kill the process and its children, and wait until all are gone."""
