@@ -18,6 +18,7 @@ from enum import Enum
 import numpy as np
 
 from mavfi_cli.autonomy.tracking import TrackingInputs, reference_waypoint, waypoint_index
+from mavfi_cli.core.flight_record import PilotCounters
 from mavfi_cli.core.frames import norm, wrap_angle
 from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
 
@@ -97,22 +98,6 @@ class PilotParams:
     sight_rad: float = math.pi / 4.0  # half the field of view that counts as seen; camera: 90 deg
     rest_mps: float = 0.3  # a slower vehicle counts as at rest
     start_error_max_m: float = 10.0  # maximum distance between a plan's start and the vehicle
-
-
-@dataclass(slots=True)
-class PilotCounters:
-    """Counters of the mission logic."""
-
-    plans_requested: int = 0
-    plans_failed: int = 0
-    plans_ignored: int = 0  # stale, late, or out of order
-    plans_rejected: int = 0  # withheld by the detector gate
-    replans: int = 0  # plans adopted after the first
-    collisions_foreseen: int = 0
-    reports_ignored: int = 0  # stale future_collision_seq
-    stops: int = 0
-    slowdowns: int = 0
-    look_rounds: int = 0
 
 
 class _ActivePlan:

@@ -16,7 +16,6 @@ from math import isfinite
 
 import numpy as np
 
-from mavfi_cli.autonomy.pilot import PilotCounters
 from mavfi_cli.core.config import structure_record
 from mavfi_cli.core.files import Json
 from mavfi_cli.core.flight_record import (
@@ -26,6 +25,7 @@ from mavfi_cli.core.flight_record import (
     MeasuredPlatform,
     MissionInstructionFault,
     NodeEnds,
+    PilotCounters,
     Point,
     ProgramEnds,
     QualityOfFlight,
