@@ -390,7 +390,8 @@ def ranking(rows, kernels, rng):
         stats.beta(k[:, None] + 0.5, (n - k)[:, None] + 0.5).rvs((len(names), 20_000), rng)
         for k, n in (np.array(each).T for each in (silent, pairs))
     ]
-    rho = [stats.spearmanr(a, b).statistic for a, b in zip(*(d.T for d in drawn), strict=True)]
+    first, second = (stats.rankdata(each, axis=0) - (len(names) + 1) / 2 for each in drawn)
+    rho = (first * second).sum(axis=0) / np.sqrt((first**2).sum(axis=0) * (second**2).sum(axis=0))
     value = stats.spearmanr(*([k / n for k, n in each] for each in (silent, pairs))).statistic
     return value, *np.percentile(rho, [2.5, 97.5]), sum(n for _, n in pairs)
 

@@ -17,6 +17,12 @@ POSTS = (
     "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [20.0, 0.0, 5.0]\n"
     "[[box]]\nmin_enu_m = [9.0, -4.0, 0.0]\nmax_enu_m = [12.0, 3.0, 12.0]\n"
 )
+# A world without anything in the short way to the goal.
+LAWN = (
+    'name = "lawn"\nbounds_enu_m = [-10.0, -10.0, 0.0, 30.0, 20.0, 20.0]\n'
+    "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [8.0, 4.0, 5.0]\n"
+    "[[box]]\nmin_enu_m = [5.0, 9.0, 0.0]\nmax_enu_m = [8.0, 12.0, 9.0]\n"
+)
 # A platform's file with every kernel.
 SOUND_PLATFORM = 'name = "mine"\ncores = 2\n' + "".join(
     f"[kernels.{kernel}]\nlatency_s = {0.01 * (k + 1):.2f}\nspread = 0.5\n"

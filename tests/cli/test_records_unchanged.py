@@ -10,7 +10,7 @@ import io
 import json
 
 import pytest
-from missions import SHORT_WAY
+from missions import LAWN, SHORT_WAY
 
 # Fields of reports that depend on the host, on the clock or on the code's own files; a struck
 # register may hold an address, and where the stack begins depends on the length of paths. A
@@ -76,6 +76,7 @@ def digest(value):
 def report(mavfi, tmp_path):
     """Run a command in an empty folder; what it prints, as JSON or as rows of CSV."""
     (tmp_path / "hashed.toml").write_text(CAMPAIGN)
+    (tmp_path / "lawn.toml").write_text(LAWN)
 
     def run(arguments):
         done = mavfi(*arguments, cwd=tmp_path)
@@ -87,6 +88,7 @@ def report(mavfi, tmp_path):
     return run
 
 
+# `compare`, `evaluate` and `vpm --fly` were renewed when they flew over a lawn instead of a farm.
 COMMANDS = {
     # Renewed when an export got the costs of detection and recovery, and when kernels became code
     # of x86-64-v3 on every processor, so that a fault in an instruction strikes the same one, and
@@ -109,28 +111,28 @@ COMMANDS = {
     # `inputs_sha256` differs.
     "kernels": ("42f19572d5433429", ["kernels", "--kernel", "control", "--runs", "12", "--json"]),
     "compare": (
-        "eac34e35e3c1cd54",
+        "c22443e05096932c",
         [
-            *("compare", "--platform", "x86", "--platform", "tx2", "--world", "farm"),
-            *("--inject", "waypoint_position", "--field", "exponent", "--detector", "none,gad"),
+            *("compare", "--platform", "x86", "--platform", "tx2", "--world", "lawn.toml"),
+            *("--inject", "waypoint_position", "--field", "mantissa", "--detector", "none,gad"),
             *("--missions", "1", "--quiet", "--json"),
         ],
     ),
     # Renewed when harm began at 10 % and `otherwise` and `golden` went (schema 2).
     "evaluate": (
-        "aa876b5f18a0a188",
+        "b06f546e29ba2582",
         [
-            *("detect", "evaluate", "--world", "farm", "--detector", "none,gad", "--flights", "1"),
-            *("--golden-flights", "1", "--field", "exponent"),
+            *("detect", "evaluate", "--world", "lawn.toml", "--detector", "none,gad"),
+            *("--flights", "1", "--golden-flights", "1", "--field", "exponent"),
             *("--quiet", "--json"),
         ],
     ),
     # Renewed when its curve got its throughputs from libm: those of numpy depend on the processor.
     "vpm": ("42b0c90aea6f35bb", ["vpm", "--vehicle", "spark", "--json"]),
     "vpm --fly": (
-        "347da80654dec6fe",
+        "8345305146863b05",
         [
-            *("vpm", "--vehicle", "spark", "--fly", "--world", "farm", "--missions", "1"),
+            *("vpm", "--vehicle", "spark", "--fly", "--world", "lawn.toml", "--missions", "1"),
             *("--quiet", "--csv"),
         ],
     ),

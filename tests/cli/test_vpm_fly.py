@@ -6,26 +6,19 @@ import re
 import xml.etree.ElementTree as ET
 
 import pytest
+from missions import LAWN
 from test_vpm import COUNTS, SVG, UNITS, numbers
 
 COUNTED = {*COUNTS, "missions_each", "first_seed", "missions", "flights", "alarms", "success",
            "collision", "timeout", "no_path", "pairs", "pairs_over_aad", "flight_replans",
            "flight_alarms"}  # fmt: skip
-WORLD = """name = "lawn"
-bounds_enu_m = [-10.0, -20.0, 0.0, 40.0, 20.0, 20.0]
-start_enu_m = [0.0, 0.0, 0.0]
-goal_enu_m = [15.0, 0.0, 5.0]
-[[box]]
-min_enu_m = [5.0, 12.0, 0.0]
-max_enu_m = [8.0, 15.0, 9.0]
-"""
 LINE = ("vpm", "--fly", "--vehicle", "spark", "--world", "lawn.toml", "--missions", "1",
         "--out", "out", "--jobs", "2")  # fmt: skip
 
 
 @pytest.fixture
 def lawn(tmp_path):
-    (tmp_path / "lawn.toml").write_text(WORLD)
+    (tmp_path / "lawn.toml").write_text(LAWN)
 
 
 @pytest.mark.slow

@@ -9,7 +9,9 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 _CAMPAIGNS = ("instruction", "effects-part2", "protected-part2", "hardening-part1", "sight-part1")
 
 
+PLACES = [*(RESULTS / f"{name}.parquet" for name in _CAMPAIGNS), RESULTS / "kernels.json"]
+
+
 def everything():
     """The whole document, made anew."""
-    exports = [RESULTS / f"{name}.parquet" for name in _CAMPAIGNS]
-    return document(Evidence.gather([*exports, RESULTS / "kernels.json"]))
+    return document(Evidence.gather(PLACES))

@@ -7,10 +7,10 @@ import io
 import re
 
 import pytest
-from committed import everything
+from committed import PLACES
 
 from mavfi_cli.paper.claims import CLAIMS
-from mavfi_cli.report.page import FILTERS, render
+from mavfi_cli.report.page import FILTERS
 from mavfi_cli.stats.shares import Interval, wilson
 
 pytestmark = pytest.mark.slow  # the page of all committed flights takes its time
@@ -55,8 +55,21 @@ def test_the_file_is_alone(page):
     assert "<script" not in text
 
 
-def test_equal_flights_give_equal_pages(page):
-    assert render(everything()) == page.read_text(encoding="utf-8")
+def test_the_command_writes_one_page_and_equal_flights_give_equal_pages(
+    told, page, mavfi, tmp_path
+):
+    written = tmp_path / "page.html"
+    done = mavfi("report", *PLACES, "-o", written)
+    assert done.returncode == 0
+    shown = [line for line in done.stderr.splitlines() if not line.endswith(" ...")]  # no steps
+    assert shown == [f"note: {problem}" for problem in told.problems]
+    answer, last = done.stdout.splitlines()
+    assert " of the " in answer
+    assert re.match(rf"[\d,]+ missions in {written} \(", last)
+    assert [each.name for each in tmp_path.iterdir()] == ["page.html"]
+    text = written.read_text(encoding="utf-8")
+    assert text.rstrip().endswith("</html>")
+    assert text == page.read_text(encoding="utf-8")
 
 
 def test_every_chart_has_its_data(page):

@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import asdict
 
 import pytest
-from missions import POSTS
+from missions import LAWN
 
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.progress import Spectator
@@ -18,7 +18,6 @@ from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.core.files import plain
 from mavfi_cli.studies.compare import ComparePlan, compare
 
-WORLD = POSTS.replace("goal_enu_m = [20.0", "goal_enu_m = [16.0")
 FEW = ("--platform", "x86", "--platform", "tx2", "--inject", "waypoint_position", "--detector",
        "none,gad", "--missions", "2", "--first-seed", "2", "--out", "out")  # fmt: skip
 SETTINGS = ("golden", "none", "gad")
@@ -27,14 +26,14 @@ SETTINGS = ("golden", "none", "gad")
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
-    (folder / "posts.toml").write_text(WORLD)
+    (folder / "lawn.toml").write_text(LAWN)
     return folder
 
 
 @pytest.fixture(scope="module")
 def flown(home, mavfi):
     """The run of the small comparison; its folder is home / "out"."""
-    run = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home)
+    run = mavfi("compare", "--world", "lawn.toml", *FEW, "--json", cwd=home)
     assert run.returncode == 0, run.stderr
     return run
 
@@ -87,10 +86,10 @@ def test_the_folder_holds_tables_and_pictures(flown, told, home):
 
 @pytest.mark.slow
 def test_called_again_it_flies_nothing_and_says_the_same(flown, told, home, mavfi):
-    again = mavfi("compare", "--world", "posts.toml", *FEW, "--json", cwd=home)
+    again = mavfi("compare", "--world", "lawn.toml", *FEW, "--json", cwd=home)
     assert json.loads(again.stdout) == told
     assert "flying, " not in again.stderr
-    text = mavfi("compare", "--world", "posts.toml", *FEW, "--quiet", cwd=home)
+    text = mavfi("compare", "--world", "lawn.toml", *FEW, "--quiet", cwd=home)
     assert (text.returncode, text.stderr) == (0, "")
     assert "tx2 over x86" in text.stdout
 
@@ -98,11 +97,11 @@ def test_called_again_it_flies_nothing_and_says_the_same(flown, told, home, mavf
 @pytest.mark.slow
 def test_other_settings_in_the_same_folder_are_refused_with_the_difference(flown, home, mavfi):
     other = [*FEW[:5], "command_velocity", *FEW[6:]]
-    run = mavfi("compare", "--world", "posts.toml", *other, cwd=home)
+    run = mavfi("compare", "--world", "lawn.toml", *other, cwd=home)
     assert (run.returncode, run.stdout) == (1, "")
     assert run.stderr.startswith("error: out: ")
     assert "site waypoint_position there, command_velocity here; " in run.stderr
-    fewer = mavfi("compare", "--world", "posts.toml", *FEW, "--missions", "1", cwd=home)
+    fewer = mavfi("compare", "--world", "lawn.toml", *FEW, "--missions", "1", cwd=home)
     assert "missions 2 there, 1 here" in fewer.stderr
 
 
@@ -121,15 +120,14 @@ class Stopper(Spectator):
 @pytest.mark.slow
 def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkeypatch):
     monkeypatch.chdir(home)
-    plan = ComparePlan(world="posts.toml", inject=("waypoint_position",),
+    plan = ComparePlan(world="lawn.toml", inject=("waypoint_position",),
                        detectors=("none", "gad"), missions=1, first_seed=2)  # fmt: skip
     folder, options = home / "resumed", Options(jobs=2)
     with pytest.raises(Interrupted):
         compare(plan, folder, options, Stopper())
     with Ledger(folder) as ledger:
         assert 0 < ledger.over() < 6
-    compare(plan, folder, options, Spectator())
-    whole = ComparePlan(world="posts.toml", inject=("waypoint_position",),
+    whole = ComparePlan(world="lawn.toml", inject=("waypoint_position",),
                         detectors=("none", "gad"), missions=2, first_seed=2)  # fmt: skip
     assert plain(asdict(compare(whole, folder, options, Spectator()))) == told
 

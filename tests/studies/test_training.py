@@ -11,7 +11,7 @@ from mavfi_cli.detect import base
 from mavfi_cli.detect.base import Model, shipped
 from mavfi_cli.detect.offline import Dataset
 
-WORLD, FIRST_SEED, FLIGHTS = "train-0.2-5", 10_075, 10
+WORLD, FIRST_SEED, FLIGHTS = "train-0.05-3", 10_000, 10
 FLOWN = {f"{WORLD}/{seed}" for seed in range(FIRST_SEED, FIRST_SEED + FLIGHTS)}
 KINDS = ["gad", "l2", "range"]
 
