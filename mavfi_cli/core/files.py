@@ -324,7 +324,7 @@ def read_parquet(path: Path, what: str) -> Any:
             packed = sum(group.total_byte_size for group in groups)
             if max(packed, 8 * about.num_rows * about.num_columns) > _LARGEST:
                 raise RecordError(f"{path}: must have at most {_LARGEST >> 20} MB")
-        return pq.read_table(path)
+            return file.read()  # pq.read_table would load pandas, if it is installed
     except (OSError, pa.ArrowException) as error:
         raise RecordError(f"{path}: the {what} cannot be read ({error})") from None
 
