@@ -1,25 +1,35 @@
 """Every code block of the documents runs, or says why it does not.
 
-The blocks of a page run one after the other in one empty folder, as a reader would run them.
-docs/contributing.md explains the comments before a block ("Add a page").
+The blocks of a page run one after the other in one empty folder, as a reader would run them. Only
+the mavfi commands of a block without other commands run in the process of the test, which has
+loaded everything. docs/contributing.md explains the comments before a block ("Add a page").
 """
 
 import contextlib
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
-COMMENT = re.compile(r"<!-- (not run|run with|file)(?:: (.+?))? -->", re.DOTALL)
-COMMAND = re.compile(r"^(mavfi (?:[^#\n\\]|\\\n)*)", re.MULTILINE)
+COMMENT = re.compile(r"<!-- (not run|[a-z ]+ with|file)(?:: (.+?))? -->", re.DOTALL)
+COMMAND = r"(?m)^(mavfi {}(?:[^#\n\\]|\\\n)*)"
+QUOTED = re.compile(r"""'[^']*'|"[^"$`\\]*\"""")
+SHELL = re.compile(r"""[][$`*?~!|&;<>(){}"'\\]""")
+NEAR = (
+    'name = "near"\nbounds_enu_m = [-10.0, -10.0, 0.0, 20.0, 10.0, 20.0]\n'
+    "start_enu_m = [0.0, 0.0, 0.0]\ngoal_enu_m = [10.0, 0.0, 5.0]\n"
+    "[[box]]\nmin_enu_m = [4.0, 6.0, 0.0]\nmax_enu_m = [5.0, 7.0, 2.0]\n"
+)
 LONGEST_S = 900.0
 WIDEST = 100  # characters; docs/static/tables.css has room for them in a window of 1280 pixels
 
@@ -37,6 +47,15 @@ class Block:
     def is_run(self):
         return self.language != "text" and "not run" not in self.notes
 
+    @property
+    def words(self):
+        """The words that commands get, by the beginning of the command."""
+        with_words = {note: text for note, text in self.notes.items() if note.endswith(" with")}
+        return {
+            "" if note == "run with" else note.removesuffix("with"): text
+            for note, text in with_words.items()
+        }
+
 
 def blocks(page):
     """The blocks of a page, without those that sphinx runs."""
@@ -52,10 +71,11 @@ def blocks(page):
 
 
 class Session:
-    """A reader who does what a page says, in a folder."""
+    """A reader who does what a page says, in a folder. `mavfi` runs a command in this process."""
 
-    def __init__(self, folder):
-        self.folder = folder
+    def __init__(self, folder, mavfi):
+        self.folder, self._mavfi = folder, mavfi
+        (folder / ".near.toml").write_text(NEAR)
         self.names = {"__name__": "__main__"}
         installed = folder / "installed"
         self.environment = os.environ | {
@@ -66,6 +86,7 @@ class Session:
             "PIP_NO_DEPS": "1",
             "PIP_NO_BUILD_ISOLATION": "0",  # pip reads this as: without isolation
         }
+        self._installed = installed
 
     def run(self, block):
         if "file" in block.notes:
@@ -90,19 +111,36 @@ class Session:
         """A command is expected to fail if it shows an error."""
         for command, shown in commands(block.text):
             told = self._bash(command, block, fails=any(each.startswith("error") for each in shown))
-            missing = [] if "run with" in block.notes else [x for x in shown if x not in told]
+            missing = [] if block.words else [line for line in shown if line not in told]
             assert missing == [], (block.place, command, told)
 
     def _bash(self, script, block, *, fails=False):
         """Run a script; the lines that it prints, without white space around them."""
-        words = block.notes.get("run with", "")
-        done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", COMMAND.sub(rf"\1 {words} ", script)],
-            cwd=self.folder, env=self.environment, check=False, timeout=LONGEST_S,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, text=True,
-        )  # fmt: skip
-        assert (done.returncode != 0) == fails, (block.place, script, done.stdout)
-        return {line.strip() for line in done.stdout.splitlines()}
+        longer = script
+        for begin, words in block.words.items():
+            longer = re.sub(COMMAND.format(begin), rf"\1 {words} ", longer)
+        code, told = self._run(longer)
+        assert (code != 0) == fails, (block.place, script, told)
+        return {line.strip() for line in told.splitlines()}
+
+    def _run(self, script):
+        """Run a script; its exit code and what it prints."""
+        lines = None if self._installed.exists() else mavfi_lines(script)
+        if lines is None:
+            done = subprocess.run(
+                ["bash", "-euo", "pipefail", "-c", script],
+                cwd=self.folder, env=self.environment, check=False, timeout=LONGEST_S,
+                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                text=True,
+            )  # fmt: skip
+            return done.returncode, done.stdout
+        code, told = 0, ""
+        for words in lines:
+            if code == 0:
+                with mock.patch.dict(os.environ, self.environment):
+                    done = self._mavfi(*words, cwd=self.folder)
+                code, told = done.returncode, told + done.stdout + done.stderr
+        return code, told
 
 
 def commands(text):
@@ -111,6 +149,17 @@ def commands(text):
         command, shown = re.fullmatch(r"((?:.*\\\n)*.*\n)((?s:.*))", part).groups()
         lines = {line.strip() for line in shown.splitlines()} - {"", "..."}
         yield command, sorted(lines)
+
+
+def mavfi_lines(script):
+    """The arguments of each command of a script; None if one is not mavfi's or needs a shell."""
+    lines = []
+    for line in script.replace("\\\n", " ").splitlines():
+        bare = QUOTED.sub("", line.partition(" #")[0])
+        if (bare and not bare.startswith("mavfi ")) or SHELL.search(bare):
+            return None
+        lines += [shlex.split(line, comments=True)[1:]] if bare else []
+    return lines
 
 
 def sessions():
@@ -143,14 +192,34 @@ def test_no_line_of_a_block_scrolls():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", sessions())
-def test_the_blocks_of_a_page_run(run, tmp_path):
-    session = Session(tmp_path)
+def test_the_blocks_of_a_page_run(run, tmp_path, mavfi):
+    session = Session(tmp_path, mavfi)
     for block in run:
         session.run(block)
 
 
 @pytest.mark.parametrize("text", ["$ echo one\ntwo\n", "$ false\n", "$ true\nerror: none\n"])
-def test_a_page_that_is_wrong_is_found(text, tmp_path):
+def test_a_page_that_is_wrong_is_found(text, tmp_path, mavfi):
     block = Block(place="here", language="console", text=text, notes={})
     with pytest.raises(AssertionError, match="here"):
-        Session(tmp_path).run(block)
+        Session(tmp_path, mavfi).run(block)
+
+
+@pytest.mark.parametrize(
+    "text", ["$ mavfi stacks\nnobody\n", "$ mavfi no\n", "$ mavfi stacks\nerror: none\n"]
+)
+def test_a_command_in_this_process_that_is_wrong_is_found(text, tmp_path, mavfi):
+    test_a_page_that_is_wrong_is_found(text, tmp_path, mavfi)
+
+
+@pytest.mark.parametrize(
+    ("script", "lines"),
+    [
+        ("mavfi a --b 'c d'  # what? (this)\nmavfi e \\\n  f\n", [["a", "--b", "c d"], ["e", "f"]]),
+        ("mavfi a\ncat b\n", None),
+        ("mavfi a > b\n", None),
+        ("mavfi a $HOME\n", None),
+    ],
+)
+def test_only_plain_commands_of_mavfi_run_without_a_shell(script, lines):
+    assert mavfi_lines(script) == lines
