@@ -178,6 +178,17 @@ def test_every_block_runs_or_says_why_not(page):
     assert wrong == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_words_for_a_command_find_it(page):
+    unused = [
+        (block.place, begin)
+        for block in blocks(page)
+        for begin in block.words
+        if f"mavfi {begin}" not in block.text
+    ]
+    assert unused == []
+
+
 def test_no_line_of_a_block_scrolls():
     pages = [page for page in PAGES if ROOT / "docs" in page.parents]
     wide = [
