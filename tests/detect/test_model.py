@@ -13,7 +13,7 @@ from mavfi_cli.detect.gaussian import GaussianDetector
 from mavfi_cli.detect.preprocess import PreprocessParams
 
 OURS = ["gad", "aad", "range", "l2"]
-STACKS = ["hardened", "mavbench"]
+STACKS = ["hardened", "mavbench", "mavbench-replica"]
 
 
 @pytest.fixture
