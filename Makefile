@@ -10,17 +10,21 @@ SPHINX  := PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -q -W --keep-goin
 # Each of the thousand processes of the tests would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test test-all docs man install install-dev lint clean
+.PHONY: fly test test-all checked docs man install install-dev lint compiled clean
 
 fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
 
-test: install-dev lint
+test: checked
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 	@echo "Left out: tests marked slow. 'make test-all' runs them too, and so does CI."
 
-test-all: install-dev lint
+test-all: checked
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+# Types are checked on one core while the kernels are compiled on the other.
+checked: install-dev
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint compiled
 
 docs: install-dev
 	$(SPHINX) -b html docs build/docs
@@ -34,6 +38,9 @@ lint: install-dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+compiled: install-dev
+	$(BIN)/python -c "from mavfi_cli.autonomy.warm import warm_up; warm_up()"
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev

@@ -84,7 +84,7 @@ def test_what_is_installed_flies_from_an_empty_folder(source, start_sitl, tmp_pa
         assert json.loads(flown.splitlines()[-1]) == {"unused": [], "late": []}
         assert {*cache.rglob("*.nbc")} > compiled
         compiled = {*cache.rglob("*.nbc")}
-    flight = (*mavfi, "fly", "--world", "farm", "--detector", "aad", "--platform", "tx2")
+    flight = (*mavfi, *SHORT_LINE, "--detector", "aad", "--platform", "tx2")
     assert "SUCCESS" in run(*flight, cwd=empty, **path)
     for line in (("stacks",), ("world", "list"), ("campaign", "plan", "fig9"), ("vpm",)):
         run(*mavfi, *line, cwd=empty, **path)

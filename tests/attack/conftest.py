@@ -34,15 +34,24 @@ def kernel_inputs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def attack(tracing, kernel_inputs):
-    """Function that runs a campaign on those inputs."""
-    (first, *_), sha256 = load_inputs(kernel_inputs)
+def two_inputs(tmp_path_factory, kernel_inputs) -> Path:
+    """A file of two of the kernel inputs: it takes seconds to profile a long kernel on an input."""
+    path = tmp_path_factory.mktemp("two") / "inputs.npz"
+    save_inputs(path, load_inputs(kernel_inputs)[0][2:4])
+    return path
 
-    def run(*kernels, runs=10, jobs=1, folder=None, seed=5, tolerance=0.0, **changes):
+
+@pytest.fixture(scope="session")
+def attack(tracing, kernel_inputs):
+    """Function that runs a campaign on those inputs, or on those of another file."""
+
+    def run(*kernels, runs=10, jobs=1, folder=None, seed=5, tolerance=0.0, inputs=kernel_inputs,
+            **changes):  # fmt: skip
         plan = Plan(runs=runs, seed=seed, **changes)
+        (first, *_), sha256 = load_inputs(inputs)
         targets = [
             KernelTarget(
-                kernel=kernel, inputs=kernel_inputs, inputs_sha256=sha256, flight=first.flight,
+                kernel=kernel, inputs=inputs, inputs_sha256=sha256, flight=first.flight,
                 tolerance=tolerance,
             )
             for kernel in kernels

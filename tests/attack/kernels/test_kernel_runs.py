@@ -31,12 +31,11 @@ def untimed(runs):
 
 
 @pytest.mark.slow
-def test_the_number_of_workers_changes_nothing(attack, control_campaign):
-    _, (control,) = control_campaign
-    _, (cloud,) = attack("point_cloud", runs=12)
-    _, together = attack("control", "point_cloud", runs=12, jobs=2)
-    for alone, two in zip((control, cloud), together, strict=True):
-        assert untimed(two) == untimed(alone)[:12]
+def test_the_number_of_workers_changes_nothing(attack, two_inputs):
+    attack_both = partial(attack, "control", "point_cloud", runs=12, inputs=two_inputs)
+    (_, alone), (_, together) = attack_both(), attack_both(jobs=2)
+    for one, two in zip(alone, together, strict=True):
+        assert untimed(two) == untimed(one)
         assert {entry["outcome"] for entry in two.records} <= OUTCOMES
         assert any(entry["injection"]["applied"] for entry in two.records)
 
@@ -104,11 +103,12 @@ def test_what_was_measured_is_never_left_out(attack, control_copy, kernels, runs
 
 
 @pytest.mark.slow
-def test_more_runs_and_kernels_go_on_from_fewer(attack, control_campaign, control_copy):
-    _, (first,) = control_campaign
-    _, (control, cloud) = attack("control", "point_cloud", runs=31, folder=control_copy)
-    assert list(control.records[:30]) == list(first.records)
-    assert (len(control.records), len(cloud.records)) == (31, 31)
+def test_more_runs_and_kernels_go_on_from_fewer(attack, two_inputs, tmp_path):
+    attack_some = partial(attack, folder=tmp_path, inputs=two_inputs)
+    _, (first,) = attack_some("control", runs=10)
+    _, (control, cloud) = attack_some("control", "point_cloud", runs=11)
+    assert list(control.records[:10]) == list(first.records)
+    assert (len(control.records), len(cloud.records)) == (11, 11)
 
 
 @pytest.mark.slow
@@ -156,8 +156,8 @@ def test_null_injections_are_benign(attack):
     assert {entry["injection"]["applied"] for entry in runs.records} == {False}
 
 
-def test_time_rules_say_what_they_missed(attack):
-    plan, (runs,) = attack("point_cloud", runs=6, rule="cpu-time")
+def test_time_rules_say_what_they_missed(attack, two_inputs):
+    plan, (runs,) = attack("point_cloud", runs=6, rule="cpu-time", inputs=two_inputs)
     for entry in runs.records:
         assert (entry["outcome"] == "not_injected") == bool(entry["not_injected_reason"])
     (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
@@ -165,17 +165,17 @@ def test_time_rules_say_what_they_missed(attack):
 
 
 @pytest.mark.slow
-def test_the_planner_is_attacked_in_its_own_library(attack):
-    _, (runs,) = attack("rrtconnect", runs=10)
+def test_the_planner_is_attacked_in_its_own_library(attack, two_inputs):
+    _, (runs,) = attack("rrtconnect", runs=10, inputs=two_inputs)
     assert {entry["object"] for entry in runs.records} <= {"libompl.so", "numba:segment_free"}
     assert all(each.complete for each in runs.profiles)
 
 
 @pytest.mark.slow
-def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, monkeypatch, tmp_path):
+def test_a_long_kernel_is_attacked_in_sampled_windows(attack, two_inputs, monkeypatch, tmp_path):
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
-    (tmp_path / "inputs.npz").write_bytes(kernel_inputs.read_bytes())
-    plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path)
+    (tmp_path / "inputs.npz").write_bytes(two_inputs.read_bytes())
+    plan, (runs,) = attack("collision_check", runs=8, windows=3, folder=tmp_path, inputs=two_inputs)
     (kernel,) = summarise(plan, [runs]).as_dict()["kernels"]
     for number, profile in enumerate(runs.profiles):
         start, pilot, windows = profile.strata
@@ -193,11 +193,11 @@ def test_a_long_kernel_is_attacked_in_sampled_windows(attack, kernel_inputs, mon
 
 @pytest.mark.slow
 def test_the_writing_of_the_tree_is_not_attacked_but_the_whole_tree_is_compared(
-    attack, monkeypatch
+    attack, two_inputs, monkeypatch
 ):
     monkeypatch.setattr(kernel_target, "profile_run", partial(profile_run, enough=0))
-    plan, (runs,) = attack("octomap", runs=15, windows=3)
-    profile = runs.profiles[2]
+    plan, (runs,) = attack("octomap", runs=15, windows=3, inputs=two_inputs)
+    profile = runs.profiles[0]
     addresses = {
         int(address)
         for stratum in profile.strata
