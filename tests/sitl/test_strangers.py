@@ -151,12 +151,13 @@ def test_the_companion_signs_for_the_server(tmp_path, mavfi):
     port = free_port(socket.SOCK_DGRAM)
     (tmp_path / "other").write_text("another passphrase")
     link = ["--link", f"udpin:127.0.0.1:{port}"]
-    with running_server("--link", f"onboard=udpout:127.0.0.1:{port}", signed=True) as server:
+    vehicle = ("--link", f"onboard=udpout:127.0.0.1:{port}", "--speed", "2")
+    with running_server(*vehicle, signed=True) as server:
         east_m, north_m, _ = load_world("farm", seed=3).start_enu_m
         flight = [
             "fly",
             "--goal",
-            f"{east_m},{north_m + 12},5",
+            f"{east_m},{north_m + 9},5",
             *link,
             "--out",
             str(tmp_path),
