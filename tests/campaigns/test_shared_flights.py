@@ -102,7 +102,7 @@ def test_a_forked_mission_is_that_flown_alone(missions, flown_alone, tmp_path):
 
 STRUCK = {  # node and seed, of each stack, by the effect on the node
     "hardened": [
-        ("octomap", 1),  # masked
+        *(("octomap", 1), ("collision_check", 1)),  # masked
         ("planner", 3),  # changed
         *(("octomap", 2), ("control", 3)),  # ended
     ],
@@ -119,7 +119,7 @@ def test_a_node_struck_in_a_rehearsal_flies_as_if_struck_in_flight(short_config,
     null = InstructionConfig(target="point_cloud", null=True)
     cases = [(base, faults)]
     if stack == "hardened":
-        cases += [(guarded, faults[1:3]), (quick, faults[-1:])]
+        cases += [(guarded, faults[2:]), (quick, faults[-1:])]
     configs = [
         *(unharmed for unharmed, _ in cases),
         replace(guarded, instruction=null),
