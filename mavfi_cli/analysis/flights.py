@@ -206,7 +206,7 @@ def exported(ledger: Ledger) -> pa.Table:
 
 
 def read_export(path: Path) -> pa.Table:
-    """Read a file of `exported`. Files of earlier versions get the column types of this one.
+    """Read an exported campaign. Columns of earlier versions are converted to the current types.
 
     Raises:
         RecordError: the file is missing or damaged.

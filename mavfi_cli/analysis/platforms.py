@@ -1,11 +1,12 @@
 """The numbers of a comparison: settings, ratios between platforms, and costs of faults.
 
-Flight time, distance, energy and replans cover successful flights, response times all counted
-flights. A faulty flight is counted if its fault struck a value that was read or caught.
+Flight time, distance, energy and replans are computed over the counted flights that succeeded.
+Response times are computed over all counted flights. A faulty flight counts if its fault struck,
+unless the struck value expired before anything read it. A value that a detector withheld counts.
 
 The cost of a fault (Fig. 16 of the paper) is the flight time divided by that of the golden flight
-of the same mission on the same platform, if both reached the goal. It extends the measure of the
-paper, which flies one fixed world, to several worlds. The ratio of the longest flight to the mean
+of the same mission on the same platform, if both reached the goal. The paper measures this in one
+fixed world; here it covers several. The ratio of the longest flight to the mean
 golden flight is also given. It depends on the length of the mission.
 """
 

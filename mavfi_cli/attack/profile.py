@@ -1,4 +1,4 @@
-"""Profiles the instructions that a target executes in one run: all of them, or a stated sample.
+"""Profiles the instructions that a target executes in one run: all of them, or a sample of them.
 
 A run that is not too long is stepped completely. A longer one is cut into windows that together
 make up the whole run. Each execution of a *marker*, such as a function's entry, begins a window.
@@ -7,12 +7,13 @@ marker is a window too. The windows of one marker are a stratum. Windows of each
 with equal probability and stepped, so all executed instructions of a stratum are equally likely to
 be in the sample.
 
-A few windows are stepped first: the *pilot*. Its lengths determine how many of the other windows
-are stepped: as many as fit into `ENOUGH` instructions. A sample whose size depends on its own
-lengths would be biased, so the pilot is a complete stratum of its own, and only the other windows
-estimate the rest. They are drawn at equal spacing from a random start. A stratum is drawn in
-proportion to its windows times their mean length, and an instruction uniformly from its stepped
-windows.
+A few windows, the *pilot*, are stepped first. Their lengths determine how many of the other windows
+are stepped: as many as fit into `ENOUGH` instructions, but at least a given number. A sample whose
+size depends on its own lengths would be biased, so the pilot is a complete stratum of its own, and
+only the other windows estimate the rest. Those are chosen at equal spacing from a random start.
+
+To draw a fault, a stratum is drawn with a probability proportional to its number of windows times
+their mean length. An instruction is then drawn uniformly from the stepped windows of the stratum.
 """
 
 from __future__ import annotations

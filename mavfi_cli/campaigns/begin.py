@@ -266,15 +266,15 @@ def begin(
     options: Options | None = None,
     spectator: Spectator | None = None,
 ) -> Ledger:
-    """Open the folder of a campaign for flying, and store its list.
+    """Open a campaign's folder for writing, and store its list of missions.
 
     Args:
-        options, spectator: for the flights that search for fixed worlds, if any.
+        options, spectator: used by the flights that search for fixed worlds, if there are any.
 
     Raises:
         ConfigError: the folder holds another campaign, or `missing_only` is set and it holds none.
-        MavfiError: a world, vehicle, planner or other choice makes missions impossible; or no
-            world fits the rule of fixed worlds.
+        MavfiError: the missions cannot be flown with the chosen world, vehicle, planner or other
+            setting, or no world seed satisfies the rule in [fixed_world].
     """
     begun = (folder / LEDGER).is_file()
     if append and spec.sampling is Sampling.STRATIFIED:
@@ -464,9 +464,11 @@ def _search(
             if rule.fits(flown[-1]):
                 return flown[:seed]
     often = sorted(itertools.chain.from_iterable(flown))
-    seen = f"; they replan {often[0]} to {often[-1]} times" if often else ""
+    seen = f"; the flights replanned {often[0]} to {often[-1]} times" if often else ""
+    least, most = rule.replans
     raise ConfigError(
-        f"no world seed of {config.world} up to {rule.candidates} is {rule.rule()}{seen}; leave "
-        f"the world out of `worlds`, or name its seed in [fixed_world.world_seed]",
+        f"no world seed of {config.world} from 1 to {rule.candidates} gives a median of {least} to "
+        f"{most} replans over {rule.flights} golden flights{seen}; leave the world out of "
+        "`worlds`, or name its seed in [fixed_world.world_seed]",
         key="fixed_world",
     )

@@ -147,7 +147,10 @@ class FixedWorld:
                 raise ValueError(f"world_seed.{world}: must be at least 0, got {seed}")
 
     def rules(self, world: str) -> bool:
-        """Return True if the rule covers this world; a user's own boxes are fixed already."""
+        """Return True if the rule covers this world.
+
+        A user's world file is covered only if it is named, because its boxes are already fixed.
+        """
         named = world in self.worlds or world in self.world_seed
         return named or (not self.worlds and not world.endswith(".toml"))
 
@@ -428,10 +431,10 @@ class Spec:
         return toml_text({**plain, **tables})
 
     def sampled(self, sampling: Sampling) -> Spec:
-        """Return the same campaign with another sampling of faults, which its name includes.
+        """Return the same campaign with another sampling method, which is appended to its name.
 
         Raises:
-            ConfigError: its faults cannot be drawn so.
+            ConfigError: the campaign cannot use this sampling method.
         """
         if sampling is self.sampling:
             return self

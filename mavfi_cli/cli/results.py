@@ -17,7 +17,7 @@ def save(
     out: Path, contents: Mapping[str, object], tables: Mapping[str, str],
     pictures: Mapping[str, Figure],
 ) -> list[str]:  # fmt: skip
-    """Write JSON files, CSV files and pictures by their names, and return the names.
+    """Write JSON files, CSV files and pictures under the given names, and return the names.
 
     Raises:
         RecordError: a file cannot be written.

@@ -9,13 +9,13 @@ A turn uses the outputs. It is a coroutine that awaits one node after the other:
 `cloud = await point_cloud.run(frame)` continues when the cloud takes effect, and never if its input
 was replaced or lost.
 
-Nodes that share a process run one after the other in the listed order, each with its newest input.
-They end together, and all their waiting inputs are lost.
+Nodes that share a process run one after another in the listed order, each with its newest input.
+If one of them fails, the whole process ends, and the waiting inputs of the other nodes are lost.
 
-A node in its own process may die from a signal or from an error in its kernel. Its present input is
-lost. It restarts with fresh state one restart time after its output was due. A node that hangs
-stays busy until the watchdog kills it. Both depend only on how the process ended, never on when the
-host noticed it, so they are repeatable.
+A node in its own process may die from a signal or from an error in its kernel. Its current input is
+then lost, and the node restarts with fresh state one restart time after its output was due. A node
+that hangs stays busy until the watchdog kills it. The times of these events depend only on how the
+process ended, never on when the host noticed it, so they are repeatable.
 """
 
 from __future__ import annotations

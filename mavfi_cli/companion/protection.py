@@ -50,7 +50,7 @@ class Response(Enum):
 
 @dataclass(slots=True)
 class _Outage:
-    """Number and duration of the phases in which a stage had no accepted message."""
+    """Number and total duration of the periods in which no message of a stage was accepted."""
 
     count: int = 0
     total_s: float = 0.0

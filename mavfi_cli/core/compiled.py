@@ -81,7 +81,7 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 
 def _recover(cache: Any) -> None:
-    """Make numba recompile damaged entries of its cache, whose errors it would raise."""
+    """Make numba recompile damaged cache entries instead of raising their errors."""
     load = cache.load_overload
 
     def load_overload(*arguments: Any) -> Any:

@@ -467,7 +467,7 @@ class Dataset:
             key.decode(errors="replace"): text.decode(errors="replace") for key, text in pairs
         }
         if "mavfi_samples" not in metadata:
-            raise ModelError("is not a data set of mavfi", path=path)
+            raise ModelError("not a mavfi data set", path=path)
         if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
             raise ModelError(
                 "was made for another version, table of states or preprocessing; fly it again",

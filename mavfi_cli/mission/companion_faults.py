@@ -37,7 +37,7 @@ class LinkInjector(Injector):
         signing: Key with which a struck frame is signed again.
 
     Attributes:
-        units: Unit of each struck field by name; the message itself has none.
+        units: Unit of each struck field by its name; of a whole message, its name with no unit.
         side: Sender of the struck messages; None before the first strike.
     """
 

@@ -298,7 +298,7 @@ class _LostFlight(_FurtherFlight):
         return next(iter(self._left.values()))
 
     def _lose(self, node: str, order: int) -> None:
-        """Lose the node over this order."""
+        """Lose the node in this invocation if the first fault ended it there."""
         if (self._first.node, self._first.order) == (node, order):
             self.flight.lose_nodes_as(next(iter(self._branches.values()))[0])
             self.flight.isolate_late(node, self._first.process)
@@ -310,7 +310,7 @@ class _LostFlight(_FurtherFlight):
         return news
 
     def end(self) -> tuple[MissionConfig, RunFolder]:
-        """See `SharedFlight`. In each fork, the logged strike is that of its own fault."""
+        """See `SharedFlight`. Each fork logs the strike of its own fault."""
         assert self.flight.companion is not None
         executor = self.flight.companion.executor
         executor.settle()  # the forks cannot share the processes of its nodes
@@ -332,7 +332,7 @@ class _LostFlight(_FurtherFlight):
 
 
 class _Starts(Recorder):
-    """Counts the orders of each node, and reports them."""
+    """Counts the invocations of each node, and reports each one by its number when it starts."""
 
     def __init__(self, report: Callable[[str, int], None]) -> None:
         super().__init__()

@@ -244,7 +244,7 @@ def _counted_kinds(
 ) -> frozenset[str]:
     """The planned kinds of missions on which a claim's effect depends.
 
-    A kind counts if the effect changes without its flights.
+    A kind is included if leaving out its flights changes the effect.
     """
     kinds = [_kind(changes) for changes in flown["changes"]]
     whole = claim.find(flown, kernels)

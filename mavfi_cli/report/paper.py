@@ -304,7 +304,7 @@ class Strip:
 
     Attributes:
         values: one for each flight, (n,).
-        style: place in PALETTE.
+        style: index into PALETTE.
         paper: the paper's largest value; None if it prints none.
     """
 

@@ -278,7 +278,9 @@ def _require_startable(name: str, program: ProgramConfig) -> None:
     place = str(Path(program.folder) / word) if "/" in word else word
     path = program.environment.get("PATH", os.environ.get("PATH"))
     if (binary := shutil.which(place, path=path)) is None:
-        raise ConfigError(f"no program {word!r} that can be executed", key=f"program.{name}")
+        raise ConfigError(
+            f"program {word!r} was not found or is not executable", key=f"program.{name}"
+        )
     if os.stat(binary).st_mode & (stat.S_ISUID | stat.S_ISGID):
         problem = f"{word} is set-uid or set-gid, so mavfi could neither end nor attack it"
         raise ConfigError(problem, key=f"program.{name}")

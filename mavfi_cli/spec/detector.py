@@ -123,10 +123,15 @@ class DetectorConfig:
         if made_for is not None and not self.any_stack:
             flown = load_stack(stack).mark
             if made_for.digest != flown.digest:
-                was = " as it was" if made_for.name == flown.name else ""
+                same = made_for.name == flown.name
+                of = (
+                    f"another version of the stack {stack!r}"
+                    if same
+                    else (f"the stack {made_for.name!r}, not for {stack!r}")
+                )
                 raise ModelError(
-                    f"{self.name}: made for the stack {made_for.name + was!r}, not for {stack!r}; "
-                    f"fit one with mavfi train --stack {shlex.quote(stack)}, or allow it with "
+                    f"{self.name}: this model was fitted for {of}; fit a new one with "
+                    f"mavfi train --stack {shlex.quote(stack)}, or allow this one with "
                     "--any-stack-model (any_stack in a campaign)",
                     path=path,
                 )
@@ -177,6 +182,7 @@ class DetectorConfig:
         ranges = detector.extended if isinstance(detector, FittedDetector) else None
         if ranges is None:
             raise ConfigError(
-                f"{EXTENDED} needs the ranges of a model, and {self.name} has none", key="watch"
+                f"{EXTENDED} needs the state ranges of a fitted model, but {self.name} has none",
+                key="watch",
             )
         return ranges

@@ -29,9 +29,9 @@ _LEAST_MARGIN = 1e-6  # narrower intervals have no effective number
 
 
 def spread(hits: int, missions: int) -> float:
-    """Standard deviation of one mission's hit in a stratum, with half a hit and half a miss added.
+    """Return the standard deviation of one mission's outcome (hit 1, miss 0) in a stratum.
 
-    So a stratum without hits, or without missions, still has a spread.
+    Half a hit and half a miss are added, so the result is positive even without hits or missions.
     """
     share = (hits + 0.5) / (missions + 1.0)
     return math.sqrt(share * (1.0 - share))

@@ -176,7 +176,7 @@ class EvaluationPlan:
         )
 
     def places(self) -> list[_Site]:
-        """Stages by bit field at source level, nodes at instruction level."""
+        """Return where faults strike: nodes at instruction level, else a stage and a bit field."""
         if self.level == INSTRUCTION:
             return [_Site(stage.value, node, Field.ANY.value) for node, stage in _NODES.items()]
         return [

@@ -79,7 +79,7 @@ def _whole(value: float) -> int | None:
 
 
 def _horizontal(autopilot: Autopilot, message: Any) -> tuple[float, float] | None:
-    """Return north and east of a command's place, m; None if it has none."""
+    """Return the local north and east of a command's position, m; None if it gives no position."""
     if message.get_type() == "COMMAND_LONG":
         latitude, longitude = message.param5, message.param6
     elif _INT_UNSET in (message.x, message.y):

@@ -60,7 +60,7 @@ def test_what_is_no_data_set_is_refused(tmp_path):
     with pytest.raises(RecordError, match="cannot be read"):
         Dataset.load(path)
     pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(ModelError, match="not a data set"):
+    with pytest.raises(ModelError, match="not a mavfi data set"):
         Dataset.load(path)
     dataset(params=PreprocessParams(yaw_floor=-5)).save(path)
     with pytest.raises(ModelError, match="preprocessing"):

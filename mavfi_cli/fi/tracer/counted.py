@@ -164,7 +164,7 @@ def _flow(code: bytes, address: int) -> _Flow | None:
 
 
 def _rcx(opcode: bytes, place: int, at: int) -> bytes:
-    """Load rcx from memory or store it there, by an instruction at `at`."""
+    """Return the instruction that, placed at `at`, loads or stores rcx at address `place`."""
     return b"\x48" + opcode + b"\x0d" + struct.pack("<i", place - at - 7)
 
 

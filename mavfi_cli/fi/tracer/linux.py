@@ -269,5 +269,5 @@ class ProcessTimer:
             self.fired = False  # the process has ended
 
     def _left_s(self) -> float:
-        """Lower bound of the remaining time; CPU time is not faster than wall-clock time."""
+        """Return a lower bound on the remaining time. CPU time is never faster than the clock."""
         return min(end_s - clock() for clock, end_s in self._ends)

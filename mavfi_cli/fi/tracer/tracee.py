@@ -601,7 +601,7 @@ class Tracee:
         return False
 
     def _continue(self, status: linux.Status, how: int) -> None:
-        """Resume a thread from a passing stop; signals are delivered."""
+        """Resume a thread from a stop that no caller awaits, and deliver its signal, if any."""
         if status.event == linux.EVENT_STOP and status.signal != signal.SIGTRAP:
             how, number = linux.LISTEN, 0  # group-stop: stay stopped until SIGCONT
         else:

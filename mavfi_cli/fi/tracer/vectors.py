@@ -1,9 +1,10 @@
 """Bits of explicit operands that vector instructions read and write (Intel SDM volume 2).
 
-Capstone's access flags are wrong for many VEX and EVEX forms and do not distinguish elements. So
-the first operand is the destination and the others are sources, and the tables below give the bits
-that are used: the lowest element of scalar instructions, the elements that a shuffle moves, the
-half that a conversion reads. A bit that only keeps its value is neither read nor written.
+Capstone's access flags are wrong for many VEX and EVEX forms and do not distinguish elements. As a
+rule, this module therefore treats the first operand as the destination and the others as sources.
+The tables below give the bits that are used: the lowest element of scalar instructions, the
+elements that a shuffle moves, the half that a conversion reads. A bit that only keeps its value is
+neither read nor written.
 """
 
 from __future__ import annotations

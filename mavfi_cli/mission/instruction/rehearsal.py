@@ -281,7 +281,10 @@ class Rehearsal:
             runs = (_run_to_answer(reached(unneeded)[0]) for _ in range(2))
             unstruck = [fork for fork in runs if isinstance(fork, StoppedFork)]
             if len(unstruck) < 2:
-                raise TargetError(f"node {self._node}", "does not answer again")
+                raise TargetError(
+                    f"node {self._node}",
+                    "gives no answer when the same invocation is repeated without the fault",
+                )
             if remembers_the_same(struck, unstruck):
                 return Struck(record=done, effect=NodeEffect.MASKED)
             process = self._let_go(tracee)
