@@ -21,6 +21,7 @@ from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
 
 LEVELS = {"source": "states", "instruction": "instructions"}
+_DECIDED = 0.25  # least share of the claims that an answer needs, and not fewer than are undecided
 _COMPUTER = "x86"  # of what protects; the table of balances has all computers
 _KINDS = {  # of faults: level, and what they do to their nodes
     "a wrong value in a state": ("source", Fate.ALL),
@@ -81,8 +82,10 @@ def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
     )
     if not yes + no + open_:
         return "Nothing here decides a claim of the paper."
-    begin = "Only in part" if yes and no else "Yes" if yes else "No" if no else "Not known yet"
+    begin = "Only in part" if yes and no else "Yes" if yes else "No"
     begin += ", as far as it is decided" if open_ and bool(yes) is not bool(no) else ""
+    if yes + no < max(open_, _DECIDED * len(claims)):
+        begin = "Not known yet"
     return (
         f"{begin}: of the {yes + no + open_} claims that are judged, {yes} {_are(yes)} reproduced, "
         f"{no} {_are(no)} contradicted, and {open_} {_are(open_)} undecided at this number of "

@@ -429,7 +429,7 @@ def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> 
     """Describe a mission; its command names an export by the given path if that is relative."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
-    kept = _is_kept(flight["path"])
+    kept = source.is_dir() and _is_kept(flight["path"])  # an export is not asked where it flew
     place = source.name if source.suffix and source.is_absolute() else str(source)
     run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
     return _ListedMission(
@@ -510,7 +510,8 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
     """The item's flights in the first campaign that has kept the run folders of all of them."""
-    several = (Flights.pooled([source.flights], stack) for source in evidence.campaigns)
+    folders = [source for source in evidence.campaigns if source.path.is_dir()]
+    several = (Flights.pooled([source.flights], stack) for source in folders)
     own = (of_kind(item, stack, flights) for flights in several)
     return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)
 

@@ -185,11 +185,19 @@ def _from_export(path: Path) -> CampaignSource:
     return _campaign(path, spec, table, origin, name=path.stem, digest=digest)
 
 
+_ORIGIN = {"planned": int | None, "versions": Mapping, "host": Mapping}
+
+
 def _campaign(
     path: Path, spec: Spec | None, table: pa.Table, origin: Mapping[str, Any], **more: Any
 ) -> CampaignSource:
     errors = table["state"].to_pylist().count(ResultState.ERROR.value)
-    known = {name: origin[name] for name in ("planned", "versions", "host") if name in origin}
+    known = {name: origin[name] for name in _ORIGIN if name in origin}
+    for name, value in known.items():
+        parts = value.values() if isinstance(value, Mapping) else ()
+        nested = any(isinstance(part, (Mapping, list)) for part in parts)
+        if nested or not isinstance(value, _ORIGIN[name]):
+            raise RecordError(f"{path}: {name!r} of its provenance is damaged")
     more["settling"] = Settling.of(origin.get(SETTLING))
     more |= {"flights": Flights.of(table), "errors": errors}
     return CampaignSource(path=path, spec=spec, **known, **more)
@@ -214,10 +222,10 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
         if source.planned is not None and over < source.planned:
             rest = f"{source.again or 'The command that began it'} flies the rest."
             rest = "An export holds no list." if source.digest else rest
-            yield f"{source.path}: {over:,} of {source.planned:,} missions have flown. {rest}"
+            yield f"{source.path.name}: {over:,} of {source.planned:,} missions have flown. {rest}"
         if source.errors:
             errors = f"{source.errors:,} missions could not begin"
-            yield f"{source.path}: {errors}; they are not counted."
+            yield f"{source.path.name}: {errors}; they are not counted."
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
@@ -244,19 +252,20 @@ def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 
 
 def _repeated(kernels: Sequence[KernelSummary]) -> Iterator[str]:
-    first: dict[str, Path] = {}
+    first: dict[str, str] = {}
     for source in kernels:
+        place = str(Path(*source.path.parts[-2:]))
         for name in (kernel.name for kernel in source.kernels):
             if name in first:
-                yield f"{first[name]} and {source.path} both have {name}; the latter counts."
-            first[name] = source.path
+                yield f"{first[name]} and {place} both have {name}; the latter counts."
+            first[name] = place
 
 
 def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     versioned = [source for source in campaigns if source.versions]
     for source in versioned[1:]:
         if differences := version_differences(versioned[0].versions, source.versions):
-            builds = f"{source.path} and {versioned[0].path} were flown by other builds"
+            builds = f"{source.path.name} and {versioned[0].path.name} were flown by other builds"
             yield f"{builds}: {', '.join(differences)}."
     unnamed = [
         source.path.name for source in campaigns if not source.versions and len(source.flights)
@@ -269,6 +278,6 @@ def _mixed(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
     here = installed_versions()
     if versioned and (differences := version_differences(versioned[0].versions, here)):
         yield (
-            f"{versioned[0].path} was flown by another build than this one, so its missions may "
-            f"not repeat here: {', '.join(differences)}."
+            f"{versioned[0].path.name} was flown by another build than this one, so its missions "
+            f"may not repeat here: {', '.join(differences)}."
         )

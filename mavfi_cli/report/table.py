@@ -1,4 +1,8 @@
-"""A table as text, Markdown, LaTeX, CSV or HTML, and formats for the numbers in its cells."""
+"""A table as text, Markdown, LaTeX, CSV or HTML, and formats for the numbers in its cells.
+
+The text is not made by rich, which folds or cuts the cells of a table that is too wide. Here the
+columns continue in a further table that repeats the labels, so a file can be searched line by line.
+"""
 
 from __future__ import annotations
 

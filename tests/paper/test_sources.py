@@ -95,6 +95,17 @@ def test_campaigns_of_several_builds_are_told(campaign, tmp_path):
     assert "is 1.0" in problem
 
 
+@pytest.mark.parametrize("damaged", ['{"numpy": [{"a": 1}]}', "[{}, {}]"])
+def test_an_export_with_damaged_builds_is_told_and_the_rest_is_used(campaign, tmp_path, damaged):
+    campaign("whole", 1, 1)
+    with Ledger(campaign("odd", 1, 1), writing=True) as ledger:
+        ledger.set_meta({"versions": damaged})
+    found = Evidence.gather([tmp_path])
+    assert [source.name for source in found.campaigns] == ["whole"]
+    (problem,) = found.problems
+    assert "odd: 'versions' of its provenance is damaged" in problem
+
+
 def test_an_export_that_names_no_build_is_told(tmp_path):
     pq.write_table(export_table([row()]), tmp_path / "merged.parquet")
     (problem,) = Evidence.gather([tmp_path]).problems
