@@ -18,9 +18,14 @@ from enum import Enum
 import numpy as np
 
 from mavfi_cli.autonomy.tracking import TrackingInputs, reference_waypoint, waypoint_index
-from mavfi_cli.core.flight_record import PilotCounters
 from mavfi_cli.core.frames import norm, wrap_angle
-from mavfi_cli.core.types import CollisionReport, FloatArray, Trajectory, VehicleState
+from mavfi_cli.core.types import (
+    CollisionReport,
+    FloatArray,
+    PilotCounters,
+    Trajectory,
+    VehicleState,
+)
 
 
 class PilotMode(Enum):

@@ -57,22 +57,6 @@ class ResponseTime:
     count: int = 0
 
 
-@dataclass(slots=True)
-class PilotCounters:
-    """Counters of the mission logic."""
-
-    plans_requested: int = 0
-    plans_failed: int = 0
-    plans_ignored: int = 0  # stale, late, or out of order
-    plans_rejected: int = 0  # withheld by the detector gate
-    replans: int = 0  # plans adopted after the first
-    collisions_foreseen: int = 0
-    reports_ignored: int = 0  # stale future_collision_seq
-    stops: int = 0
-    slowdowns: int = 0
-    look_rounds: int = 0
-
-
 # Nodes and programs -------------------------------------------------------------------------------
 
 

@@ -262,3 +262,19 @@ STATES: tuple[State, ...] = (
     State("command_yaw", Command, "yaw_rad", "rad", detected=True),
 )  # fmt: skip
 BY_NAME: dict[str, State] = {state.name: state for state in STATES}
+
+
+@dataclass(slots=True)
+class PilotCounters:
+    """Counters of the mission logic."""
+
+    plans_requested: int = 0
+    plans_failed: int = 0
+    plans_ignored: int = 0  # stale, late, or out of order
+    plans_rejected: int = 0  # withheld by the detector gate
+    replans: int = 0  # plans adopted after the first
+    collisions_foreseen: int = 0
+    reports_ignored: int = 0  # stale future_collision_seq
+    stops: int = 0
+    slowdowns: int = 0
+    look_rounds: int = 0

@@ -25,7 +25,6 @@ from mavfi_cli.core.flight_record import (
     MeasuredPlatform,
     MissionInstructionFault,
     NodeEnds,
-    PilotCounters,
     Point,
     ProgramEnds,
     QualityOfFlight,
@@ -38,7 +37,7 @@ from mavfi_cli.core.flight_record import (
     Strike,
 )
 from mavfi_cli.core.frames import norm
-from mavfi_cli.core.types import KERNELS, FloatArray, Outcome, Stage
+from mavfi_cli.core.types import KERNELS, FloatArray, Outcome, PilotCounters, Stage
 from mavfi_cli.fi import bits
 
 QUALITY = tuple(measure.name for measure in fields(QualityOfFlight))
