@@ -267,7 +267,7 @@ class _Against:
             return None
         change = after.minus(before)
         proven = change.high < 0.0 or change.low > 0.0
-        counts = f"harmful {after.counts}, not {before.counts}"
+        counts = f"harmful {after.counts} instead of {before.counts}"
         return cls(
             effect=_effect(before.count + after.count, change.value < 0, proven), counts=counts
         )

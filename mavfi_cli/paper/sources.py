@@ -221,7 +221,7 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
         over = len(source.flights) + source.errors
         if source.planned is not None and over < source.planned:
             rest = f"{source.again or 'The command that began it'} flies the rest."
-            rest = "An export holds no list." if source.digest else rest
+            rest = "An export cannot fly the rest." if source.digest else rest
             yield f"{source.path.name}: {over:,} of {source.planned:,} missions have flown. {rest}"
         if source.errors:
             errors = f"{source.errors:,} missions could not begin"

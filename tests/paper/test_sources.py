@@ -70,7 +70,7 @@ def test_an_export_tells_what_its_campaign_does(campaign, tmp_path):
     there, here = (each.campaigns[0] for each in found)
     assert (here.planned, here.versions, here.host) == (there.planned, there.versions, there.host)
     (problem,) = found[1].problems
-    assert re.search("2 of 5 missions .*no list", problem)
+    assert re.search("2 of 5 missions .*cannot fly the rest", problem)
 
 
 def test_what_has_not_flown_is_told(campaign):
