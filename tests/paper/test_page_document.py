@@ -157,7 +157,7 @@ def test_another_stack_is_compared_in_the_same_scenes():
                          row("planning", seed=seed, config=config, **end)]  # fmt: skip
     (other,) = protections({"mavbench": flights(one), "hardened": flights(two)})
     cell = other.against["a wrong value in a state"]
-    assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10, not 10 of 10")
+    assert (cell.effect, cell.counts) == ("helps", "harmful 0 of 10 instead of 10 of 10")
 
 
 @pytest.mark.parametrize(
