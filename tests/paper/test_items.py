@@ -16,16 +16,16 @@ KINDS = FlightsPlan(items=[FIG13], stack="mavbench").kinds()
 
 
 @pytest.fixture
-def shown(monkeypatch):
+def shown(monkeypatch, tmp_path):
     """What is shown of Fig. 13 on `mavbench`, and the run folders that are drawn."""
     monkeypatch.setattr(document, "ITEMS", [FIG13])
     monkeypatch.setattr(document, "draw", lambda *given: given[1]["path"])
     monkeypatch.setattr(document.Picture, "of", lambda *given: given[2])
 
-    def of(*exports):
+    def of(*exports, path=tmp_path):
         tables = [Flights.of(each) for each in exports]
         campaigns = [
-            CampaignSource(path=Path("some"), name="some", spec=None, planned=None, flights=each)
+            CampaignSource(path=path, name="some", spec=None, planned=None, flights=each)
             for each in tables
         ]
         evidence = Evidence(campaigns=campaigns, kernels=[], problems=[])
@@ -54,6 +54,12 @@ def export(seed, folder=None):
 def test_the_campaign_that_kept_its_runs_is_drawn(shown, tmp_path):
     found = shown(export(1), export(2, tmp_path))
     assert found.picture == [str(tmp_path)] * len(KINDS)
+    assert found.table is not None
+
+
+def test_no_run_folder_is_read_because_an_export_names_it(shown, tmp_path):
+    found = shown(export(2, tmp_path), path=Path("some.parquet"))
+    assert found.picture is None
     assert found.table is not None
 
 
