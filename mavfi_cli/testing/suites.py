@@ -207,7 +207,7 @@ class DetectorContract:
             assert config.build("mavbench").name == name
         else:
             with pytest.raises(
-                ConfigError, match=f"needs the ranges of a model, and {name} has none"
+                ConfigError, match=f"needs the state ranges of a fitted model, but {name} has none"
             ):
                 config.build("mavbench")
 

@@ -101,7 +101,7 @@ def test_a_corridor_around_the_golden_path(fly):
 @pytest.mark.parametrize(
     ("text", "error", "problem"),
     [
-        ("[program.a]\ncommand = 'no-such-program'", ConfigError, "no program 'no-such-program'"),
+        ("[program.a]\ncommand = 'no-such-program'", ConfigError, "program' was not found"),
         ("[program.a]\ncommand = ''", ConfigError, "must name a program"),
         ("[program.a]\ncommand = \"'\"", ConfigError, "cannot be split"),
         ("[program.a]\ncomand = 'true'", ConfigError, "did you mean 'command'"),
