@@ -1,5 +1,7 @@
 """Recompute the claims from exported missions with pandas and SciPy alone.
 
+Each claim about faults is recomputed for all faults, for silent ones and for those that end a node.
+
     python benchmarks/claims_recomputed.py EXPORT.parquet KERNELS.json
 
 Nothing of `mavfi_cli` takes part in the numbers: the rules are those of docs/explanation/claims.md,
@@ -39,6 +41,8 @@ def wilson(hits, n, z=Z):
 def rate(frame, column, value=True):
     """Wilson with the design effect of worlds as strata and seeds as clusters."""
     rows = frame[frame[column].notna()]
+    if not len(rows):
+        return None
     y = (rows[column].astype(bool) == value).astype(float)
     n, p = len(rows), y.mean()
     if 0 < p < 1:
@@ -55,6 +59,8 @@ def rate(frame, column, value=True):
 
 def minus(a, b):
     """Newcombe's hybrid interval."""
+    if a is None or b is None:
+        return None
     value = a[0] - b[0]
     low = value - math.hypot(a[0] - a[1], b[2] - b[0])
     high = value + math.hypot(a[2] - a[0], b[0] - b[1])
@@ -72,6 +78,8 @@ def cluster_effect(change, seeds):
 
 def bonett_price(first, second, seeds):
     """Rate of the second minus that of the first, of the same missions."""
+    if not len(first):
+        return None
     change = second.astype(int) - first.astype(int)
     n = len(change) / cluster_effect(change, seeds)
     up, down = ((n * (change == sign).mean() + 1) / (n + 2) for sign in (1, -1))
@@ -103,6 +111,8 @@ def mean(values, frame):
     known = values.notna()
     means = values[known].groupby([frame.world[known], frame.seed[known]]).mean()
     n = int(known.sum())
+    if not n:
+        return None
     if means.nunique() == 1:
         return means.iloc[0], means.iloc[0], means.iloc[0], n
     ends = stats.bootstrap(
@@ -146,6 +156,14 @@ def prepare(path):
         rows[f"own_{name}"] = rows.pair.map(golden[name])
     rows["own_time"] = own
     return rows
+
+
+def of_fate(rows, fate):
+    """The flights without a fault, and those whose unprotected fault does this to its node."""
+    if fate == "all":
+        return rows
+    ended = rows.dead.where(rows.detector.isna(), rows.bare_dead)
+    return rows[rows.level.isna() | (ended == (fate == "dead"))]
 
 
 class Flights:
@@ -277,7 +295,7 @@ def of_flights(f, kernels, rng):
     perception = f.kernel("point_cloud", "octomap", "collision_check")
     harm = lambda rows: rate(rows, "harmed")  # noqa: E731
     map_only = f.kernel("point_cloud", "octomap")
-    shares = f.kernels.groupby("struck_kernel").lost.mean()
+    shares = f.kernels.groupby("struck_kernel", sort=False).lost.mean()
     world = {name: f.stages[f.stages.world == name] for name in WORLDS}
     whole = {name: rows[rows.own_lost == False] for name, rows in world.items()}  # noqa: E712
     signs = harm(f.state("waypoint_position", field=("sign", "exponent")))
@@ -338,7 +356,8 @@ def of_detectors(f, rng):
             protect: undone(f.protected(name, protect), "harmed", rng)
             for protect in ("perception", "planning", "control", "planning+control", ALL)
         }
-        best = max((arm["perception"], arm["planning"]), key=lambda each: each[0])
+        alone = arm["perception"], arm["planning"]
+        best = None if None in alone else max(alone, key=lambda each: each[0])
         for kind, first, second in (
             ("control", arm["control"], best),
             ("pc", arm["planning+control"], arm["control"]),
@@ -375,6 +394,8 @@ def of_computers(f, rng):
 
 def mover(a, b):
     """The difference of two effects that are no shares."""
+    if a is None or b is None:
+        return None
     value = a[0] - b[0]
     low = value - math.hypot(a[0] - a[1], b[2] - b[0])
     return value, low, value + math.hypot(a[2] - a[0], b[0] - b[1]), min(a[3], b[3])
@@ -384,6 +405,8 @@ def ranking(rows, kernels, rng):
     """Spearman's correlation of silent corruption alone and harm in flight."""
     names = sorted(set(rows.struck_kernel) & set(kernels))
     flown = [(rows[rows.struck_kernel == name].harmed.dropna().astype(bool)) for name in names]
+    if len(names) < 5 or len({y.mean() for y in flown}) == 1:
+        return None
     pairs = [(sum(y), len(y)) for y in flown]
     silent = [(kernels[n]["sdc"]["count"], kernels[n]["sdc"]["of"]) for n in names]
     drawn = [
@@ -417,21 +440,29 @@ def of_kernels(kernels):
     yield "fig6-rrtconnect", minus(silent["rrtconnect"], silent["rrt"]), below
 
 
+FATES = ("all", "silent", "dead")
+WITHOUT_FATES = ("fig6", "table4-golden", "table5")
+
+
 def recomputed(export, kernels):
-    """Effect and verdict of each claim, by its name."""
+    """Effect and verdict of each claim, by its name and the fate of the faults."""
     runs = {each["kernel"]: each["outcomes"] for each in json.loads(kernels.read_text())["kernels"]}
     rng = np.random.default_rng(7)
+    rows = prepare(export)
     families = defaultdict(dict)
-    flights = of_flights(Flights(prepare(export)), runs, rng)
-    for name, effect, ends in (*of_kernels(runs), *flights):
-        families[name.split("-")[0]][name] = (effect, ends)
+    for name, effect, ends in of_kernels(runs):
+        families["all", "fig6"][name] = (effect, ends)
+    for fate in FATES:
+        for name, effect, ends in of_flights(Flights(of_fate(rows, fate)), runs, rng):
+            if fate == "all" or not name.startswith(WITHOUT_FATES):
+                families[fate, name.split("-")[0]][name] = (effect, ends)
     found = {}
-    for family in families.values():
+    for (fate, _), family in families.items():
         told = dict(zip(family, verdicts([*family.values()]), strict=True))
         if told.get("table3-1") == "contradicted":  # the premise of table3-5
             family["table3-5"] = (None, family["table3-5"][1])
             told = dict(zip(family, verdicts([*family.values()]), strict=True))
-        found |= {name: (family[name][0], told[name]) for name in family}
+        found |= {(name, fate): (family[name][0], told[name]) for name in family}
     return found
 
 
@@ -448,11 +479,13 @@ def of_mavfi(export, kernels):
     flights = evidence.flights("mavbench").chosen(as_paper=True).chosen(at=(None, "random"))
     found = {}
     for each in judged({"mavbench": flights}, evidence.isolated):
-        place = ISOLATED if each.claim.isolated else "mavbench"
-        judgement = each.judgements[place][Fate.ALL]
-        e = judgement.effect
-        numbers = None if e is None else (e.value, e.low, e.high, e.count)
-        found[each.claim.name] = (numbers, judgement.verdict.value)
+        for fate, judgement in each.judgements[
+            ISOLATED if each.claim.isolated else "mavbench"
+        ].items():
+            e = judgement.effect
+            numbers = None if e is None else (e.value, e.low, e.high, e.count)
+            name = dict(zip(Fate, FATES, strict=True))[fate]
+            found[each.claim.name, name] = (numbers, judgement.verdict.value)
     return found
 
 
@@ -488,13 +521,15 @@ def main() -> int:
     asked = parser.parse_args()
     mine, theirs = (f(asked.export, asked.kernels) for f in (recomputed, of_mavfi))
     unequal = 0
-    for name, (effect, told) in mine.items():
-        same = equal(name, effect, theirs[name][0]) and told == theirs[name][1]
+    for (name, fate), (effect, told) in mine.items():
+        other = theirs[name, fate]
+        same = equal(name, effect, other[0]) and told == other[1]
         unequal += not same
-        for numbers, verdict in ((effect, told), *(() if same else (theirs[name],))):
+        for numbers, verdict in ((effect, told), *(() if same else (other,))):
             mark = "" if same else "  UNEQUAL"
-            print(f"{name:24}{as_text(numbers):56}{verdict}{mark}")
-    print(f"{len(mine)} claims recomputed, {unequal} unequal")
+            print(f"{name:24}{fate:8}{as_text(numbers):56}{verdict}{mark}")
+    claims = len({name for name, _ in mine})
+    print(f"{claims} claims recomputed, {len(mine)} verdicts, {unequal} unequal")
     return int(unequal > 0)
 
 

@@ -248,6 +248,22 @@ class Flights:
         """The flights without a detector, or with one that watches all stages."""
         return self.chosen(protect=(None, EVERY_STAGE))
 
+    def shared(self, *names: str) -> Flights:
+        """The flights without a fault, and those whose fault was flown in every arm.
+
+        The arms are the flights without a detector and with each of the detectors.
+
+        Args:
+            names: columns; each combination of their values has its own arms.
+        """
+        arms = self.where(level is not None for level in self["level"]).by(*names, "detector")
+        groups: dict[tuple[Any, ...], list[set[tuple[str, str]]]] = {}
+        for (*group, _), flights in arms.items():
+            groups.setdefault(tuple(group), []).append(set(flights.faults))
+        shared = {fault for group in groups.values() for fault in set.intersection(*group)}
+        faults = zip(self["level"], self.faults, strict=True)
+        return self.where(level is None or fault in shared for level, fault in faults)
+
     def by(self, *names: str) -> dict[tuple[Any, ...], Flights]:
         """The flights of each combination of values, in the order of their first flights."""
         return self.grouped(zip(*map(self.__getitem__, names), strict=True))

@@ -358,24 +358,16 @@ class Delays:
         hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
         for level in ("source", "instruction"):
             mine = hit.chosen(level=level)
-            by_detector = {
-                name: those
-                for name in (None, *DETECTOR_TITLES)
-                if len(those := mine.chosen(detector=name))
-            }
-            if None not in by_detector:
+            if None not in mine["detector"]:
                 continue
-            shared = set.intersection(*(set(those.faults) for those in by_detector.values()))
+            arms = mine.shared().by("detector")
             added = {
-                name: np.sort([
-                    np.inf if lost else added
-                    for fault, lost, added in zip(
-                        those.faults, those["lost"], those.numbers("added_s"), strict=True
-                    )
-                    if fault in shared
-                ])
-                for name, those in by_detector.items()
-            }  # fmt: skip
+                name: np.sort(
+                    np.where(arms[name,].flags("lost"), np.inf, arms[name,].numbers("added_s"))
+                )
+                for name in (None, *DETECTOR_TITLES)
+                if (name,) in arms
+            }
             golden_s = float(np.nanmean(mine.numbers("own_flight_time_s")))
             yield cls(stack=stack, level=level, added_s=added, golden_s=golden_s)
 

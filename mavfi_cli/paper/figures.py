@@ -103,7 +103,7 @@ def _beside_detectors(flights: Flights, paper: float | None) -> list[_Row]:
 
 
 def _fig12(flights: Flights) -> dict[str, list[_Row]]:
-    alike = flights.comparable
+    alike = flights.comparable.shared("world")
     return {
         world: _beside_detectors(
             alike.chosen(world=world), _number("fig12", "worst_increase_percent", world)

@@ -37,7 +37,7 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
         flights: the item's missions.
     """
     if name in _ONLY_COMPARABLE:
-        flights = flights.comparable
+        flights = flights.comparable.shared("world")
     rows = [*OF_FLIGHTS[name](flights)]
     notes = [*_unpaired(flights), *(_unknown_costs(flights) if name == "table5" else [])]
     table = BY_NAME[name].table(rows, flights.worlds, notes)

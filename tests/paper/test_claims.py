@@ -127,7 +127,10 @@ def test_the_counts_of_table_iv_are_its_printed_rates(world):
 
 
 def possible(claim):
-    """The verdicts that a hundred numbers of hits give at the paper's n, in a family of one."""
+    """The verdicts that a hundred numbers of hits give at the paper's n.
+
+    The others of the claim's item come out alike, so Holm's factor is that of the whole family.
+    """
     told = TOLD[claim.name]
     n = told.get("more") or told.get("less") or told.get("alike")
     if n is None:
@@ -139,7 +142,9 @@ def possible(claim):
         if claim.unit == "points":
             lost = [True] * hits + [False] * (n - hits)
             found.append(Finding(effect=paired_difference([False] * n, lost, range(n))))
-    return {judge([each], [(claim.low, claim.high)])[0].verdict for each in found}
+    family = sum(other.item == claim.item and other.rule != "none" for other in CLAIMS)
+    ends = [(claim.low, claim.high)] * family
+    return {judge([each] * family, ends)[0].verdict for each in found}
 
 
 SHARES = [
