@@ -1,7 +1,7 @@
 """Questions that the paper does not ask about its flights.
 
 They follow a fault from the kernel to the mission, map where a flipped bit does harm, count
-failures per hour, and compare what each mechanism saves.
+failures per hour, compare what each mechanism saves, and what the restart of a dead node saves.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.pairs import Flights
+from mavfi_cli.analysis.pairs import WORLDS, Fate, Flights
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
+from mavfi_cli.paper.items import printed
+from mavfi_cli.spec.mission import LIMITS, MissionConfig
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
@@ -278,14 +280,10 @@ def _arm_of(flight: Row) -> str:
     return detector if name == PLAIN else f"{name} and {detector}"
 
 
-def _trial_of(flight: Row) -> str:
-    """Fault, world, start, noise and computer as text, which the flights of all arms share."""
+def _trial_of(flight: Row, apart: Sequence[str] = ("detector", "isolate", "stack")) -> str:
+    """The mission as text, without the keys in which the compared flights differ."""
     config = json.loads(flight["changes"])
-    scene = {name: value for name, value in config.items() if name not in _APART}
-    return canonical([scene, flight["fault"]])
-
-
-_APART = ("fault", "instruction", "detector", "isolate", "stack")
+    return canonical({name: value for name, value in config.items() if name not in apart})
 
 
 def _lost(flights: Sequence[Row]) -> Share:
@@ -299,3 +297,93 @@ def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
         by_site.setdefault(_WORDS["sites"].get(target, target), []).append(flight)
     order = dict.fromkeys((*_WORDS["sites"].values(), *sorted(by_site)))
     return {name: _lost(by_site[name]) for name in order if name in by_site}
+
+
+# What the restart of a dead node saves ------------------------------------------------------------
+
+_RESTART = "node_restart_s"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RestartComparison:
+    """Success of a stack in a world with the same faults, by when a dead node comes back.
+
+    Attributes:
+        paper: success that Table IV prints for golden flights and for faults, %; None if it has no
+            such world.
+        golden: success of the golden flights.
+        success: success with faults in instructions, for each of the restart rules.
+        lost: lost missions among the faults of each fate, for each of the rules.
+        p_value: p-value of McNemar's exact test between the earliest and the latest restart.
+    """
+
+    stack: str
+    world: str
+    paper: Sequence[float | None]
+    golden: Share
+    success: Mapping[str, Share]
+    lost: Mapping[str, Mapping[Fate, Share]]
+    p_value: float
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """The restart rules, the earliest restart first."""
+        return tuple(self.success)
+
+
+def restarts(flights: Flights) -> list[RestartComparison]:
+    """Compare the restart rules under which a stack flew the same faults in instructions."""
+    groups: dict[tuple[str, str], dict[float, dict[str, Row]]] = {}
+    hit = flights.struck(level="instruction")
+    for flight in hit.rows("stack", "world", "lost", "ended", "changes"):
+        delay_s = json.loads(flight["changes"]).get(_RESTART, MissionConfig().node_restart_s)
+        rules = groups.setdefault((flight["stack"], flight["world"]), {})
+        rules.setdefault(delay_s, {})[_trial_of(flight, [_RESTART])] = flight
+    return [
+        row
+        for stack, world in sorted(groups, key=lambda each: (each[0], _place_of(each[1])))
+        if (row := _restarts(stack, world, groups[stack, world], flights.golden))
+    ]
+
+
+def _place_of(world: str) -> tuple[int, str]:
+    return (WORLDS.index(world) if world in WORLDS else len(WORLDS), world)
+
+
+def _restarts(
+    stack: str, world: str, rules: Mapping[float, Mapping[str, Row]], golden: Flights
+) -> RestartComparison | None:
+    shared = sorted(set.intersection(*(set(trials) for trials in rules.values())))
+    if len(rules) < 2 or not shared:
+        return None
+    flown = {delay_s: [rules[delay_s][trial] for trial in shared] for delay_s in sorted(rules)}
+    won = [[not flight["lost"] for flight in mine] for mine in flown.values()]
+    printed_rates = [
+        rate
+        if isinstance(rate := printed("table4", "success_percent", kind, world), float)
+        else None
+        for kind in ("golden", "none")
+    ]
+    return RestartComparison(
+        stack=stack,
+        world=world,
+        paper=printed_rates,
+        golden=golden.chosen(stack=stack, world=world).share(value=False),
+        success={
+            _rule(delay_s): wilson(sum(mine), len(mine))
+            for delay_s, mine in zip(flown, won, strict=True)
+        },
+        lost={
+            _rule(delay_s): {
+                fate: _lost([flight for flight in mine if flight["ended"] is (fate is Fate.DEAD)])
+                for fate in (Fate.SILENT, Fate.DEAD)
+            }
+            for delay_s, mine in flown.items()
+        },
+        p_value=McNemar.of(won[0], won[-1]).p_value,
+    )
+
+
+def _rule(delay_s: float) -> str:
+    never = delay_s >= LIMITS[_RESTART][1]
+    return "never back" if never else f"back after {delay_s:g} s"

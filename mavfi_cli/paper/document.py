@@ -36,9 +36,11 @@ from mavfi_cli.paper.beyond import (
     HourlyFailures,
     KernelFlow,
     MapCell,
+    RestartComparison,
     arms,
     hourly_failures,
     kernel_flows,
+    restarts,
     state_map,
 )
 from mavfi_cli.paper.claims import judged
@@ -166,6 +168,7 @@ class Document:
     hourly: Mapping[str, Sequence[HourlyFailures]]
     arms: Mapping[str, Sequence[Arm]]
     arm_pictures: Mapping[str, Picture]
+    restarts: Sequence[RestartComparison]
     sources: Sequence[CampaignSource]
     kernel_sources: Sequence[KernelSummary]
     missions: Sequence[_CampaignMissions]
@@ -243,6 +246,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         hourly={s: [*hourly_failures(flights[s], upsets_per_hour)] for s in stacks},
         arms=by_arm,
         arm_pictures={name: _arm_picture(name, mine) for name, mine in by_arm.items()},
+        restarts=restarts(evidence.flights().comparable),
         sources=evidence.campaigns,
         kernel_sources=evidence.kernels,
         missions=[*_missions(evidence.campaigns)],

@@ -3,7 +3,7 @@
 import pytest
 from made_flights import flights, row
 
-from mavfi_cli.paper.beyond import arms, hourly_failures, kernel_flows, state_map
+from mavfi_cli.paper.beyond import arms, hourly_failures, kernel_flows, restarts, state_map
 
 LOST = {"outcome": "timeout"}
 
@@ -125,3 +125,32 @@ def test_the_unprotected_arm_alone_compares_nothing():
 def test_one_stack_has_no_arms():
     rows = [row(seed=1), row("planning", seed=1), row("planning", seed=1, detector="gad")]
     assert arms(flights(rows)) == []
+
+
+# When a dead node comes back ----------------------------------------------------------------------
+
+
+def under(restart_s, seed, **how):
+    return row("planning", instruction=True, seed=seed, config={"node_restart_s": restart_s}, **how)
+
+
+def test_restart_rules_are_compared_on_the_faults_that_all_of_them_flew():
+    died = {"node_ended": "killed by SIGSEGV"}
+    rows = [row(seed=seed) for seed in range(1, 5)]
+    rows += [row("planning", instruction=True, seed=seed) for seed in (1, 2)]  # 1 s, the default
+    rows += [row("planning", instruction=True, seed=3, **died)]
+    rows += [row("planning", instruction=True, seed=4, **died, **LOST)]  # without a partner
+    rows += [under(3600.0, 1), under(3600.0, 2, **LOST), under(3600.0, 3, **died, **LOST)]
+    (found,) = restarts(flights(rows))
+    assert found.rules == ("back after 1 s", "never back")
+    assert [each.counts for each in found.success.values()] == ["3 of 3", "1 of 3"]
+    assert {rule: [each.counts for each in lost.values()] for rule, lost in found.lost.items()} == {
+        "back after 1 s": ["0 of 2", "0 of 1"],
+        "never back": ["1 of 2", "1 of 1"],
+    }
+    assert (found.golden.counts, found.paper) == ("4 of 4", [95.0, 88.3])
+    assert found.p_value == 0.5
+
+
+def test_one_restart_rule_is_no_comparison():
+    assert not restarts(flights([row(seed=1), under(5.0, 1)]))
