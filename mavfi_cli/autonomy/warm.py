@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -21,6 +22,7 @@ def is_compiled() -> bool:
     return in_cache(tracking.track)  # the last kernel that `warm_up` calls
 
 
+@functools.cache  # once for each process and those forked from it
 def warm_up() -> None:
     """Run every kernel: observe a wall, map it, plan round it, check the plan and track it."""
     start = np.array([0.0, 0.0, 5.0])

@@ -20,10 +20,15 @@ def prepare() -> None:
 
     import mavfi_cli.mission.run
     from mavfi_cli.autonomy import warm
+    from mavfi_cli.core.config import structure
     from mavfi_cli.mission.vehicle import VehicleInProcess
+    from mavfi_cli.spec.mission import MissionConfig
 
     assert mavfi_cli.mission.run
     warm.warm_up()
+    parts = {"fault": {"target": "waypoint_x"}, "instruction": {"target": "planner"}}
+    for name, part in parts.items():  # cattrs generates the code that reads a table at its first
+        structure({name: part, "detector": {"name": "gad"}}, MissionConfig)
     VehicleInProcess.warm_up()
     table = pa.table({"": [0.0]})  # pyarrow imports pandas, if there is one, at its first array
     pq.write_table(table, io.BytesIO(), compression="zstd")

@@ -81,12 +81,17 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 
 
 def _recover(cache: Any) -> None:
-    """Make numba recompile damaged cache entries instead of raising their errors."""
-    load = cache.load_overload
+    """Make numba load machine code without its compiler, and recompile damaged cache entries.
 
-    def load_overload(*arguments: Any) -> Any:
+    numba would load all that its compiler knows before it looks into the cache, which takes 0.4 s.
+    Machine code needs the runtime only, and the compiler loads what it needs itself.
+    """
+    from numba.core.runtime import rtsys
+
+    def load_overload(signature: Any, context: Any) -> Any:
         try:
-            return load(*arguments)
+            rtsys.initialize(context)
+            return cache._load_overload(signature, context)
         except Exception:  # a damaged file can raise any error
             with contextlib.suppress(OSError):
                 cache._cache_file.flush()

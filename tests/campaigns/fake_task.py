@@ -16,7 +16,8 @@ from mavfi_cli.spec.mission import MissionConfig
 
 
 def prepare():
-    pass
+    """Load what every mission needs, before workers are forked."""
+    harmful({"fault": {"target": "waypoint_x"}})
 
 
 def perform(task, out):

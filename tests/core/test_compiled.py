@@ -41,6 +41,18 @@ def test_an_edited_callee_is_compiled_anew(tmp_path, monkeypatch):
     assert run() == ["6.0", "0", "False"]
 
 
+@pytest.mark.slow
+def test_machine_code_from_the_cache_needs_no_compiler():
+    script = (
+        "import sys; from mavfi_cli.autonomy.warm import warm_up; "
+        "warm_up(); print('numba.typed.typeddict' in sys.modules)"
+    )
+    command = [sys.executable, "-c", script]
+    for _ in range(2):  # the first may fill the cache
+        result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout == "False\n"
+
+
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="levels are those of x86-64")
 def test_the_level_of_the_processor_agrees_with_numpy():
     features = np._core._multiarray_umath.__cpu_features__
