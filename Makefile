@@ -16,11 +16,11 @@ fly: install
 	$(BIN)/mavfi fly --world dense --inject planning
 
 test: checked
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
 	@echo "Left out: tests marked slow. 'make test-all' runs them too, and so does CI."
 
 test-all: checked
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 # Types are checked on one core while the kernels are compiled on the other.
 checked: install-dev

@@ -115,10 +115,10 @@ def test_a_node_struck_in_a_rehearsal_flies_as_if_struck_in_flight(short_config,
     null = InstructionConfig(target="point_cloud", null=True)
     cases = [(base, faults)]
     if stack == "hardened":
-        cases += [(guarded, faults[1:]), (quick, faults[-1:])]
+        cases += [(guarded, faults[1:2]), (quick, faults[-1:])]
     configs = [
         *(unharmed for unharmed, _ in cases),
-        replace(guarded, instruction=null),
+        *(replace(unharmed, instruction=null) for unharmed, _ in cases[1:2]),
         *(
             replace(unharmed, instruction=InstructionConfig(target=node, seed=seed))
             for unharmed, faults in cases

@@ -344,9 +344,11 @@ def test_alarms_about_correct_reports_do_not_lengthen_the_flight(
 
 @pytest.mark.slow
 def test_a_flip_that_blinds_the_detector_is_a_fault_site(guarded):
-    """The threshold's highest exponent bit: 8 becomes a number beyond all deltas."""
-    fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(62,))
-    record = guarded(fault=fault).result["fault"]
+    """The threshold's second exponent bit: 8 becomes a number beyond all deltas."""
+    fault = FaultConfig(target="detector.threshold", at="time=1", exact_bits=(61,))
+    result = guarded(fault=fault).result
+    record = result["fault"]
+    assert result["detection"]["alarm_count"] == 0
     assert (record["stage"], record["state"], record["activation"]["activation"]) == (
         "detector", "applied", "read",
     )  # fmt: skip
