@@ -418,23 +418,26 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
     for source in campaigns:
         flights = source.flights
         longest = sorted(flights.timed.rows(), key=lambda row: -row["over_own"])[:_LONGEST]
-        lost = [_listed(row, source.path, left > place)
+        lost = [_listed(row, source, left > place)
                 for place, row in enumerate(flights.chosen(lost=True).rows())]  # fmt: skip
         left -= sum(bool(mission.picture) for mission in lost)
         if len(flights):
             yield _CampaignMissions(
                 name=source.name,
                 lost=lost,
-                longest=[_listed(row, source.path) for row in longest],
+                longest=[_listed(row, source) for row in longest],
             )
 
 
-def _listed(flight: Mapping[str, Any], source: Path, pictured: bool = False) -> _ListedMission:
+def _listed(
+    flight: Mapping[str, Any], source: CampaignSource, pictured: bool = False
+) -> _ListedMission:
     """Describe a mission; its command names an export by the given path if that is relative."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
-    kept = source.is_dir() and _is_kept(flight["path"])  # an export is not asked where it flew
-    place = source.name if source.suffix and source.is_absolute() else str(source)
+    kept = source.may_have_runs and _is_kept(flight["path"])
+    path = source.path
+    place = path.name if path.suffix and path.is_absolute() else str(path)
     run = [flight["path"]] if kept else [place, "--mission", str(flight["number"])]
     return _ListedMission(
         number=flight["number"],
@@ -514,7 +517,7 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
     """The item's flights in the first campaign that has kept the run folders of all of them."""
-    folders = [source for source in evidence.campaigns if source.path.is_dir()]
+    folders = [source for source in evidence.campaigns if source.may_have_runs]
     several = (Flights.pooled([source.flights], stack) for source in folders)
     own = (of_kind(item, stack, flights) for flights in several)
     return next((mine for mine in own if len(mine) and all(map(_is_kept, mine["path"]))), None)

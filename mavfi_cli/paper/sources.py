@@ -58,6 +58,11 @@ class CampaignSource:
     again: str = ""
 
     @property
+    def may_have_runs(self) -> bool:
+        """Whether run folders are read; an export could name folders of anybody."""
+        return self.path.is_dir()
+
+    @property
     def stacks(self) -> list[str]:
         """The stacks that flew, sorted."""
         return sorted(set(self.flights["stack"]))
