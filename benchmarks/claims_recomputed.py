@@ -477,15 +477,14 @@ def of_mavfi(export, kernels):
 
     evidence = Evidence.gather([export, kernels])
     flights = evidence.flights("mavbench").chosen(as_paper=True).chosen(at=(None, "random"))
+    fates = dict(zip(Fate, FATES, strict=True))
     found = {}
     for each in judged({"mavbench": flights}, evidence.isolated):
-        for fate, judgement in each.judgements[
-            ISOLATED if each.claim.isolated else "mavbench"
-        ].items():
+        place = ISOLATED if each.claim.isolated else "mavbench"
+        for fate, judgement in each.judgements[place].items():
             e = judgement.effect
             numbers = None if e is None else (e.value, e.low, e.high, e.count)
-            name = dict(zip(Fate, FATES, strict=True))[fate]
-            found[each.claim.name, name] = (numbers, judgement.verdict.value)
+            found[each.claim.name, fates[fate]] = (numbers, judgement.verdict.value)
     return found
 
 

@@ -23,6 +23,7 @@ from mavfi_cli.core.errors import ConfigError
 from mavfi_cli.core.types import FloatArray, Outcome, Stage
 from mavfi_cli.spec.detector import PAPER
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
+from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.paired import OWN, McNemar, WorstCase
 from mavfi_cli.stats.shares import Share, design_effect, wilson
 
@@ -56,6 +57,7 @@ _DRAWN = {"target", "seed", "field", "bits", "together", "at"}
 _USUAL: Mapping[str, Any] = json.loads(canonical({
     "fault": asdict(FaultConfig(target="")), "instruction": asdict(InstructionConfig(target="")),
 }))  # fmt: skip
+_RESTART = "node_restart_s"
 _NO_FAULT = canonical([None] * len(_FAULTS))
 _NO, _YES = pa.scalar(False), pa.scalar(True)  # noqa: FBT003
 
@@ -100,6 +102,7 @@ class Flights:
         struck: whether the fault flipped a bit, read or not, as the paper counts.
         lost: whether the mission did not end in success.
         ended: whether the fault ended a node, by a crash or a hang.
+        restart_s: time after which a dead node is restarted.
         repeats: whether the flight would repeat; one of a user's companion has no partner.
     Columns about its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
@@ -248,15 +251,14 @@ class Flights:
         """The flights without a detector, or with one that watches all stages."""
         return self.chosen(protect=(None, EVERY_STAGE))
 
-    def shared(self, *names: str) -> Flights:
+    def shared(self, *names: str, arm: str = "detector") -> Flights:
         """The flights without a fault, and those whose fault was flown in every arm.
-
-        The arms are the flights without a detector and with each of the detectors.
 
         Args:
             names: columns; each combination of their values has its own arms.
+            arm: column whose values are the arms; None, as without a detector, is one of them.
         """
-        arms = self.where(level is not None for level in self["level"]).by(*names, "detector")
+        arms = self.where(level is not None for level in self["level"]).by(*names, arm)
         groups: dict[tuple[Any, ...], list[set[tuple[str, str]]]] = {}
         for (*group, _), flights in arms.items():
             groups.setdefault(tuple(group), []).append(set(flights.faults))
@@ -322,6 +324,7 @@ class Flights:
 
 def _flown(table: pa.Table) -> pa.Table:
     table = tables.flown(table)
+    usual_s = MissionConfig().node_restart_s
     configs = [json.loads(changes) for changes in table["changes"].to_pylist()]
     flips = pc.is_in(table["injected"], pa.array([fate.value for fate in _STRUCK]))
     kills = pc.fill_null(pc.starts_with(table["fault_target"], "process."), _NO)
@@ -338,6 +341,7 @@ def _flown(table: pa.Table) -> pa.Table:
         struck=pc.and_not(flips, kills),
         lost=lost,
         ended=pc.is_valid(table["node_ended"]),
+        restart_s=pa.array((config.get(_RESTART, usual_s) for config in configs), pa.float64()),
         repeats=pa.array(("companion" not in config for config in configs), pa.bool_()),
     )
 

@@ -26,9 +26,9 @@ def prepare() -> None:
 
     assert mavfi_cli.mission.run
     warm.warm_up()
-    parts = {"fault": {"target": "waypoint_x"}, "instruction": {"target": "planner"}}
-    for name, part in parts.items():  # cattrs generates the code that reads a table at its first
-        structure({name: part, "detector": {"name": "gad"}}, MissionConfig)
+    # cattrs generates the code that reads a table when it first reads one.
+    structure({"fault": {"target": "waypoint_x"}, "detector": {"name": "gad"}}, MissionConfig)
+    structure({"instruction": {"target": "planner"}}, MissionConfig)
     VehicleInProcess.warm_up()
     table = pa.table({"": [0.0]})  # pyarrow imports pandas, if there is one, at its first array
     pq.write_table(table, io.BytesIO(), compression="zstd")

@@ -44,7 +44,7 @@ def compiled(function: F) -> F:
     cache = getattr(dispatcher, "_cache", None)
     cache_file = getattr(cache, "_cache_file", None)
     if cache_file is not None:
-        _recover(cache)
+        _load_without_compiler(cache)
         known: list[Any] = [function, *_callees(function)]
         folders = sorted({Path(inspect.getfile(function)).parent for function in known})
         cache_file._source_stamp = tuple(folder_digest(folder) for folder in folders)
@@ -80,7 +80,7 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
         return False
 
 
-def _recover(cache: Any) -> None:
+def _load_without_compiler(cache: Any) -> None:
     """Make numba load machine code without its compiler, and recompile damaged cache entries.
 
     numba would load all that its compiler knows before it looks into the cache, which takes 0.4 s.

@@ -10,15 +10,17 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from mavfi_cli.analysis.pairs import WORLDS, Fate, Flights
+from mavfi_cli.analysis.pairs import Fate, Flights
 from mavfi_cli.campaigns.missions import canonical
 from mavfi_cli.core.config import read_toml
 from mavfi_cli.core.types import BY_NAME, DType
 from mavfi_cli.paper.items import printed
-from mavfi_cli.spec.mission import LIMITS, MissionConfig
+from mavfi_cli.report.paper import Printed
+from mavfi_cli.spec.mission import LIMITS
 from mavfi_cli.stats.paired import McNemar, holm
 from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
@@ -280,10 +282,13 @@ def _arm_of(flight: Row) -> str:
     return detector if name == PLAIN else f"{name} and {detector}"
 
 
-def _trial_of(flight: Row, apart: Sequence[str] = ("detector", "isolate", "stack")) -> str:
-    """The mission as text, without the keys in which the compared flights differ."""
+def _trial_of(flight: Row) -> str:
+    """Fault, world, start, noise and computer as text, which the flights of all arms share."""
     config = json.loads(flight["changes"])
-    return canonical({name: value for name, value in config.items() if name not in apart})
+    return canonical({name: value for name, value in config.items() if name not in _APART})
+
+
+_APART = ("detector", "isolate", "stack")
 
 
 def _lost(flights: Sequence[Row]) -> Share:
@@ -301,8 +306,6 @@ def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
 
 # What the restart of a dead node saves ------------------------------------------------------------
 
-_RESTART = "node_restart_s"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RestartComparison:
@@ -319,7 +322,7 @@ class RestartComparison:
 
     stack: str
     world: str
-    paper: Sequence[float | None]
+    paper: Sequence[Printed]
     golden: Share
     success: Mapping[str, Share]
     lost: Mapping[str, Mapping[Fate, Share]]
@@ -333,57 +336,36 @@ class RestartComparison:
 
 def restarts(flights: Flights) -> list[RestartComparison]:
     """Compare the restart rules under which a stack flew the same faults in instructions."""
-    groups: dict[tuple[str, str], dict[float, dict[str, Row]]] = {}
-    hit = flights.struck(level="instruction")
-    for flight in hit.rows("stack", "world", "lost", "ended", "changes"):
-        delay_s = json.loads(flight["changes"]).get(_RESTART, MissionConfig().node_restart_s)
-        rules = groups.setdefault((flight["stack"], flight["world"]), {})
-        rules.setdefault(delay_s, {})[_trial_of(flight, [_RESTART])] = flight
+    hit = flights.struck(level="instruction").shared("stack", "world", arm="restart_s")
+    by_place = {place: mine.by("restart_s") for place, mine in hit.by("stack", "world").items()}
     return [
-        row
-        for stack, world in sorted(groups, key=lambda each: (each[0], _place_of(each[1])))
-        if (row := _restarts(stack, world, groups[stack, world], flights.golden))
+        _restarts(stack, world, by_place[stack, world], flights.golden)
+        for stack in sorted({stack for stack, _ in by_place})
+        for world in hit.worlds
+        if len(by_place.get((stack, world), ())) > 1
     ]
-
-
-def _place_of(world: str) -> tuple[int, str]:
-    return (WORLDS.index(world) if world in WORLDS else len(WORLDS), world)
 
 
 def _restarts(
-    stack: str, world: str, rules: Mapping[float, Mapping[str, Row]], golden: Flights
-) -> RestartComparison | None:
-    shared = sorted(set.intersection(*(set(trials) for trials in rules.values())))
-    if len(rules) < 2 or not shared:
-        return None
-    flown = {delay_s: [rules[delay_s][trial] for trial in shared] for delay_s in sorted(rules)}
-    won = [[not flight["lost"] for flight in mine] for mine in flown.values()]
-    printed_rates = [
-        rate
-        if isinstance(rate := printed("table4", "success_percent", kind, world), float)
-        else None
-        for kind in ("golden", "none")
-    ]
+    stack: str, world: str, rules: Mapping[tuple[float], Flights], golden: Flights
+) -> RestartComparison:
+    flown = {_rule(delay_s): mine for (delay_s,), mine in sorted(rules.items(), key=itemgetter(0))}
+    lost = [dict(zip(mine.faults, mine["lost"], strict=True)) for mine in flown.values()]
+    first, last = ([not those[fault] for fault in sorted(lost[0])] for those in (lost[0], lost[-1]))
     return RestartComparison(
         stack=stack,
         world=world,
-        paper=printed_rates,
+        paper=[printed("table4", "success_percent", kind, world) for kind in ("golden", "none")],
         golden=golden.chosen(stack=stack, world=world).share(value=False),
-        success={
-            _rule(delay_s): wilson(sum(mine), len(mine))
-            for delay_s, mine in zip(flown, won, strict=True)
-        },
+        success={rule: mine.share(value=False) for rule, mine in flown.items()},
         lost={
-            _rule(delay_s): {
-                fate: _lost([flight for flight in mine if flight["ended"] is (fate is Fate.DEAD)])
-                for fate in (Fate.SILENT, Fate.DEAD)
-            }
-            for delay_s, mine in flown.items()
+            rule: {fate: mine.of_fate(fate).share() for fate in (Fate.SILENT, Fate.DEAD)}
+            for rule, mine in flown.items()
         },
-        p_value=McNemar.of(won[0], won[-1]).p_value,
+        p_value=McNemar.of(first, last).p_value,
     )
 
 
 def _rule(delay_s: float) -> str:
-    never = delay_s >= LIMITS[_RESTART][1]
+    never = delay_s >= LIMITS["node_restart_s"][1]
     return "never back" if never else f"back after {delay_s:g} s"
