@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import select
 import socket
@@ -21,6 +22,7 @@ from missions import POSTS, SHORT
 
 from mavfi_cli import cli
 from mavfi_cli.autonomy.warm import warm_up
+from mavfi_cli.core.fork_server import ForkServer
 from mavfi_cli.link.codec import Codec
 from mavfi_cli.mission.progress import Watcher
 from mavfi_cli.mission.run import fly_mission
@@ -33,6 +35,8 @@ from sitl.camera.component import COMPONENT_ID, Camera
 sys.path.insert(0, str(Path(__file__).parent / "link"))  # scripted autopilots
 settings.register_profile("no clock", deadline=None)  # no test asserts speed by the clock
 settings.load_profile("no clock")
+_SLOW_TO_LOAD = ("mavfi_cli.campaigns.task", "fake_task")  # modules of fork servers
+_OF_TEST = ("PYTEST_CURRENT_TEST", "COLUMNS")  # variables that differ without effect on a campaign
 TICK_WALL_S = 0.01  # of a scripted autopilot that gets no answer
 
 
@@ -40,6 +44,47 @@ def pytest_configure(config):
     """Compile every kernel once, before workers would all do so at once."""
     if getattr(config.option, "numprocesses", None):
         warm_up()
+
+
+def pytest_collection_finish():
+    """Keep the garbage collector from visiting the thousands of tests again and again."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kept_servers():
+    """Keep a server whose campaign has ended for the next campaign, because it loads for seconds.
+
+    Another environment gets a server of its own. Tests that look for the processes of a campaign
+    mark its environment; a server with the mark ends with its campaign.
+    """
+    kept, running, close = {}, ForkServer._running, ForkServer.close
+
+    def key(server):
+        environment = {name: text for name, text in os.environ.items() if name not in _OF_TEST}
+        return server._module, *sorted(environment.items())
+
+    def take(server):
+        if server._control is None:
+            server._key = key(server)
+            server._control, server._process = kept.pop(server._key, (None, None))
+        return running(server)
+
+    def keep(server):
+        parts, serving = (server._control, server._process), server._process is not None
+        if not serving or server._process.poll() is not None or server._key in kept:
+            return close(server)
+        if "MAVFI_TEST_CAMPAIGN" not in os.environ and server._module in _SLOW_TO_LOAD:
+            kept[server._key] = parts
+            server._control = server._process = None
+        return close(server)
+
+    with mock.patch.multiple(ForkServer, _running=take, close=keep):
+        yield
+    for control, process in kept.values():
+        control.close()
+        process.wait()
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -45,6 +46,7 @@ def exit_code(program: Callable[[], object]) -> int:
 
     A known error, wrong usage (code 2) and output that cannot be written are printed in one line.
     """
+    gc.set_threshold(100_000)  # imports leave few cycles, but the usual threshold looks for them
     try:
         code = program()
     except click.exceptions.Exit as left:

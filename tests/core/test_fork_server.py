@@ -82,14 +82,24 @@ def test_the_worker_ends_when_its_channel_is_closed(server, tmp_path):
 
 
 def test_workers_are_fresh_and_a_killed_server_is_started_again(server, tmp_path):
+    others = set(children(os.getpid()))
     (one, _), (two, _) = (
         heard(server.start({}, tmp_path / name, LONG_S)) for name in ("one", "two")
     )
     assert one["pid"] != two["pid"]
-    (server_pid,) = (pid for pid in children(os.getpid()) if name_of(pid) == SERVER)
+    started = set(children(os.getpid())) - others
+    (server_pid,) = (pid for pid in started if name_of(pid) == SERVER)
     os.kill(server_pid, signal.SIGKILL)
     os.waitid(os.P_PID, server_pid, os.WEXITED | os.WNOWAIT)
     assert heard(server.start({}, tmp_path / "three", LONG_S))[-1]["exit"] == 0
+
+
+def test_a_worker_works_in_the_folder_in_which_its_client_is_then(server, tmp_path, monkeypatch):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        assert heard(server.start({}, Path("out"), LONG_S))[-1]["exit"] == 0
+        assert (tmp_path / name / "out" / "left").is_dir()
 
 
 def test_a_kernel_that_does_not_list_children_is_enough(server, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from mavfi_cli.detect import base
 from mavfi_cli.detect.base import Model, shipped
 from mavfi_cli.detect.offline import Dataset
 
-WORLD, FIRST_SEED, FLIGHTS = "train-0.05-3", 10_000, 10
+STACK, WORLD, FIRST_SEED, FLIGHTS = "hardened", "train-0.05-3", 10_000, 10
 FLOWN = {f"{WORLD}/{seed}" for seed in range(FIRST_SEED, FIRST_SEED + FLIGHTS)}
 KINDS = ["gad", "l2", "range"]
 
@@ -21,7 +21,8 @@ def folder(mavfi, tmp_path_factory):
     """Where the small training was done."""
     out = tmp_path_factory.mktemp("small") / "training"
     done = mavfi(
-        "train", "--world", WORLD, "--first-seed", FIRST_SEED, "--flights", FLIGHTS,
+        "train", "--stack", STACK, "--world", WORLD,
+        "--first-seed", FIRST_SEED, "--flights", FLIGHTS,
         *(word for kind in KINDS for word in ("--kind", kind)), "--out", out, "--quiet",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -35,7 +36,9 @@ def flights_of(told):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder, kind):
-    new, ours = (json.loads(path.read_text()) for path in (folder / f"{kind}.json", shipped(kind)))
+    new, ours = (
+        json.loads(path.read_text()) for path in (folder / f"{kind}.json", shipped(kind, STACK))
+    )
     for key in ("schema", "mavfi", "states", "preprocess", "preprocess_digest", "detector"):
         assert new[key] == ours[key]
     assert set(new["arrays"]) == set(ours["arrays"])
@@ -48,19 +51,25 @@ def test_shipped_and_new_are_of_the_same_version_and_tell_the_same_things(folder
 
 @pytest.mark.slow
 def test_the_flights_are_still_those_that_the_shipped_ranges_and_scales_were_made_of(folder):
-    new, ours = (base.find_detector("range", model=p).memory for p in (folder / "range.json", None))
+    new, ours = (
+        base.find_detector("range", model=p).memory
+        for p in (folder / "range.json", shipped("range", STACK))
+    )
     assert (new["lowest"] >= ours["lowest"]).all()
     assert (new["highest"] <= ours["highest"]).all()
     assert (new["highest"] > 0.0).any()
-    new, ours = (base.find_detector("l2", model=p).memory for p in (folder / "l2.json", None))
+    new, ours = (
+        base.find_detector("l2", model=p).memory for p in (folder / "l2.json", shipped("l2", STACK))
+    )
     assert (new["scale"] <= ours["scale"]).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*KINDS, "aad"])
 def test_no_flight_that_set_a_shipped_threshold_exceeds_it(folder, kind):
-    detector = base.find_detector(kind)
-    setting = set(Model.read(shipped(kind)).provenance["split"]["threshold"]) & FLOWN
+    model = shipped(kind, STACK)
+    detector = base.find_detector(kind, model=model)
+    setting = set(Model.read(model).provenance["split"]["threshold"]) & FLOWN
     flights = Dataset.load(folder / "dataset.parquet").flights
     scores = [
         flight.scores(detector) for flight in flights if f"{flight.world}/{flight.seed}" in setting

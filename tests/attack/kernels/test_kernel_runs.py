@@ -33,8 +33,8 @@ def untimed(runs):
 @pytest.mark.slow
 def test_neither_workers_nor_another_kernel_change_anything(control_campaign, attack):
     _, (alone,) = control_campaign
-    _, (together, other) = attack("control", "point_cloud", runs=30, jobs=2)
-    assert untimed(together) == untimed(alone)
+    _, (together, other) = attack("control", "point_cloud", runs=10, jobs=2)
+    assert untimed(together) == untimed(alone)[:10]
     for runs in (together, other):
         assert {entry["outcome"] for entry in runs.records} <= OUTCOMES
         assert any(entry["injection"]["applied"] for entry in runs.records)
