@@ -16,7 +16,7 @@ import numpy as np
 
 from mavfi_cli.attack.tracer_thread import Notice
 from mavfi_cli.core.errors import FaultSpecError
-from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer import linux, record
 from mavfi_cli.fi.tracer.fault import FaultModel, InstructionFault, Rule, Strategy
 from mavfi_cli.fi.tracer.image import Image, Regions, Scope
 from mavfi_cli.fi.tracer.inject import (
@@ -38,6 +38,8 @@ _WINDOW = 64  # instructions for which a fault is followed
 # Time for which a thread is stepped to a fault, and for which the fault is followed. The program
 # runs by the wall clock, and PX4 misses a companion after 0.5 s.
 _STEPPED_S, _FOLLOWED_S = 0.15, 0.05
+_AT_ONCE = 50  # instructions that are stepped between two looks at the clock
+_NO_END = np.array([-1, 0], np.int64)  # of the window of `record_steps`
 _LOOK_S, _SEARCH_S = 1e-3, 10.0  # time between two looks for code in scope, and of all looks
 
 
@@ -252,8 +254,12 @@ class _Search:
         while self.tracee.ended is None and time.monotonic() < until_s:
             if by_steps and not self._enter():
                 continue
+            late = self._stepped_s > _STEPPED_S
+            if self.entry is None and count + 1 < drawn and not late:
+                count += self._steps(min(drawn - 1 - count, _AT_ONCE))
+                continue
             count += 1
-            if count >= drawn or self._stepped_s > _STEPPED_S:
+            if count >= drawn or late:
                 number = count if by_steps else 0
                 fault, reason = draw_fault_here(
                     self.tracee, self.image, self.scope, self.plan, self.rng, number
@@ -290,6 +296,23 @@ class _Search:
             return int.from_bytes(self.tracee.memory.read(self.tracee.registers.sp, 8), "little")
         except OSError:
             return 0
+
+    def _steps(self, most: int) -> int:
+        """Execute at most `most` instructions in scope, in a compiled loop. Return their number."""
+        from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
+
+        begun_s, tracee = time.perf_counter(), self.tracee
+        tracee.registers.forget()
+        executed, why, status = stepper.record_steps(
+            tracee.tid, self.scope.bounds, np.empty(most, np.int64), _NO_END
+        )
+        self._stepped_s += time.perf_counter() - begun_s
+        if why == stepper.OTHER_STATUS:
+            tracee.handle(linux.Status(tracee.tid, status), linux.SINGLESTEP)
+        elif why == stepper.NEEDS_CARE:
+            self._step()
+            executed += 1
+        return executed
 
     def _step(self) -> None:
         begun_s = time.perf_counter()

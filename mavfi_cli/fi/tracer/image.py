@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
+from numpy.typing import NDArray
 
 from mavfi_cli.core.errors import FaultError, UnknownName
 
@@ -203,6 +204,11 @@ class Scope:
 
     def __contains__(self, address: int) -> bool:
         return any(address in span for span in self.spans)
+
+    @property
+    def bounds(self) -> NDArray[np.int64]:
+        """The first address and the end of each span, (n, 2)."""
+        return np.array([[span.start, span.stop] for span in self.spans], np.int64)
 
 
 Regions = Mapping[str, "range | Region | Part"]

@@ -160,8 +160,7 @@ def record_window(
 def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
 
-    spans = np.array([[span.start, span.stop] for span in scope.spans], np.int64)
-    blanket = _Blanket(tracee, scope)
+    spans, blanket = scope.bounds, _Blanket(tracee, scope)
     while tracee.ended is None:
         trace = np.empty(_CHUNK, np.int64)
         tracee.registers.forget()

@@ -29,7 +29,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
@@ -492,13 +491,24 @@ class Tracee:
         """Return the threads that the calling thread traces, in the process and its children."""
         if self.group == self.pid:
             return {self.tid}
-        line = f"TracerPid:\t{threading.get_native_id()}\n"
-        threads = set[int]()
-        for path in Path("/proc").glob("[0-9]*/task/[0-9]*/status"):
-            with contextlib.suppress(OSError):  # it has ended
-                if line in path.read_text():
-                    threads.add(int(path.parent.name))
-        return threads
+        line = f"TracerPid:\t{threading.get_native_id()}\n".encode()
+
+        def traced(folder: str) -> bool:
+            try:
+                with open(f"{folder}/status", "rb") as status:
+                    return line in status.read()
+            except OSError:  # it has ended
+                return False
+
+        # A machine has many threads, and the target is stopped meanwhile.
+        processes = [int(pid) for pid in os.listdir("/proc") if pid.isdigit()]
+        return {
+            thread
+            for pid in processes
+            if traced(f"/proc/{pid}")
+            for thread in threads_of(pid)
+            if traced(f"/proc/{pid}/task/{thread}")
+        }
 
     def kill(self) -> Ended:
         """Kill the process and its children, and wait until all are gone."""

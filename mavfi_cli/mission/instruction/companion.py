@@ -15,7 +15,7 @@ from mavfi_cli.core.errors import MavfiError
 from mavfi_cli.core.flight_record import Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.injector import Moment
-from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.inject import NOTHING
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.mission.companion_faults import CompanionFault
@@ -53,7 +53,8 @@ class ProcessInjection(CompanionFault):
         self.injector = self._moment
 
     def begin(self, path: Path) -> None:
-        """Write the planned fault."""
+        """Write the planned fault, and load what must not be loaded while a thread is stopped."""
+        stepper.load()
         self._path = path
         self._context = {
             "node": self._request.program,
