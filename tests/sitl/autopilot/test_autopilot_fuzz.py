@@ -71,7 +71,7 @@ def check_sane(bench):
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(data=st.lists(messages(), min_size=1, max_size=8), airborne=st.booleans())
 def test_valid_frames_of_any_message_with_any_fields(make_bench, data, airborne):
     bench = make_bench(Preset.ONBOARD)
