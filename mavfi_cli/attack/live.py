@@ -39,7 +39,6 @@ _WINDOW = 64  # instructions for which a fault is followed
 # runs by the wall clock, and PX4 misses a companion after 0.5 s.
 _STEPPED_S, _FOLLOWED_S = 0.15, 0.05
 _AT_ONCE = 50  # instructions that are stepped between two looks at the clock
-_NO_END = np.array([-1, 0], np.int64)  # of the window of `record_steps`
 _LOOK_S, _SEARCH_S = 1e-3, 10.0  # time between two looks for code in scope, and of all looks
 
 
@@ -304,7 +303,7 @@ class _Search:
         begun_s, tracee = time.perf_counter(), self.tracee
         tracee.registers.forget()
         executed, why, status = stepper.record_steps(
-            tracee.tid, self.scope.bounds, np.empty(most, np.int64), _NO_END
+            tracee.tid, self.scope.bounds, np.empty(most, np.int64), stepper.NO_END
         )
         self._stepped_s += time.perf_counter() - begun_s
         if why == stepper.OTHER_STATUS:

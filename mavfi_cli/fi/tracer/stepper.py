@@ -21,6 +21,8 @@ _STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
 # would leave traces, the wait status was not that of a step, the window is over.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
 _IP, _SP = 128, 152  # offsets in `struct user`
+NO_END = np.array([-1, 0], np.int64)
+"""The `stop` of a window without an end."""
 
 _ptrace: Any = types.ExternalFunction(
     "ptrace", types.int64(types.int64, types.int64, types.uint64, types.uint64)
@@ -92,7 +94,7 @@ def _run(
 
 def load() -> None:
     """Load the compiled loop, or compile it, which takes seconds."""
-    record_steps(0, np.empty((0, 2), np.int64), np.empty(0, np.int64), np.array([-1, 0]))
+    record_steps(0, np.empty((0, 2), np.int64), np.empty(0, np.int64), NO_END)
 
 
 def record_steps(

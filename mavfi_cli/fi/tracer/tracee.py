@@ -170,7 +170,7 @@ def threads_of(pid: int) -> list[int]:
     """Return the thread ids of a process, ascending; empty when it has ended."""
     try:
         return sorted(int(name) for name in os.listdir(f"/proc/{pid}/task"))
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return []
 
 
