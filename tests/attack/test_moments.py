@@ -24,6 +24,8 @@ def workers(native_program):
         [native_program("workers")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout.readline() == "ready\n"
+        while calls(process) < 300_000:  # threads are drawn by the CPU time that they have used
+            pass
         yield process
         process.kill()
 
