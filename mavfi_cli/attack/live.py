@@ -171,8 +171,8 @@ def attack_moment(
     record.write(path, planned)
     tracee = Tracee.attach(pid, thread=_drawn_thread(pid, rng))
     begun_s = time.perf_counter()
+    fault: InstructionFault | None = None
     try:
-        fault: InstructionFault | None
         if repeat is None:
             fault, reason = _Search(tracee, image, scope, entry, plan, rng).fault()
         else:
@@ -184,6 +184,8 @@ def attack_moment(
             record.write(path, record.planned(fault, image, names_symbol=False, **context))
             injection, followed = strike(tracee, fault, window=_WINDOW, patience_s=_FOLLOWED_S)
             reason = "" if injection is None else injection.reason
+    except ProcessLookupError:  # it was killed while it was stopped
+        reason = "the process ended"
     finally:
         thread = _thread_name(tracee.tid)
         if tracee.ended is None:
