@@ -1,5 +1,6 @@
 """Faults at a moment, in a process with several threads that runs by the wall clock."""
 
+import contextlib
 import subprocess
 import time
 from pathlib import Path
@@ -10,7 +11,7 @@ from live_processes import LONG_S
 
 from mavfi_cli.attack.live import attack_moment
 from mavfi_cli.attack.tracer_thread import TracerThread
-from mavfi_cli.core.errors import UnknownName
+from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import Strategy
 
@@ -92,4 +93,26 @@ def test_what_cannot_be_struck(workers, tmp_path):
     while "TracerPid:\t0" in status.read_text() and time.monotonic() < until_s:
         pass
     workers.kill()
-    assert tracer.result().record["not_injected_reason"] == "the process ended"
+    with contextlib.suppress(TargetError):  # it was killed before its thread had stopped
+        assert tracer.result().record["not_injected_reason"] == "the process ended"
+
+
+def test_a_program_that_is_killed_while_its_thread_is_stopped_ends_the_fault(
+    workers, tmp_path, monkeypatch
+):
+    def killed(_):
+        workers.kill()
+        raise ProcessLookupError
+
+    monkeypatch.setattr("mavfi_cli.attack.live._Search.fault", killed)
+    assert strike(workers, tmp_path)["not_injected_reason"] == "the process ended"
+
+
+def test_a_program_that_is_killed_before_its_thread_has_stopped(workers, tmp_path, monkeypatch):
+    def killed(_):
+        workers.kill()
+        raise ProcessLookupError
+
+    monkeypatch.setattr("mavfi_cli.fi.tracer.tracee.Tracee.interrupt", killed)
+    with pytest.raises(TargetError, match="has ended"):
+        strike(workers, tmp_path)

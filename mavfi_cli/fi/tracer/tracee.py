@@ -237,7 +237,11 @@ class Tracee:
         group = pid if alone else _ANY_CHILD
         target = pid if thread is None or thread not in seized else thread
         tracee = cls(pid, target, group, mechanism or Mechanism.best())
-        tracee.interrupt()
+        try:
+            tracee.interrupt()
+        except ProcessLookupError:  # it has ended since
+            tracee.detach()
+            raise TargetError(f"process {pid}", "has ended") from None
         return tracee
 
     def interrupt(self) -> None:
