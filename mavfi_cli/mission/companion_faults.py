@@ -13,7 +13,7 @@ from typing import Any
 
 from mavfi_cli.companion.injection import Killer, NoInjection, SourceInjection
 from mavfi_cli.core.errors import FaultSpecError
-from mavfi_cli.core.flight_record import Strike
+from mavfi_cli.core.flight_record import NodeEnds, Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.bits import NUMPY_TYPES
 from mavfi_cli.fi.fault import Effect
@@ -158,15 +158,17 @@ class Throttle(threading.Thread):
 
 
 class CompanionFault(NoInjection):
-    """A fault in a user's companion.
+    """A fault in a user's companion; by itself none.
 
     Attributes:
         running: The started programs by name.
         link: Strikes messages; None for a fault in a process.
+        ends: The death of a struck process, by the name of its program.
     """
 
     running: Mapping[str, RunningProgram] = MappingProxyType({})
     link: LinkInjector | None = None
+    ends: Mapping[str, NodeEnds] = MappingProxyType({})
 
     def aim_at(self, shortest_flight_s: float) -> None:
         """Draw the fault over the shortest time of flight, s."""

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.core.errors import ConfigError, LinkLost
 from mavfi_cli.core.files import read_parquet
 from mavfi_cli.core.flight_record import ProgramEnds
@@ -75,7 +74,7 @@ class CompanionFlight:
         link: Transport,
         watcher: Watcher,
         interrupts: Sequence[int],
-        injection: NoInjection,
+        injection: CompanionFault,
     ) -> None:
         self._config, self._companion = config, companion
         self._interrupts, self._watcher = interrupts, watcher
@@ -96,7 +95,6 @@ class CompanionFlight:
         self._gate = self._planned_gate()
         self._commanders: set[tuple[int, int]] = set()
         self._ticks = 0  # since the first arming
-        self._faults = injection if isinstance(injection, CompanionFault) else None
         self._mode, self._failsafe = "", False
         self._next_progress_s = 0.0
         self._crew = Crew(companion, self.logger.note)
@@ -150,10 +148,9 @@ class CompanionFlight:
         ):
             folder.write_briefing(briefing)
             self._crew.prepare(programs, self._placeholders(folder, briefing, depth))
-            if self._faults is not None:
-                self._faults.running = self._crew.running
-                self._faults.aim_at(self._shortest_flight_s(briefing))
-                self._faults.begin(folder.fault)
+            self.injection.running = self._crew.running
+            self.injection.aim_at(self._shortest_flight_s(briefing))
+            self.injection.begin(folder.fault)
             try:
                 while self.outcome is None:
                     self._turn()
@@ -207,7 +204,7 @@ class CompanionFlight:
     def _pass(self, message: Message, side: Side) -> Iterable[bytes]:
         if side is Side.AUTOPILOT:
             self._hear(message)
-        link = None if self._faults is None else self._faults.link
+        link = self.injection.link
         passed = [message] if link is None else link.pass_between(message, side, self._moment)
         return [frame for own in passed for frame in self._deliver(own, side)]
 
@@ -216,8 +213,8 @@ class CompanionFlight:
         if self._gate is None:
             return (message,)
         passed = self._gate.pass_between(message, side, self.stamp_s)
-        if message not in passed and self._faults is not None and self._faults.link is not None:
-            self._faults.link.follower.withheld(message)
+        if message not in passed and self.injection.link is not None:
+            self.injection.link.follower.withheld(message)
         for frame in self._gate.outbox:
             self._tlog.write(self.stamp_s, frame)
             self._router.send(frame, Side.COMPANION)
@@ -230,8 +227,8 @@ class CompanionFlight:
         for own in passed:
             if side is Side.COMPANION:
                 self._watch(own)
-            if self._faults is not None and self._faults.link is not None:
-                self._faults.link.deliver(own, side, self.stamp_s)
+            if self.injection.link is not None:
+                self.injection.link.deliver(own, side, self.stamp_s)
         frames = [frame_of(own) for own in passed]
         self._tlog.write(self.stamp_s, *frames)
         return frames
@@ -243,14 +240,12 @@ class CompanionFlight:
 
     def _strike(self) -> None:
         """Strike a process if it is due, pass late messages on, and log the fault."""
-        if self._faults is None:
-            return
-        self._faults.tick(self._moment)
-        if self._faults.link is not None:
-            for message, side in self._faults.link.release(self.stamp_s):
+        self.injection.tick(self._moment)
+        if self.injection.link is not None:
+            for message, side in self.injection.link.release(self.stamp_s):
                 for frame in self._deliver(message, side):
                     self._router.send(frame, side)
-        for text in self._faults.news():
+        for text in self.injection.news():
             self.logger.note(self.stamp_s, "fault", text, self.telemetry.state)
 
     def _hear(self, message: Message) -> None:

@@ -39,7 +39,7 @@ from mavfi_cli.core.processes import interruptible
 from mavfi_cli.core.types import FlightTruth, FloatArray, Outcome, Reaction
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
 from mavfi_cli.link.transport import signing_from_file
-from mavfi_cli.mission.companion_faults import CompanionInjection
+from mavfi_cli.mission.companion_faults import CompanionFault, CompanionInjection
 from mavfi_cli.mission.companion_flight import CompanionFlight, LockstepFlight
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.instruction import CACHE
@@ -141,7 +141,7 @@ def _fly_companion(
     if config.detector is not None:
         SetpointGate.warm_up(config.detector, programs.mark)
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
-    injection: NoInjection = NoInjection()
+    injection = CompanionFault()
     if config.fault is not None:
         key = signing_from_file(programs.key_file)
         injection = CompanionInjection(config.fault, programs.program, key)
@@ -176,6 +176,8 @@ def _fly_companion(
     guarded = {} if flight.detection is None else {"detection": flight.detection}
     ends = {name: asdict(program) for name, program in flight.programs.items()}
     result |= {"pilot": {}, "plans": [], "programs": ends, **guarded}
+    if injection.ends:
+        result["nodes"] = {name: asdict(end) for name, end in injection.ends.items()}
     result |= {"in_lockstep": True} if programs.in_lockstep else {}
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import select
 import signal
 import socket
 import struct
@@ -29,6 +30,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 
 from mavfi_cli.core.errors import TargetError
 from mavfi_cli.fi.tracer import linux
@@ -176,16 +178,52 @@ def threads_of(pid: int) -> list[int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """The end of a process; exactly one of the two fields is set."""
+    """The end of a process. At most one of the two fields is set; none if the status is unknown."""
 
     exit_code: int | None
     signal: int | None
 
+    @classmethod
+    def of(cls, code: int) -> Ended:
+        """Read an exit code as `subprocess` gives it: a negative one is a signal."""
+        return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
+
     def describe(self) -> str:
         """Describe the end for a record."""
         if self.signal is not None:
-            return f"killed by {signal.Signals(self.signal).name}"
-        return f"ended with code {self.exit_code}"
+            known = self.signal in signal.Signals.__members__.values()
+            return f"killed by {signal.Signals(self.signal).name if known else self.signal}"
+        return "ended" if self.exit_code is None else f"ended with code {self.exit_code}"
+
+
+class EndWatch:
+    """Notices the end of a process, which need not be a child: pidfd_open(2).
+
+    Raises:
+        ProcessLookupError: There is no such process.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid, self._descriptor = pid, os.pidfd_open(pid)
+        self._poller = select.poll()
+        self._poller.register(self._descriptor, select.POLLIN)
+
+    def look(self) -> Ended | None:
+        """Return how the process has ended, or None. The status is unknown once it was read."""
+        if not self._poller.poll(0):
+            return None
+        try:
+            stat = Path(f"/proc/{self._pid}/stat").read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            return Ended(exit_code=None, signal=None)
+        state, *_, status = stat.rpartition(")")[2].split()  # field 52, proc_pid_stat(5)
+        if state != "Z":  # another process has its number
+            return Ended(exit_code=None, signal=None)
+        return Ended.of(os.waitstatus_to_exitcode(int(status)))
+
+    def close(self) -> None:
+        """Stop watching."""
+        os.close(self._descriptor)
 
 
 @dataclass(slots=True)
@@ -579,10 +617,7 @@ class Tracee:
         if status.tid != self.pid:
             return False
         self.memory.close()
-        if os.WIFSIGNALED(status.raw):
-            self.ended = Ended(exit_code=None, signal=os.WTERMSIG(status.raw))
-        else:
-            self.ended = Ended(exit_code=os.WEXITSTATUS(status.raw), signal=None)
+        self.ended = Ended.of(os.waitstatus_to_exitcode(status.raw))
         return True
 
     def _await_end(self) -> None:

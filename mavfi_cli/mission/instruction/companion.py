@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,21 @@ from mavfi_cli.attack.live import LiveAttack, attack_moment, mission_strategy
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.companion.injection import Killer
 from mavfi_cli.core.errors import MavfiError
-from mavfi_cli.core.flight_record import Strike
+from mavfi_cli.core.flight_record import NodeCrash, NodeEnds, Strike
 from mavfi_cli.core.seeds import Stream
 from mavfi_cli.fi.injector import Moment
 from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.inject import NOTHING
 from mavfi_cli.fi.tracer.record_fields import FaultRecord
+from mavfi_cli.fi.tracer.tracee import Ended, EndWatch
 from mavfi_cli.mission.companion_faults import CompanionFault
+from mavfi_cli.mission.programs import RunningProgram
 from mavfi_cli.spec.fault import InstructionConfig
+
+# Signals by which programs end each other. Such an end, one with code 0 and one without a known
+# status count as a death by the fault if the program goes on for a time without the process.
+_ORDINARY = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGHUP})
+_WITHOUT_S = 2.0
 
 
 class ProcessInjection(CompanionFault):
@@ -46,6 +54,9 @@ class ProcessInjection(CompanionFault):
         self._context: dict[str, Any] = {}
         self._problem = ""
         self._reported = False
+        self._watch: EndWatch | None = None
+        self._end: tuple[float, Ended] | None = None  # of the struck process, with its stamp
+        self._leads, self._codes = True, 0  # it is its program's own process; ended ones before it
 
     def aim_at(self, shortest_flight_s: float) -> None:
         """See `CompanionFault`."""
@@ -69,13 +80,44 @@ class ProcessInjection(CompanionFault):
     def tick(self, moment: Moment) -> None:
         """See `CompanionFault`."""
         self.injector.strike(moment)
+        if self._watch is None or self.ends:
+            return
+        program = self.running[self._request.program]
+        if self._end is None and (ended := self._look(self._watch, program)) is not None:
+            self._end = moment.stamp_s, ended
+        if self._end is None:
+            return
+        stamp_s, ended = self._end
+        failed = bool(ended.exit_code) or ended.signal not in {None, *_ORDINARY}
+        if failed or (program.pid is not None and moment.stamp_s - stamp_s >= _WITHOUT_S):
+            crash = NodeCrash(stamp_s=round(stamp_s, 9), how=ended.describe())
+            self.ends = {self._request.program: NodeEnds(crashes=[crash])}
+
+    def _look(self, watch: EndWatch, program: RunningProgram) -> Ended | None:
+        """Return how the struck process has ended, or None."""
+        ended = watch.look()
+        if ended is None or not self._leads or ended.exit_code is not None or ended.signal:
+            return ended
+        codes = program.codes[self._codes :]  # the program's own process: its worker has the status
+        return Ended.of(codes[0]) if codes else None
+
+    def close(self) -> None:
+        """See `NoInjection`."""
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
 
     def _on_strike(self, strike: Strike) -> None:
         program, path, request = self.running.get(self._request.program), self._path, self._request
         assert path is not None
         self._context["stamp_s"] = round(strike.stamp_s, 9)
         pid = None if program is None else _process_of(program.pid, request.executable)
-        if pid is None:
+        try:
+            if program is None or pid is None:
+                raise ProcessLookupError
+            self._watch = EndWatch(pid)
+            self._leads, self._codes = pid == program.pid, len(program.codes)
+        except ProcessLookupError:
             wanted = request.executable or request.program
             self._problem = f"no process of {wanted} ran at the moment of the fault"
             return
