@@ -20,7 +20,7 @@ test: checked
 	@echo "Left out: tests marked slow. 'make test-all' runs them too, and so does CI."
 
 test-all: checked
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Types are checked on one core while the kernels are compiled on the other.
 checked: install-dev

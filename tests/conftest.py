@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -44,6 +45,12 @@ def pytest_configure(config):
     """Compile every kernel once, before workers would all do so at once."""
     if getattr(config.option, "numprocesses", None):
         warm_up()
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that have slow tests, so that no long test is left for the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 def pytest_collection_finish():
