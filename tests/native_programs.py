@@ -48,7 +48,8 @@ static void *run(void *at) { for (;;) { sum = work(++*(volatile long *) at); } r
 int main(void) {
     pthread_t t; for (int i = 0; i < 3; i++) pthread_create(&t, 0, run, (void *) &calls[i]);
     puts("ready"); fflush(stdout);
-    while (getchar() != EOF) {
+    for (int c; (c = getchar()) != EOF;) {
+        if (c == '!') run((void *) &calls[0]);
         if (getchar() == EOF) break;
         printf("%ld\\n", calls[0] + calls[1] + calls[2]); fflush(stdout);
     }

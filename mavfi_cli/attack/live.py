@@ -304,12 +304,12 @@ class _Search:
 
         begun_s, tracee = time.perf_counter(), self.tracee
         tracee.registers.forget()
-        executed, why, status = stepper.record_steps(
-            tracee.tid, self.scope.bounds, np.empty(most, np.int64), stepper.NO_END
+        executed, why, report = stepper.record_steps(
+            tracee.tid, tracee.group, self.scope.bounds, np.empty(most, np.int64), stepper.NO_END
         )
         self._stepped_s += time.perf_counter() - begun_s
         if why == stepper.OTHER_STATUS:
-            tracee.handle(linux.Status(tracee.tid, status), linux.SINGLESTEP)
+            tracee.handle(report, linux.SINGLESTEP)
         elif why == stepper.NEEDS_CARE:
             self._step()
             executed += 1

@@ -20,7 +20,10 @@ UNIFORM = Strategy.of("instruction-uniform")
 
 @pytest.fixture
 def workers(native_program):
-    """A program whose three threads call `work` again and again; it prints its calls when asked."""
+    """A program whose three threads call `work` again and again; it prints its calls when asked.
+
+    At a "!" its main thread does the same.
+    """
     with subprocess.Popen(
         [native_program("workers")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -106,6 +109,17 @@ def test_a_program_that_is_killed_while_its_thread_is_stopped_ends_the_fault(
 
     monkeypatch.setattr("mavfi_cli.attack.live._Search.fault", killed)
     assert strike(workers, tmp_path)["not_injected_reason"] == "the process ended"
+
+
+def test_a_program_that_is_killed_while_its_main_thread_is_stepped(workers, tmp_path, monkeypatch):
+    workers.stdin.write("!")
+    workers.stdin.flush()
+    monkeypatch.setattr("mavfi_cli.attack.live._drawn_thread", lambda pid, _: pid)
+    for name, value in {"MOST_STEPS": 10**9, "_AT_ONCE": 10**6, "_STEPPED_S": LONG_S}.items():
+        monkeypatch.setattr(f"mavfi_cli.attack.live.{name}", value)
+    with subprocess.Popen(["sh", "-c", f"sleep 0.3; kill -9 {workers.pid}"]):
+        done = strike(workers, tmp_path, objects=("workers",))
+    assert done["not_injected_reason"] == "the process ended"
 
 
 def test_a_program_that_is_killed_before_its_thread_has_stopped(workers, tmp_path, monkeypatch):

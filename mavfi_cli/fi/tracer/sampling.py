@@ -164,12 +164,12 @@ def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[ND
     while tracee.ended is None:
         trace = np.empty(_CHUNK, np.int64)
         tracee.registers.forget()
-        recorded, why, status = stepper.record_steps(tracee.tid, spans, trace, stop)
+        recorded, why, report = stepper.record_steps(tracee.tid, tracee.group, spans, trace, stop)
         yield trace[:recorded]
         if why == stepper.WINDOW_END:
             return
         if why == stepper.OTHER_STATUS:
-            tracee.handle(linux.Status(tracee.tid, status), linux.SINGLESTEP)
+            tracee.handle(report, linux.SINGLESTEP)
         elif why == stepper.NEEDS_CARE:
             yield np.array([tracee.registers.ip], np.int64)
             clean_step(tracee, instruction_at(tracee, tracee.registers.ip))

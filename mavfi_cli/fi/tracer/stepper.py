@@ -13,12 +13,14 @@ from numba import types
 from numpy.typing import NDArray
 
 from mavfi_cli.core.compiled import compiled
+from mavfi_cli.fi.tracer import linux
 
-_PEEKTEXT, _PEEKUSER, _SINGLESTEP, _WALL = 1, 3, 9, 0x4000_0000
+_PEEKTEXT, _PEEKUSER, _SINGLESTEP = 1, 3, 9
+_OF_OWN_THREAD = 0x6000_0000  # __WALL and __WNOTHREAD, as `Tracee` waits
 _STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
 
 # Why recording returned: the trace is full, foreign code is next, a step over the next instruction
-# would leave traces, the wait status was not that of a step, the window is over.
+# would leave traces, the report was not that of a step, the window is over.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
 _IP, _SP = 128, 152  # offsets in `struct user`
 NO_END = np.array([-1, 0], np.int64)
@@ -56,10 +58,11 @@ def _needs_care(word: int) -> bool:
 @compiled
 def _run(
     tid: int,
+    group: int,
     spans: NDArray[np.int64],
     trace: NDArray[np.int64],
     stop: NDArray[np.int64],
-    status: NDArray[np.int32],  # (1,) the last wait status, if it is not a plain step
+    report: NDArray[np.int32],  # (2,) thread and status of the last report
 ) -> tuple[int, int]:
     recorded = 0
     repeating = np.int64(-1)
@@ -87,30 +90,36 @@ def _run(
             if _is_repeated(word):
                 repeating = ip
         _ptrace(_SINGLESTEP, tid, 0, 0)
-        _wait4(tid, status.ctypes.data, _WALL, 0)
-        if status[0] != _STOPPED_BY_STEP:
+        report[0] = _wait4(group, report.ctypes.data + report.itemsize, _OF_OWN_THREAD, 0)
+        if report[0] != tid or report[1] != _STOPPED_BY_STEP:
             return recorded, OTHER_STATUS
 
 
 def load() -> None:
     """Load the compiled loop, or compile it, which takes seconds."""
-    record_steps(0, np.empty((0, 2), np.int64), np.empty(0, np.int64), NO_END)
+    record_steps(0, 0, np.empty((0, 2), np.int64), np.empty(0, np.int64), NO_END)
 
 
 def record_steps(
-    tid: int, spans: NDArray[np.int64], trace: NDArray[np.int64], stop: NDArray[np.int64]
-) -> tuple[int, int, int]:
+    tid: int,
+    group: int,
+    spans: NDArray[np.int64],
+    trace: NDArray[np.int64],
+    stop: NDArray[np.int64],
+) -> tuple[int, int, linux.Status]:
     """Single-step a stopped thread and record the addresses of instructions before they execute.
 
     Args:
+        group: `Tracee.group`. A report about another of its threads ends the recording, because
+            Linux reports the end of a process only after those of its threads were read.
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start; a repeated string instruction is one entry.
         stop: (2 + n,) the window ends at the first address once the stack pointer is above the
             second number, and at each of the other addresses.
 
     Returns:
-        The number of recorded addresses, why the recording ended, and the last wait status.
+        The number of recorded addresses, why the recording ended, and the last report.
     """
-    status = np.zeros(1, np.int32)
-    recorded, why = _run(tid, spans, trace, stop, status)
-    return int(recorded), int(why), int(status[0])
+    report = np.zeros(2, np.int32)
+    recorded, why = _run(tid, group, spans, trace, stop, report)
+    return int(recorded), int(why), linux.Status(int(report[0]), int(report[1]))
