@@ -256,7 +256,9 @@ class _Search:
             if by_steps and not self._enter():
                 continue
             late = self._stepped_s > _STEPPED_S
-            if self.entry is None and count + 1 < drawn and not late:
+            # A restarted system call blocks, and a compiled step would block all of Python with it.
+            waits = self.tracee.registers.system_call is not None
+            if self.entry is None and count + 1 < drawn and not late and not waits:
                 count += self._steps(min(drawn - 1 - count, _AT_ONCE))
                 continue
             count += 1
@@ -316,8 +318,8 @@ class _Search:
         return executed
 
     def _step(self) -> None:
-        begun_s = time.perf_counter()
+        begun_s, waits = time.perf_counter(), self.tracee.registers.system_call is not None
         instruction = instruction_at(self.tracee, self.tracee.registers.ip)
         clean_step(self.tracee, instruction)
-        if instruction is None or instruction.mnemonic != "syscall":
+        if not waits and (instruction is None or instruction.mnemonic != "syscall"):
             self._stepped_s += time.perf_counter() - begun_s

@@ -264,7 +264,8 @@ def _recorded(run: Path, config: MissionConfig) -> AttemptResult:
             reason = "the vehicle died before it had saved the truth"
             return AttemptResult(state=None, result={}, reason=reason)
     fault = flight.state_fault
-    by_fault = fault is not None and fault.stage == PROCESS  # it kills a node itself
+    # A fault kills a node itself, and programs of a user's companion end each other.
+    by_fault = config.companion is not None or (fault is not None and fault.stage == PROCESS)
     doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
     return AttemptResult(
         state=ResultState.FLOWN, result=result, reason=reason, run=run, doubtful=doubtful

@@ -1,6 +1,7 @@
 """Faults at a moment, in a process with several threads that runs by the wall clock."""
 
 import contextlib
+import faulthandler
 import subprocess
 import time
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from live_processes import LONG_S
 
-from mavfi_cli.attack.live import attack_moment
+from mavfi_cli.attack.live import _Search, attack_moment
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.core.errors import TargetError, UnknownName
 from mavfi_cli.fi.tracer import record
 from mavfi_cli.fi.tracer.fault import Strategy
+from mavfi_cli.fi.tracer.image import Image
 
 UNIFORM = Strategy.of("instruction-uniform")
 
@@ -109,6 +111,49 @@ def test_a_program_that_is_killed_while_its_thread_is_stopped_ends_the_fault(
 
     monkeypatch.setattr("mavfi_cli.attack.live._Search.fault", killed)
     assert strike(workers, tmp_path)["not_injected_reason"] == "the process ended"
+
+
+def test_compiled_steps_strike_the_drawn_execution(start, monkeypatch):
+    def faults():
+        for seed in range(6):
+            tracee = start("flows")
+            image = Image(tracee.pid)
+            scope = image.scope(("flows", "libc.so.6"))
+            rng = np.random.default_rng(seed)
+            fault, reason = _Search(tracee, image, scope, None, UNIFORM, rng).fault()
+            assert not reason
+            yield fault, tracee.registers.ip
+
+    monkeypatch.setattr("mavfi_cli.attack.live._STEPPED_S", LONG_S)
+    compiled = list(faults())
+    monkeypatch.setattr(_Search, "_steps", lambda search, _: search._step() or 1)
+    assert compiled == list(faults())
+    assert len({fault.execution for fault, _ in compiled}) > 4
+
+
+def test_a_waiting_thread_is_struck_once_it_goes_on_and_nothing_else_waits(
+    workers, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("mavfi_cli.attack.live._drawn_thread", lambda pid, _: pid)
+    monkeypatch.setattr("mavfi_cli.attack.live.MOST_STEPS", 50)
+    faulthandler.dump_traceback_later(LONG_S, exit=True)  # no Python would run if a step blocked it
+    tracer = TracerThread(
+        lambda _: attack_moment(
+            workers.pid, UNIFORM, np.random.default_rng(1), path=tmp_path / "fault.json", null=True
+        )
+    )
+    try:
+        while "TracerPid:\t0" in Path(f"/proc/{workers.pid}/status").read_text():
+            time.sleep(0.01)
+        time.sleep(0.3)
+        assert not tracer.done
+        assert calls(workers) > 0
+        done = tracer.result().record
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+    assert done["not_injected_reason"] == ""
+    assert 0 < done["k"] <= 50
+    assert calls(workers) > 0
 
 
 def test_a_program_that_is_killed_while_its_main_thread_is_stepped(workers, tmp_path, monkeypatch):
