@@ -37,6 +37,8 @@ FLIGHTS_MIN = 10
 KINDS = ("gad", "aad", "range", "l2")
 # Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
+# The Gaussian model goes on learning in flight, which moves the distance of the same step.
+_LEARNING = 1.02
 # Two reports can arrive between two ticks, so a sequence number may increase by two.
 _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
 _X, _Y = ([NAMES.index(f"{prefix}{axis}") for prefix in ("waypoint_", "waypoint_v", "command_v")]
@@ -68,7 +70,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
     Args:
         n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
-            flights of the third part do not exceed, and at least `gaussian.N_SIGMA`.
+            flights of the third part stay 2 % below, and at least `gaussian.N_SIGMA`.
     """
     check([kind], len(dataset), n_sigma)
     flights, parts = dataset.flights, _split(dataset, seed)
@@ -83,7 +85,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
         largest = _largest(detector, held_out)
         details = {"largest_distance_sigma": largest}
         if n_sigma is None:
-            detector.flat[0] = max(gaussian.N_SIGMA, math.ceil(largest))
+            detector.flat[0] = max(gaussian.N_SIGMA, math.ceil(_LEARNING * largest))
     elif kind == "range":
         rows = _mirrored(flights)
         lowest, highest = np.minimum(rows.min(axis=0), 0), np.maximum(rows.max(axis=0), 0)

@@ -118,6 +118,12 @@ def test_gad_is_warmed_by_the_flights_that_set_no_threshold(dataset):
     assert fitted.arrays["n_sigma"][0] == fitted.provenance["threshold"] == 6.5
 
 
+def test_a_threshold_of_gad_leaves_room_for_what_it_learns_in_flight(dataset, monkeypatch):
+    monkeypatch.setattr(fit, "_largest", lambda *_: 16.0)
+    fitted = fit.fit("gad", dataset)
+    assert fitted.provenance["threshold"] == 17.0
+
+
 @pytest.mark.parametrize("kind", ["l2", pytest.param("aad", marks=pytest.mark.slow)])
 def test_a_threshold_is_the_largest_score_of_flights_that_training_did_not_see(
     dataset, kind, quick, tmp_path
