@@ -40,12 +40,13 @@ def leader(request):
 def struck(monkeypatch, tmp_path, pid, executable):
     """An injection that has struck a process of a program, and the program."""
     monkeypatch.setattr(companion, "attack_moment", lambda *_, **__: None)
-    program = SimpleNamespace(pid=pid, codes=[])
+    program, usual_s = SimpleNamespace(pid=pid, codes=[]), sys.getswitchinterval()
     request = InstructionConfig(target=f"fly{executable}", at="time=1", seed=1)
     injection = ProcessInjection(request, {"fly": None}, None)
     injection.running = {"fly": program}
     injection.aim_at(10.0)
     injection.begin(tmp_path / "fault.json")
+    assert sys.getswitchinterval() < usual_s  # the link's thread waits less for the tracer's
     assert not deaths(injection, 1.5)
     return injection, program
 
@@ -77,6 +78,7 @@ def test_a_process_without_which_its_program_goes_on_is_dead(
     assert deaths(injection, 2.0) == deaths(injection, 3.9) == [(2.0, how)] * at_once
     assert deaths(injection, 4.1) == [(2.0, how)]
     injection.close()
+    assert sys.getswitchinterval() > 1e-3
 
 
 @pytest.mark.parametrize("leader", ["does not read"], indirect=True)

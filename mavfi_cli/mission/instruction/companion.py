@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from mavfi_cli.spec.fault import InstructionConfig
 # status count as a death by the fault if the program goes on for a time without the process.
 _ORDINARY = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGHUP})
 _WITHOUT_S = 2.0
+# The tracer's thread computes in Python for up to seconds. The thread of the link must not wait for
+# Python's default of 5 ms whenever it has sent or received.
+_SWITCH_S = 1e-4
 
 
 class ProcessInjection(CompanionFault):
@@ -54,6 +58,7 @@ class ProcessInjection(CompanionFault):
         self._context: dict[str, Any] = {}
         self._problem = ""
         self._reported = False
+        self._usual_switch_s: float | None = None
         self._watch: EndWatch | None = None
         self._end: tuple[float, Ended] | None = None  # of the struck process, with its stamp
         self._leads, self._codes = True, 0  # it is its program's own process; ended ones before it
@@ -66,6 +71,8 @@ class ProcessInjection(CompanionFault):
     def begin(self, path: Path) -> None:
         """Write the planned fault, and load what must not be loaded while a thread is stopped."""
         stepper.load()
+        self._usual_switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
         self._path = path
         self._context = {
             "node": self._request.program,
@@ -106,6 +113,8 @@ class ProcessInjection(CompanionFault):
         if self._watch is not None:
             self._watch.close()
             self._watch = None
+        if self._usual_switch_s is not None:
+            sys.setswitchinterval(self._usual_switch_s)
 
     def _on_strike(self, strike: Strike) -> None:
         program, path, request = self.running.get(self._request.program), self._path, self._request
