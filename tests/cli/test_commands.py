@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
+from mavfi_cli.core.compiled import processor_level
 from mavfi_cli.core.errors import Interrupted
 from mavfi_cli.mission.measures import FlightRecord
 from mavfi_cli.report.summary import event_lines, summary_lines
@@ -247,6 +248,7 @@ def test_doctor(command_line):
     failed = [check for check in checks.values() if check["verdict"] == "failed"]
     assert code == (1 if failed else 0)
     assert checks["Vehicle"]["verdict"] == "ok"
+    assert processor_level() in checks["Processor"]["found"]
     needed = [each for each in importlib.metadata.requires("mavfi") if "extra ==" not in each]
     for each in needed:
         assert re.match(r"[\w-]+", each)[0] in checks["Libraries"]["found"]

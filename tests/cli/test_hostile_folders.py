@@ -8,7 +8,9 @@ import shutil
 import sqlite3
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from mavfi_cli.analysis.kernels import KernelSummary
@@ -20,8 +22,11 @@ from mavfi_cli.campaigns.specification_file import parse_spec
 from mavfi_cli.core.errors import RecordError
 from mavfi_cli.fi.tracer.record import read as read_fault
 from mavfi_cli.link.tlog import tlog_messages
+from mavfi_cli.mission.instruction import kept_in
+from mavfi_cli.mission.instruction.injection import _golden_orders
 from mavfi_cli.mission.run_folder import FAULT, RESULT
 from mavfi_cli.spec.fault import FaultConfig
+from mavfi_cli.spec.mission import MissionConfig
 
 _TEXT = "mine"
 
@@ -119,14 +124,18 @@ COMMANDS = [
     "campaign run HOSTILE --missing-only --quiet",
     "kernels --kernel control --runs 1 --out HOSTILE",
     "kernels --replay HOSTILE",
+    "kernels --program /bin/true --runs 1 --out HOSTILE",
     "reproduce fig9 --scale 0.001 --out HOSTILE",
+    "reproduce --settle --hours 0.001 --out HOSTILE",
     "train --flown HOSTILE --out models",
     "train --flown . --out models",
     "vpm --overhead HOSTILE",
+    "vpm --out HOSTILE",
     "detect evaluate --world farm --flights 1 --golden-flights 1 --quiet --out HOSTILE",
     "compare --world farm --missions 1 --quiet --out HOSTILE",
     "fly --world farm --start=2,2,0 --goal=10,6,5 --quiet --out HOSTILE",
     "fly --world farm --level instruction --inject control --quiet --out HOSTILE",
+    "fly --companion true --world farm --replay HOSTILE",
 ]
 
 
@@ -172,6 +181,21 @@ def test_the_companion_of_a_campaign_flies_only_if_the_user_names_it(
         assert not struck.exists()
     command_line("campaign", "run", folder, "--quiet", "--companion", companion)
     assert struck.exists()
+
+
+def test_hostile_orders_of_a_golden_mission_are_made_again(tmp_path):
+    golden, struck = MissionConfig(goal=(20.0, 0.0, 5.0)), tmp_path / "struck"
+    folder = kept_in(tmp_path / "profiles", golden)
+    folder.mkdir(parents=True)
+    for name in ("orders.npz", "orders.pickle"):
+        (folder / name).write_bytes(pickle.dumps(_Bomb(struck)))
+    briefing = golden.briefing(np.zeros(3))
+    recorder = SimpleNamespace(briefing=briefing, orders={}, sequence=[])
+    flown = []
+    for _ in range(2):
+        _golden_orders(golden, tmp_path / "profiles", lambda at: flown.append(at) or recorder)
+    assert flown == [folder]
+    assert not struck.exists()
 
 
 def test_a_record_that_inflates_beyond_bounds_is_refused(hostile, command_line, monkeypatch):

@@ -193,3 +193,15 @@ def test_a_plan_has_the_defaults_that_the_help_of_its_command_shows(words, kind)
     told = {name: shown[name] for name in own.keys() & shown.keys() if shown[name]}
     assert told
     assert {name: own[name] for name in told} == told
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("campaign plan --difference 0.5", "--discordant 0.2"),
+        ("campaign run fig8 --out OUT --set wrld=x", "did you mean 'world'"),
+        ("vpm --overhead aad=nan", "got nan"),
+    ],
+)
+def test_a_wrong_value_within_an_option_is_wrong_usage(refused, tmp_path, line, words):
+    assert words in refused(*line.replace("OUT", str(tmp_path / "out")).split())

@@ -2,7 +2,7 @@
 
 The frames have right checksums: NaN, infinities, extremes and zeros in all fields, payloads that
 are cut or too long, and both versions of MAVLink. They are of every message that the companion, the
-simulated vehicle or the stand-alone camera handles.
+gate, the simulated vehicle or the stand-alone camera handles.
 """
 
 from __future__ import annotations
@@ -23,12 +23,17 @@ from mavfi_cli.companion.injection import NoInjection
 from mavfi_cli.companion.pipeline import CompanionParts
 from mavfi_cli.core.types import Outcome
 from mavfi_cli.link import session, telemetry
-from mavfi_cli.link.codec import Codec, dialect
+from mavfi_cli.link.codec import Codec, dialect, frame_of
 from mavfi_cli.link.images import IMAGE_MESSAGES
+from mavfi_cli.link.router import Side
 from mavfi_cli.link.session import Phase
 from mavfi_cli.link.transport import memory_pair
 from mavfi_cli.mission.flight import Flight
 from mavfi_cli.mission.progress import Watcher
+from mavfi_cli.mission.setpoint_gate import SetpointGate
+from mavfi_cli.mission.setpoints import SETPOINTS
+from mavfi_cli.spec.companion import GateConfig
+from mavfi_cli.spec.detector import DetectorConfig
 from mavfi_cli.spec.mission import MissionConfig
 from sitl.autopilot import services
 from sitl.autopilot.telemetry import Preset
@@ -292,6 +297,35 @@ def test_a_flood_of_texts_fills_no_record() -> None:
         scene.check()
     told = [each.text for each in scene.flight.logger.events if each.kind == "autopilot"]
     assert told[-1] == "further texts are not recorded"
+
+
+# The gate before a user's companion ---------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            frames({*SETPOINTS, dialect.MAVLINK_MSG_ID_HEARTBEAT} | BY_COMPANION, [AUTOPILOT]),
+            st.sampled_from(Side),
+        ),
+        min_size=1,
+        max_size=25,
+    )
+)
+def test_a_gate_judges_any_frame_and_passes_only_frames_that_decode(hostile: list[Any]) -> None:
+    """It would fail open or closed for good if its detector or its view of the vehicle raised."""
+    notes: list[str] = []
+    detector, closed = DetectorConfig(name="gad", any_stack=True), GateConfig(on_error="closed")
+    gate = SetpointGate(detector, closed, None, note=notes.append)
+    codec = Codec(0, 0, keeps_unknown=True)
+    for number, (frame, side) in enumerate(hostile):
+        for message in codec.decode(frame):
+            passed = [frame_of(own) for own in gate.pass_between(message, side, 0.05 * number)]
+            assert all(Codec(0, 0, keeps_unknown=True).decode(own) for own in passed)
+            if message.get_msgId() not in SETPOINTS or side is Side.AUTOPILOT:
+                assert passed == [frame_of(message)]
+    assert not any("gate fails" in note for note in notes)
 
 
 # The simulated vehicle and its camera -------------------------------------------------------------
