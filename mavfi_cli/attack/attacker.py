@@ -22,7 +22,7 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
-Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn at its moment
+Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn when it strikes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +89,7 @@ class Attacker:
         """Run once with a fault at an exact execution of an instruction.
 
         Raises:
-            FaultError: the location holds another instruction than the drawn one.
+            FaultError: the location holds an instruction other than the drawn one.
         """
         start = time.perf_counter()
         tracee = self.place.start()

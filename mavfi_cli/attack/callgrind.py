@@ -1,8 +1,8 @@
-"""Counts how often a program executes each instruction in one run, by valgrind's callgrind.
+"""Counts how often a program executes each instruction in one run, using valgrind's callgrind.
 
 Callgrind takes 10 to 60 times as long as the program. It writes a file of counts after every
 `_BLOCKS` basic blocks and one at the end; their sum covers the whole run. The finished files give
-the counting rate. The native CPU time that leads to the same counts gives the remaining time.
+the counting rate. The native CPU time up to the same counts gives the remaining time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mavfi_cli.core.errors import TargetError
 from mavfi_cli.core.fork_server import die_with
 from mavfi_cli.fi.tracer.spawn import Program
 
-# By the path of an object, or UNNAMED: the executions of each linked address.
+# Execution counts by object path (or UNNAMED), then by linked address.
 Executions = Mapping[str, Mapping[int, int]]
 UNNAMED = "???"  # objects that valgrind does not recognise; their addresses are addresses in memory
 
@@ -106,7 +106,7 @@ class _Count:
 
     @property
     def limit_s(self) -> float:
-        """The longest duration."""
+        """The longest allowed duration."""
         return _SLOWER * self.golden.wall_s + _START_S
 
     def update(self) -> str:
@@ -134,7 +134,7 @@ class _Count:
         self._add(self.counts)
 
     def _read_files(self) -> bool:
-        """Read the new files with a number; False if there is none."""
+        """Read the new numbered files; return False if there are none."""
         before = self.read
         while _is_complete(path := Path(f"{self.counts}.{self.read + 1}")):
             self._add(path)
@@ -172,8 +172,8 @@ def _read_counts(path: Path) -> dict[str, Counter[int]]:
     """Return execution counts by the path of the object and the linked address.
 
     Args:
-        path: callgrind's file; addresses are those of the linker, and the line after `calls=` is
-            the cost of the called function.
+        path: callgrind's file, with linked addresses; the line after `calls=` is the cost of the
+            called function.
     """
     counts: dict[str, Counter[int]] = {}
     current: Counter[int] = Counter()

@@ -61,7 +61,7 @@ class Plan:
     rule: str = Rule.INSTRUCTION.value
     compat: str | None = None
     model: FaultModel | None = None
-    windows: int = 16  # number of stepped windows, if not the whole run is stepped
+    windows: int = 16  # number of stepped windows, unless the whole run is stepped
     null: bool = False  # leave out the flip
 
     def strategy(self) -> Strategy:
@@ -90,8 +90,8 @@ class TargetRuns:
     """All runs of one target in numerical order, with the profiles of their faults."""
 
     target: AttackTarget
-    context: Mapping[str, Any]  # entries of every record about the target
-    goldens: tuple[Golden, ...]  # of each input
+    context: Mapping[str, Any]  # entries about the target in every record
+    goldens: tuple[Golden, ...]  # one per input
     profiles: Profiles
     null_runs: NullRuns
     records: tuple[FaultRecord, ...] = ()
@@ -109,7 +109,7 @@ class TargetRuns:
         return self.profiles[0]
 
     def input_of(self, run: int) -> int:
-        """Return the input that the fault of this number strikes."""
+        """Return the number of the input that fault number `run` strikes."""
         return run % len(self.goldens)
 
     def records_of(self, number: int) -> tuple[FaultRecord, ...]:
@@ -140,7 +140,7 @@ def run_campaign(
     Raises:
         TracingForbidden: the operating system does not allow tracing.
         TargetError: a target cannot be attacked.
-        ConfigError: the folder holds another campaign, or runs beyond this one.
+        ConfigError: the folder holds another campaign, or runs that this one does not include.
     """
     journal = None
     if folder is not None:
@@ -232,7 +232,7 @@ def _prepare(
 
 
 def _report_steps(stage: Callable[[str], None]) -> Watch:
-    """Return a watch that reports stepped instructions, or other news, to `stage`."""
+    """Return a `Watch` that reports stepped instructions, or a status text, to `stage`."""
     total = 0
 
     def watch(news: int | str) -> None:
@@ -313,26 +313,26 @@ class _TargetSetup:
 
     plan: Plan
     target: AttackTarget
-    golden: tuple[Golden, ...]  # of each input
+    golden: tuple[Golden, ...]  # one per input
 
     def attackers(self, place: JudgedPlace) -> tuple[Attacker, ...]:
-        """Return one attacker for each input of the target that is open at a place."""
+        """Return one attacker for each input of the opened target."""
         pairs = zip(places_of(place), self.golden, strict=True)
         return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
-        """Return a generator of the target's stream, for one use such as a fault's number."""
+        """Return a generator of the target's stream for one purpose, such as one fault number."""
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
     def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
-        """Return fault number i; None for a time rule."""
+        """Draw fault number `index`; return None for a time rule."""
         profile = profiles[index % len(profiles)]
         if profile is None:
             return None
         return profile.draw(self.plan.strategy(), self.generator(index))
 
 
-_opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the one target of this process
+_opened: dict[tuple[str, ...], tuple[Attacker, ...]] = {}  # the only target that is open here
 
 
 def _keep_open(setup: _TargetSetup, place: JudgedPlace) -> tuple[Attacker, ...]:
@@ -369,7 +369,7 @@ def _work(job: tuple[_TargetSetup, Sequence[Task]]) -> list[tuple[int, RunResult
 
 
 def _settle(campaign: int) -> None:
-    """Make a worker process ready; SIGTERM ends it without leaving a process or a folder."""
+    """Prepare a worker process; SIGTERM ends it without leaving a process or a folder behind."""
     die_with(campaign)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the campaign
     signal.signal(signal.SIGTERM, _leave)
@@ -382,7 +382,7 @@ def _leave(*_: object) -> NoReturn:
 
 
 class _AttackWorkers:
-    """The worker processes of one campaign, or this process for one job; a context manager."""
+    """The worker processes of one campaign, or this process if `jobs` is 1; a context manager."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
@@ -450,7 +450,7 @@ class _AttackWorkers:
             raise FaultError("a worker process was killed; the campaign is incomplete") from None
 
 
-# -- recorded runs are repeated bit by bit
+# -- recorded runs are repeated bit for bit
 
 # A replay must repeat these entries; durations are not among them.
 _COMPARED = (
@@ -478,7 +478,7 @@ def replay_runs(
 
     Args:
         kernels: names of the kernels; empty for all built-in ones.
-        runs: number of runs to repeat of each kernel or of the program; 0 for all.
+        runs: number of runs to repeat per kernel, or of the program; 0 for all.
         program: the program that the user named. The folder may come from somebody else, so its
             program is executed only if it is this one.
 

@@ -42,7 +42,7 @@ class Difference:
     parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> Json:
-        """Return the entries of a record. A size that is not finite is null."""
+        """Return the entries of a record. Non-finite sizes become null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,

@@ -37,7 +37,7 @@ class Journal:
         """Open the folder, or create it.
 
         Args:
-            known: everything that determines its results, as plain values.
+            known: everything that determines the campaign's results, as plain values.
             runs: number of runs of each kernel when the campaign is complete.
 
         Raises:
@@ -58,7 +58,7 @@ class Journal:
         self._end_last_line()
 
     def _end_last_line(self) -> None:
-        """End a line that an interruption has cut, so that the next run starts a new one."""
+        """End a line that an interruption has cut off, so that the next run starts a new one."""
         path = self._folder / RUNS
         if path.is_file() and not path.read_bytes().endswith(b"\n"):
             self._write(b"\n")

@@ -35,11 +35,11 @@ from mavfi_cli.spec.fault import UNIFORM, InstructionConfig
 
 MOST_STEPS = 1000  # executed instructions between a moment and the fault
 _WINDOW = 64  # instructions for which a fault is followed
-# Time for which a thread is stepped to a fault, and for which the fault is followed. The program
-# runs by the wall clock, and PX4 misses a companion after 0.5 s.
+# Longest time for which a thread is stepped to a fault, and for which the fault is followed. The
+# program runs in real time, and PX4 detects a missing companion after 0.5 s.
 _STEPPED_S, _FOLLOWED_S = 0.15, 0.05
-_AT_ONCE = 50  # instructions that are stepped between two looks at the clock
-_LOOK_S, _SEARCH_S = 1e-3, 10.0  # time between two looks for code in scope, and of all looks
+_AT_ONCE = 50  # instructions that are stepped between two checks of the clock
+_LOOK_S, _SEARCH_S = 1e-3, 10.0  # interval of the checks for code in scope, and their total time
 
 
 def mission_strategy(fault: InstructionConfig) -> Strategy:
@@ -138,13 +138,13 @@ def attack_moment(
     repeat: FaultRecord | None = None,
     **context: Any,
 ) -> LiveAttack:
-    """Apply one fault in a process at this moment or soon after it, and let it continue.
+    """Apply one fault in a process now or shortly afterwards, and let it continue.
 
-    A thread is drawn by the CPU time that it has used so far, and stopped. By the rule
-    `INSTRUCTION` it is stepped, and the fault strikes execution k of the instructions in scope; k
-    is drawn uniformly from 1 to `MOST_STEPS`, and is less if the steps take too long. By a rule of
-    time the fault strikes where the thread is, or where a later look finds it in scope. The process
-    runs by the wall clock, so neither repeats.
+    A thread is drawn in proportion to the CPU time that it has used so far, and stopped. Under the
+    rule `INSTRUCTION` it is stepped, and the fault strikes the k-th executed instruction in scope;
+    k is drawn uniformly from 1 to `MOST_STEPS`, and is smaller if the steps take too long. Under a
+    time rule the fault strikes where the thread is, or where a later check finds it in scope. The
+    process runs in real time, so neither is repeatable.
 
     Args:
         objects: shared objects or executables in scope; empty for all files of the process,
@@ -152,8 +152,8 @@ def attack_moment(
         function: only code that executes during calls of this function is in scope. The first
             thread that calls it is struck.
         null: leave out the flip.
-        repeat: the record of a fault, whose instruction is struck again: its first execution in
-            any thread.
+        repeat: the record of an earlier fault; its instruction is struck again, at its first
+            execution in any thread.
         context: further entries of the record.
 
     Raises:
@@ -162,7 +162,7 @@ def attack_moment(
         UnknownName: the process has no such object or function.
         BuildMismatch: the record comes from another build.
     """
-    image = Image(pid)  # takes long, so the process still runs
+    image = Image(pid)  # slow, so the process still runs meanwhile
     scope = image.scope(objects or _own_objects(pid, image))
     entry = None if function is None else image.address(image.function(function, scope.objects))
     if repeat is not None:
@@ -211,7 +211,7 @@ def _own_objects(pid: int, image: Image) -> list[str]:
 
 
 def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
-    """Draw a thread by the CPU time that it has used, proc_pid_schedstat(5)."""
+    """Draw a thread in proportion to the CPU time that it has used (proc_pid_schedstat(5))."""
     threads = threads_of(pid)
     if not threads:
         return pid
@@ -222,7 +222,7 @@ def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
 def _cpu_ns(pid: int, thread: int) -> int:
     try:
         return int(Path(f"/proc/{pid}/task/{thread}/schedstat").read_text().split()[0])
-    except (OSError, ValueError, IndexError):  # it has ended, or the kernel does not tell
+    except (OSError, ValueError, IndexError):  # it has ended, or the kernel does not report it
         return 0
 
 
@@ -240,14 +240,14 @@ class _Search:
     tracee: Tracee
     image: Image
     scope: Scope
-    entry: int | None  # of the function in whose calls the code is in scope
+    entry: int | None  # of the function during whose calls code is in scope
     plan: Strategy
     rng: np.random.Generator
     _caller: int = -1  # stack pointer at the function's entry; a higher one is its caller's
-    _stepped_s: float = 0.0  # without the system calls, in which the thread waits by itself
+    _stepped_s: float = 0.0  # excludes system calls, in which the thread waits anyway
 
     def fault(self) -> tuple[InstructionFault | None, str]:
-        """Return the fault before which the thread has stopped, or None and why there is none."""
+        """Run the thread to a fault and return the fault, or None and the reason."""
         by_steps = self.plan.rule is Rule.INSTRUCTION
         drawn = int(self.rng.integers(MOST_STEPS)) + 1 if by_steps else 0
         reason, count = "it executed no code in scope", 0

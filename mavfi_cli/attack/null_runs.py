@@ -3,7 +3,7 @@
 An outcome is meaningful only if a run without a flip ends as the golden run did. A target may
 depend on time or on chance. It may also read its own code as data; then a detour, which counts
 executions by patching code, changes its output. So a campaign begins with null runs of some of its
-first faults, covers every counting method, and then avoids detours that change the output.
+first faults, which cover every counting method, and then avoids detours that change the output.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mavfi_cli.fi.tracer.tracee import DETOUR_COST
 NULL_RUNS = 20
 _FAULTS = 64  # first faults of the campaign, from which null runs are chosen
 _REPEATED = 3  # repetitions of a differing null run, to separate detours from chance
-_APART_S = 1.0  # least time between the golden runs and the last null run
+_APART_S = 1.0  # minimum time between the golden runs and the last null run
 _TIMER = "timer"
 _DETOURS = (Counting.FAR_DETOUR, Counting.DETOUR)
-Profiles = tuple[TargetProfile | None, ...]  # of each input; None for time rules
+Profiles = tuple[TargetProfile | None, ...]  # one per input; None for time rules
 Run = Callable[[Sequence[Task]], Iterable[tuple[int, RunResult]]]
 
 
@@ -63,7 +63,7 @@ def make_null_runs(
 
     Args:
         name: the target's name for errors.
-        draw: returns the fault of a number, given the profiles; None for time rules.
+        draw: returns the fault with a given number, drawn from the profiles; None for time rules.
         run: runs tasks without their flips.
 
     Returns:
@@ -93,7 +93,7 @@ def make_null_runs(
 
 
 def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
-    """Repeat a null run later to detect a slow change, such as that of a date.
+    """Repeat a null run later to detect a slow change, such as a change of date.
 
     Args:
         golden_s: end of the golden runs on `time.monotonic`. The null run begins at least a
@@ -124,7 +124,7 @@ class _NullRun:
 
     @property
     def method(self) -> str:
-        """Name of the counting method; of several, the one that changes the most code."""
+        """Name of the counting method; if there are several, the one that changes the most code."""
         if self.task[1] is None:
             return _TIMER
         return _counting(self.task[1]).value
@@ -175,6 +175,6 @@ def _detours(fault: InstructionFault | None) -> list[CountedStop]:
 
 
 def _counting(fault: InstructionFault | None) -> Counting:
-    """Return the counting method of a fault; of several, the one that changes the most code."""
+    """Return a fault's counting method; if it has several, the one that changes the most code."""
     used = {stage.detour.counting for stage in _detours(fault) if stage.detour is not None}
     return next((method for method in Counting if method in used), Counting.BREAKPOINT)

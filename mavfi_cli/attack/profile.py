@@ -39,16 +39,16 @@ from mavfi_cli.fi.tracer.sampling import Segment, Stratum, draw_fault, record_wi
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.stats.shares import Interval, estimated_total
 
-STEPS = 2_000_000  # of one window
+STEPS = 2_000_000  # limit of one window
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _NOTHING = "executes no code in scope"
 _UNNAMED = (
     "executes code that callgrind cannot name: its file has no writable data, and its address is "
     "not fixed; link it at a fixed address (-no-pie), or name a function"
 )
-_COOL = 64  # ratio of the hottest instruction's executions to those of a checked one, at most
-_CHECKED = 4  # instructions whose counts are checked, besides the most executed
-_TAIL = 16  # bytes behind the code, for the decoder
+_COOL = 64  # minimum ratio of the hottest instruction's executions to those of the counted one
+_CHECKED = 4  # instructions whose counts are checked, in addition to the most executed one
+_TAIL = 16  # bytes after the code, for the decoder
 _DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
 Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
@@ -60,7 +60,7 @@ class _ScopeCode:
     """One contiguous piece of code in scope."""
 
     start: int  # address
-    data: bytes  # the code, and _TAIL bytes behind it
+    data: bytes  # the code, and _TAIL bytes after it
     object: str
     offset: int  # of the start in the object
 
@@ -106,7 +106,7 @@ class TargetProfile:
 
     @property
     def not_reached(self) -> float:
-        """Share of the executed instructions that no stop can reach, and that are never drawn."""
+        """Share of the executed instructions that no stop can reach; they are never drawn."""
         return 0.0 if self.counted is None else self.counted.not_reached
 
     def code_at(self, address: int) -> bytes:
@@ -225,12 +225,12 @@ def profile_run(
     """Step a golden run, or a sample of its windows.
 
     Args:
-        markers: instructions in scope that begin windows; none for the whole run.
+        markers: instructions in scope that begin windows; empty for the whole run.
         end: an instruction in scope; its first execution ends the profile.
-        windows: least number of windows of each marker to step, after a pilot of half as many.
+        windows: minimum number of windows of each marker to step, after a pilot of half as many.
         enough: number of instructions up to which more windows are stepped, estimated from the
             pilot.
-        guard: makes the context in which a run is stepped.
+        guard: creates the context in which a run is stepped.
 
     Raises:
         TargetError: no instruction in scope executes, or the run is not repeatable.
@@ -249,7 +249,7 @@ def profile_run(
         strata.append(known)
         if len(others):
             number = min(len(others), max(windows, fit))
-            # At equal distances from a random start: windows change with the progress of a run.
+            # Evenly spaced from a random start, because windows change in the course of a run.
             places = (rng.random() + np.arange(number)) * len(others) / number
             strata.append(stepper.step(np.sort(others)[places.astype(int)], len(others)))
     strata = [stratum for stratum in strata if stratum.executed]
@@ -282,7 +282,7 @@ def profile_calls(
 
     Args:
         windows: largest number of calls to step.
-        guard: makes the context in which a run is stepped.
+        guard: creates the context in which a run is stepped.
 
     Raises:
         WindowTooLong: too many instructions.
@@ -332,13 +332,13 @@ def profile_counted(
 
 
 def native_time_s(place: AttackPlace, counts: Executions) -> float | None:
-    """Return the CPU time of a native run until it has executed as much as has been counted, s.
+    """Return the CPU time that a native run needs to reach the given counts, s.
 
     Args:
         counts: execution counts of the first part of the run.
 
     Returns:
-        None if nothing in scope has been counted yet, or the native run ends before that.
+        None if nothing in scope has been counted yet, or the native run ends first.
     """
     run, image, _ = _counted(place, counts)
     if not run.executed:
@@ -472,7 +472,7 @@ class _Stepper:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
 
     def step(self, numbers: NDArray[np.int64], count: int) -> Stratum:
-        """Step the windows of these numbers, from 1 to `count`."""
+        """Step the windows with these numbers, each from 1 to `count`."""
         left = sorted(numbers.tolist())
         segments: list[Segment] = []
         while left:  # one pass, unless a function calls itself

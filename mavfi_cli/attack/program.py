@@ -67,7 +67,7 @@ def _require_attackable(path: Path) -> None:
         )
 
 
-_SHORT = 100_000  # instructions that are stepped rather than counted
+_SHORT = 100_000  # longest run that is stepped rather than counted, instructions
 _STEP_LIMIT_S = 1e-3  # for one stepped instruction, about forty times what it takes
 _WATCHING = 20.0  # largest slowdown of a run whose system calls are observed
 
@@ -102,7 +102,7 @@ class ProgramTarget:
         return self.objects or (self.name,)
 
     def context(self) -> Json:
-        """Return the entries of every record about the program."""
+        """Return the entries about the program in every record."""
         entries: Json = {
             "program": list(self.command.argv),
             "scope": list(self.scope_objects),
@@ -222,7 +222,7 @@ class _Workplace:
 
     @contextlib.contextmanager
     def _guard(self, tracee: Tracee) -> Iterator[None]:
-        """Give a stepped run a deadline; if it ends, compare it with the golden run."""
+        """Give a stepped run a deadline; if the run ends, compare it with the golden run."""
         wall_s = self._watching_s + self.limits.profile_steps * _STEP_LIMIT_S
         with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
             yield
@@ -396,7 +396,7 @@ class _Workplace:
 
 
 def _joined(parts: dict[str, bytes | None]) -> bytes:
-    """Join all outputs; with several, each follows its name."""
+    """Join all outputs; if there are several, precede each with its name."""
     pieces = [b"\0missing" if data is None else data for data in parts.values()]
     if len(pieces) == 1:
         return pieces[0]

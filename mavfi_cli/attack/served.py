@@ -1,6 +1,6 @@
-"""Starts a Python program, whose forks may be attacked, always in the same state.
+"""Starts a Python program, whose forks may be attacked, in the same state every time.
 
-Its memory depends only on its messages, so a corrupted pointer meets the same data in every
+Its memory depends only on its messages, so a corrupted pointer leads to the same data in every
 repetition. It runs without address randomisation, in a fixed environment, and with all bytecode
 cached. A fork of the attacking process would inherit traces of everything that ran there before.
 """
@@ -22,8 +22,8 @@ from mavfi_cli.fi.tracer import linux
 
 CHANNEL = 3  # file descriptor of the program's end of the socket
 _FILE_CLOCK = 5  # CLOCK_REALTIME_COARSE, which stamps files; `time.time_ns` runs ahead of it
-# It gets no other environment variables, so that its memory does not depend on the shell's
-# language, search path or virtual environment.
+# The program gets no other environment variables, so that its memory does not depend on the
+# shell's language, search path or virtual environment.
 _KEPT = ("HOME", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "PYTHONPATH")
 _FIXED = {
     "LANG": "C.UTF-8",
@@ -70,7 +70,7 @@ class ServedProcess:
 
     def _start(self) -> None:
         self.connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        choose_caches()  # before the first program, which would do so alone otherwise
+        choose_caches()  # before the first program, which would otherwise choose its own
         environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
         output = (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)
         actions = [

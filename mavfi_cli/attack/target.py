@@ -43,9 +43,9 @@ class RunLimits:
     factor: float = 10.0  # multiple of the golden CPU time and duration
     cpu_grace_s: float = 1.0
     golden_s: float = 120.0  # wall time of a fault-free run
-    wall_grace_s: float = 5.0  # for delays on a loaded machine; only a blocked target waits as long
+    wall_grace_s: float = 5.0  # for delays on a loaded machine; only a blocked target uses it up
     follow_window: int = 64  # instructions after a destination fault
-    profile_steps: int = 2_000_000  # of one window
+    profile_steps: int = 2_000_000  # limit of one window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ class JudgedPlace(AttackPlace, Protocol):
         """The limits beyond which a run counts as hung."""
 
     def context(self) -> Json:
-        """Return the entries of every record about the target."""
+        """Return the entries about the target in every record."""
 
     def profile(self, rng: np.random.Generator, *, windows: int, watch: Watch) -> TargetProfile:
         """Step the golden run, or a sample of it."""
@@ -122,12 +122,12 @@ def judged(
     *,
     tolerance: float | None,
 ) -> tuple[RunOutcome, Difference | None]:
-    """Return the outcome of a run, and its difference if that is known.
+    """Return the outcome of a run, and its difference from the golden run if known.
 
     Args:
         ended: how the run ended; None if it exceeded its limit.
         output: its output; None if incomplete.
-        compare: returns the difference of the golden and another output, or None.
+        compare: returns the difference between the golden and another output, or None.
         tolerance: largest relative difference that is benign; None if every byte counts.
     """
     if ended is None:

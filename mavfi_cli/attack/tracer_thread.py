@@ -1,4 +1,4 @@
-"""Traces a node that keeps running, in a thread beside the code that uses the node.
+"""Traces a node that keeps running, in a thread separate from the code that uses the node.
 
 ptrace obeys only the thread that attached.
 """

@@ -75,7 +75,7 @@ def _unlinked(path: str) -> str:
 
 
 def _place(path: str, folder: Path) -> str:
-    """Return the path relative to a folder, or an empty text if it is outside."""
+    """Return the path relative to a folder, or an empty string if it is outside."""
     place = os.path.relpath(_unlinked(path), os.path.realpath(folder))
     return "" if PurePosixPath(place).parts[:1] == ("..",) else place
 

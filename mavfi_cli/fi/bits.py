@@ -27,7 +27,7 @@ class Field(Enum):
     ANY = "any"
 
 
-# Codes of struct for a value, and for the unsigned integer of the same size.
+# struct format codes of a value and of the unsigned integer of the same size.
 _FORMATS = {
     "float64": ("<d", "<Q"), "float32": ("<f", "<I"), "int8": ("<b", "<B"), "int16": ("<h", "<H"),
     "int32": ("<i", "<I"), "int64": ("<q", "<Q"), "bool": ("<?", "<B"),
@@ -45,7 +45,7 @@ class BitType:
 
     @classmethod
     def raw(cls, size_bytes: int) -> BitType:
-        """Return a register or memory operand of `size_bytes` bytes, without fields."""
+        """Return the type of a register or memory operand of `size_bytes` bytes, without fields."""
         width = 8 * size_bytes
         return cls(name=f"raw{width}", width=width, fields={Field.ANY: range(width)})
 
@@ -95,7 +95,7 @@ class BitType:
         return tuple(sorted(candidates[int(index)] for index in chosen))
 
     def pattern(self, value: Scalar) -> int:
-        """Return the bits of a value; a float32 is rounded to the nearest representable first."""
+        """Return the bits of a value; a float32 is first rounded to the nearest binary32 value."""
         of_value, of_pattern = _FORMATS[self.name]
         return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
 
@@ -140,7 +140,7 @@ BOOL = BitType(name="bool", width=1, fields={Field.ANY: range(1)})
 
 
 def bits_of(mask: int) -> tuple[int, ...]:
-    """Return the numbers of the set bits of a mask in ascending order."""
+    """Return the indices of the set bits of a mask in ascending order."""
     return tuple(bit for bit in range(mask.bit_length()) if mask >> bit & 1)
 
 

@@ -38,14 +38,14 @@ class When(Enum):
 class Effect(Enum):
     """The change that a corruption makes to a value, to a message on a link, or to a process."""
 
-    FLIP = "flip"  # of a process: it is killed
+    FLIP = "flip"  # on a process: it is killed
     ZERO = "zero"
     RANDOM = "random"  # all bits are replaced by random ones
-    FREEZE = "freeze"  # the value stays as it is at the first strike
+    FREEZE = "freeze"  # the value stays what it was at the first strike
     DROP = "drop"
     LATE = "late"  # late=SECONDS
     TWICE = "twice"
-    SWAP = "swap"  # the message follows the next one of its kind
+    SWAP = "swap"  # the message is delivered after the next one of its kind
     STOP = "stop"  # the process is stopped
     SLOW = "slow"  # slow=SHARE of a processor
 
@@ -119,8 +119,8 @@ class Corruption:
         """Refuse a corruption of bits that a type does not have.
 
         Raises:
-            FaultError: an exact bit or the field is missing, or the field has too few bits; or the
-                effect is not one on a value.
+            FaultError: an exact bit or the field is missing, the field has too few bits, or the
+                effect does not apply to values.
         """
         require_effect(name, self.effect, OF_VALUES)
         if bits is not None:
@@ -133,7 +133,7 @@ class Corruption:
 
 
 def require_effect(name: str, effect: Effect, known: Sequence[Effect]) -> None:
-    """Refuse an effect that a target does not have. Raises FaultSpecError."""
+    """Refuse an effect that a target does not support. Raises FaultSpecError."""
     if effect not in known:
         values = ", ".join(own.value for own in known)
         raise FaultSpecError(f"{name}: effect must be one of {values}, got {effect.value}")
@@ -146,8 +146,7 @@ class SourceFault:
     Attributes:
         states: the attacked states, all of one message. Several states are struck together,
             with separate bits.
-        bits: the exact bits of every state if they are given, as in a replay; otherwise they
-            are drawn.
+        bits: the exact bits of every state, as in a replay; None draws them.
     """
 
     states: tuple[State, ...]
@@ -174,8 +173,8 @@ def draw_fault(
     """Draw the fault of a target and a seed.
 
     Args:
-        target: a stage, a state, or a group of states. From a stage, one state with the
-            corruption's field is drawn; from a group, one state, unless `together`.
+        target: a stage, a state, or a group of states. From a stage, one state that has the
+            corruption's field is drawn; from a group, one state is drawn unless `together` is set.
         together: strike all states of the target's group at once, as the paper's Table III does
             with the three components of the acceleration.
         bits: exact bits, the same for all states; None draws them at the strike.
@@ -184,7 +183,7 @@ def draw_fault(
 
     Raises:
         UnknownName: no such stage, state or group.
-        FaultSpecError: a bit outside the width, a field that the type does not have.
+        FaultSpecError: a bit is outside the width, or the type lacks the field.
     """
     rng = Stream.FAULT.generator(seed, "site")
     states = _states(target, rng, together, corruption.field, known, wholes)
@@ -236,8 +235,8 @@ def inject(
 ) -> Value:
     """Return the value with flipped bits, or a copy of the array with one corrupted element.
 
-    The same arguments give the same flip. An injection into the result with the same seed and the
-    same bits restores the value.
+    The same arguments give the same flip. Injecting into the result with the same seed and the same
+    bits restores the value.
 
     Args:
         value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any

@@ -42,7 +42,7 @@ _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Comman
 
 
 class Moment(NamedTuple):
-    """The state of the mission at one moment, with which triggers are compared."""
+    """The mission's state at one moment, against which triggers are checked."""
 
     stamp_s: float
     flight_s: float  # since the companion took over
@@ -114,7 +114,7 @@ class NoInjector:
         return message
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """Return the active plan from this tick on; `index` is its current waypoint."""
+        """Return the active plan, corrupted if it is struck; `index` is its current waypoint."""
         return trajectory
 
     def strike(self, moment: Moment) -> None:
@@ -122,12 +122,12 @@ class NoInjector:
 
 
 class Injector(NoInjector):
-    """The schedule and the strikes of one fault. A subclass strikes messages or a memory.
+    """The schedule and the strikes of one fault. Subclasses strike messages or memory.
 
     Args:
-        rng: draws the time of a random trigger first.
+        rng: random generator, which first draws the time of a random trigger.
         shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
-            uniformly over it, so that it is always reached.
+            uniformly below it, so that every flight reaches it.
         listener: called with every strike before the mission continues.
     """
 
@@ -188,7 +188,7 @@ class Injector(NoInjector):
         return True
 
     def _is_triggered(self, moment: Moment) -> bool:
-        """Return True if the trigger has occurred. Invocations are counted with the messages."""
+        """Return True if the trigger has occurred; `_due` checks invocations."""
         trigger = self._trigger
         return {
             When.TIME: moment.flight_s >= trigger.number - 1e-9,
@@ -318,7 +318,7 @@ def rehearsed(fault: SourceFault, seed: int) -> tuple[float, Strike]:
 
     Returns:
         The moment as a fraction of the shortest possible flight, and a strike with the bits of each
-        component. In a flight the bits are others if the last waypoint of a plan is struck.
+        component. In a flight, the bits differ if the last waypoint of a plan is struck.
     """
     injector = SourceInjector(
         fault, seed=seed, shortest_flight_s=1.0, listener=lambda _strike: None
@@ -335,12 +335,12 @@ Memory = Mapping[str, NDArray[Any]]
 
 
 class MemoryInjector(Injector):
-    """Injects one fault into a memory during one mission: into one element of one array.
+    """Injects one fault into one element of an array in memory during one mission.
 
-    It attacks the memory of a detector: its thresholds, means and weights.
+    The memory is that of a detector: its thresholds, means and weights.
 
     Args:
-        array: the attacked array; None draws one with a probability in proportion to its bits.
+        array: the attacked array; None draws one in proportion to its size in bytes.
         trigger: when to strike; an invocation is a control tick.
         shortest_flight_s, listener: as for `Injector`.
 
@@ -350,7 +350,7 @@ class MemoryInjector(Injector):
     Raises:
         UnknownName: no array has this name.
         FaultError: the array's elements do not have these bits.
-        FaultSpecError: the array has no elements, or the field too few bits.
+        FaultSpecError: the array has no elements, or the field has too few bits.
     """
 
     _awaits = "control tick"
@@ -466,6 +466,6 @@ class Follower:
             self._become(Activation.OVERWRITTEN)
 
     def _become(self, activation: Activation) -> None:
-        """Set the activation. A later strike never replaces WITHHELD of an earlier one."""
+        """Set the activation, unless an earlier strike left it at WITHHELD."""
         if self.activation is not Activation.WITHHELD:
             self.activation = activation

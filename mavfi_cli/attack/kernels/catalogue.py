@@ -31,18 +31,18 @@ if TYPE_CHECKING:
     from mavfi_cli.attack.kernels.scope import KernelScope
 
 Array = NDArray[np.generic]
-# A function does work that is not part of the kernel. It is called after the kernel has ended.
+# A callable does work that is not part of the kernel. It is called after the kernel has ended.
 Output = dict[str, Array | Callable[[], Array]]
 Numbers = dict[str, Array]
 
 Call = Callable[[], Output]
-_FILLED_MB_PER_S = 512  # least rate of a loop that allocates
+_FILLED_MB_PER_S = 512  # minimum rate of a loop that allocates
 _POSES = 5  # number of poses from which the collision check looks ahead
 _SMALL = 1e-6  # largest unnoticeable relative difference of numbers
-_HALF_A_VOXEL_M = 0.1  # finer than the map; also of a path
-_A_TICK_S = 0.1  # of a foreseen collision
+_HALF_A_VOXEL_M = 0.1  # largest unnoticeable difference of a path; finer than the map
+_A_TICK_S = 0.1  # largest unnoticeable shift of a foreseen collision
 
-# Errors that numpy raises for an array with a broken header, beside ValueError.
+# Errors that numpy raises for an array with a broken header, besides ValueError.
 _DAMAGE = (
     OSError, EOFError, SyntaxError, MemoryError, TypeError, OverflowError, SystemError,
     tokenize.TokenError,
@@ -139,7 +139,7 @@ def _maps(golden: Numbers, output: Numbers) -> Difference:
 def _occupied(output: Numbers) -> set[tuple[int, int, int]]:
     occupied: set[tuple[int, int, int]] = set()
     for x, y, z, size in occupied_leaves(output["payload"].tobytes()).tolist():
-        if size > 64:  # a corrupted stream: one huge cube stands for itself
+        if size > 64:  # a corrupted stream: a huge cube counts as one voxel
             occupied.add((x, y, z))
             continue
         occupied.update(
@@ -346,9 +346,9 @@ class Kernel:
 
     @property
     def hang_s(self) -> float:
-        """CPU time beyond the golden run's after which a run counts as hung, s.
+        """CPU time beyond that of the golden run after which a run counts as hung, s.
 
-        A runaway allocation fills the memory three times as fast, so it crashes before it hangs.
+        A runaway allocation fills the memory in a third of this time, so it crashes first.
         """
         return self.memory_mb / _FILLED_MB_PER_S
 
@@ -507,7 +507,7 @@ def _own(path: Path) -> Kernel:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None or not path.is_file():
         raise TargetError(str(path), "no such file")
-    sys.path.insert(0, str(path.parent))  # as for a script: modules beside it can be imported
+    sys.path.insert(0, str(path.parent))  # as for a script: modules next to it can be imported
     module = importlib.util.module_from_spec(spec)
     sys.modules.setdefault(path.stem, module)  # dataclasses look up their module there
     try:
@@ -526,8 +526,8 @@ def select(names: Iterable[str]) -> tuple[str, ...]:
     Built-in kernels come first, in the order of the pipeline.
 
     Raises:
-        UnknownName: there is no kernel of a name.
-        TargetError: a file has no kernel, or several kernels have one name.
+        UnknownName: no kernel has one of the names.
+        TargetError: a file has no kernel, or several kernels share a name.
     """
     chosen = list(names)
     files = [str(Path(name).resolve()) for name in chosen if name.endswith(".py")]

@@ -33,7 +33,7 @@ from mavfi_cli.fi.tracer.image import (
 KERNELS = ("point_cloud", "octomap", "collision_check", *OUR_PLANNERS, "control")
 
 # A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
-# The classes that all planners call belong to it too. Mangled name, and the end of its class.
+# The classes that all planners call belong to it too. Each entry: mangled class name, and its end.
 _OMPL = {"rrtstar": ("7RRTstar", ""), "rrt": ("3RRT", "E"), "rrtconnect": ("10RRTConnect", "")}
 _OMPL_SHARED = ("4ompl4base20RealVectorStateSpace", "4ompl4base29PathLengthOptimizationObjective")
 _OCTOMAP_INSERT = (
@@ -71,8 +71,8 @@ class KernelScope:
         inner: functions of the kernel. If it executes too many instructions to profile them all,
             invocations of these functions are sampled. For a planner node, windows that begin at
             them are sampled, and the first function is the search.
-        end: an optional instruction. Nothing is attacked from its first execution on, because
-            only the output is written then.
+        end: an optional instruction. Nothing is attacked once it is reached, because only
+            the output is written then.
     """
 
     kernel: str
@@ -138,7 +138,7 @@ def node_scope(node: str, planner: str) -> KernelScope:
     """Find the entry and the scope of a mission node's work in this process.
 
     A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
-    after that is in scope up to the reply: the tests of straight segments and of pieces of the
+    after that, up to the reply, is in scope: the tests of straight segments and of pieces of the
     trajectory, and the search if there is one.
 
     Raises:
@@ -260,7 +260,7 @@ def _object_of(image: Image, prefix: str, folder: str = "") -> str:
 
 
 def _part(functions: Iterable[Function]) -> Part:
-    """Return the code of functions, including code between two of them on the same page."""
+    """Return the code of functions, including gaps of less than a page between them."""
     spans: list[range] = []
     for function in functions:
         start, end = function.start, function.start + function.size

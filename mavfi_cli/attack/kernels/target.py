@@ -79,7 +79,7 @@ class KernelTarget:
 
 
 class _KernelPlace:
-    """Runs one kernel in forks of one template; use it only in the thread that made it.
+    """Runs one kernel in forks of one template; use it only in the thread that created it.
 
     Attributes:
         inputs: one place per input of the kernel. All share one template, which belongs to the
@@ -188,7 +188,7 @@ class _KernelPlace:
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:
-        """Read times and output, or error, of the last run; None if they are incomplete."""
+        """Read the times and the output, or error, of the last run; None if they are incomplete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None

@@ -1,11 +1,11 @@
-"""Counts executions of instructions, up to one stop by a detour, or over a whole run.
+"""Counts executions of instructions: up to one stop, by a detour, or over a whole run.
 
 The k-th execution of an instruction is reached by counting. A *detour* counts inside the target, in
 a few nanoseconds per execution. A jump to a page of ours replaces the bytes of the counted
 instruction. The code there counts down without changing flags or stack, executes the replaced
-instructions and jumps back. At zero it stops at a breakpoint instead. No jump may lead between the
-replaced instructions. If they have fewer than five bytes, a short jump leads to five unused bytes
-nearby, which hold a second jump.
+instructions and jumps back. At zero it stops at a breakpoint instead. No jump may lead into the
+middle of the replaced instructions. If they have fewer than five bytes, a short jump leads to five
+unused bytes nearby, which hold a second jump.
 
 The population of a program that is too long to be stepped consists of its execution counts.
 Instructions of a block always execute together and have equal counts. So a frequent instruction is
@@ -51,7 +51,7 @@ class _DetourCode:
 
 
 class Counting(Enum):
-    """Counting methods, from the fastest, which changes the most code."""
+    """Counting methods, fastest first; the fastest changes the most code."""
 
     FAR_DETOUR = "detour over unused bytes"
     DETOUR = "detour"
@@ -63,9 +63,9 @@ class Detour:
     """The location of a detour that counts the executions of an instruction.
 
     Attributes:
-        size: bytes of the instructions that the detour replaces; no jump leads between them.
-        via: distance from the instruction to the unused bytes of a second jump; 0 if one jump is
-            enough.
+        size: bytes of the instructions that the detour replaces; no jump leads into their middle.
+        via: distance from the instruction to the unused bytes that hold a second jump; 0 if one
+            jump is enough.
     """
 
     size: int
@@ -242,7 +242,7 @@ class CountedRun:
         )
 
     def without(self, methods: Container[Counting]) -> CountedRun:
-        """Return the same run without some counting methods, which reaches fewer executions."""
+        """Return the same run without some counting methods; it reaches fewer executions."""
         detours = [
             None if detour and detour.counting in methods else detour for detour in self.detours
         ]
@@ -251,7 +251,7 @@ class CountedRun:
 
     @functools.cached_property
     def reached(self) -> NDArray[np.int64]:
-        """(n,) number of executions, from the first, that can be reached."""
+        """(n,) number of executions that can be reached, counted from the first."""
         detoured = np.array([self.detours[place] is not None for place in self.places])
         return np.where(detoured, self.counts, np.minimum(self.counts, _BY_BREAKPOINT))
 
@@ -270,7 +270,7 @@ class CountedRun:
         return 1.0 - self.executed / max(1, int(self.counts.sum()))
 
     def _at(self, position: int) -> tuple[int, int]:
-        """Return the index and number of the execution, from 1, of one executed instruction."""
+        """Return the index of one executed instruction, and its execution number, from 1."""
         index = int(np.searchsorted(self._ends, position, side="right"))
         return index, position - int(self._ends[index] - self.reached[index]) + 1
 
@@ -281,12 +281,12 @@ class CountedRun:
     def trigger(
         self, position: int, locate: Locate, _: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger of one executed instruction, and k, the number of its execution."""
+        """Return the trigger of one executed instruction, and k, its execution number."""
         index, k = self._at(position)
         return self.stages(index, k, locate), k
 
     def stages(self, index: int, k: int, locate: Locate) -> tuple[CountedStop, ...]:
-        """Return the stages to execution k of an instruction."""
+        """Return the trigger's stages up to execution k of an instruction."""
         place = int(self.places[index])
         here, there = (locate(int(self.addresses[at])) for at in (index, place))
         detour = self.detours[place]

@@ -5,9 +5,10 @@ address or the control flow. It is *written* if it holds part of the result; a 3
 clears the upper half, a VEX-encoded one all other bits (Intel SDM volume 1, sections 3.4.1.1 and
 14.1.1). These bits are overwritten, but are not part of the result.
 
-Capstone decodes. `vectors` has the tables of vector instructions. This module has the exceptions of
-all others, the stack slots of push, pop, call and ret, and the properties that the tracer needs to
-step over an instruction. tests/fi/tracer/test_operands.py compares them with real executions.
+Capstone does the decoding. `vectors` has the tables for vector instructions. This module has the
+exceptions for all others, the stack slots of push, pop, call and ret, and the properties that the
+tracer needs to step over an instruction. tests/fi/tracer/test_operands.py checks all of it
+against real executions.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class MemoryUse:
     displacement: int
     segment: str | None = None
     size: int
-    mask: int  # bits of it that are read or written
+    mask: int  # bits of the operand that are read or written
     reads: bool
     writes: bool
 
@@ -72,7 +73,7 @@ class MemoryUse:
         return f"{self.size} bytes at {'+'.join(parts)}{self.displacement:+#x}"
 
     def address(self, instruction: Instruction, read: Callable[[str], int]) -> int:
-        """Return the address before execution; `read` returns the value of a register."""
+        """Return the address before the instruction executes; `read` returns a register's value."""
 
         def value(name: str | None) -> int:
             named = _GENERAL.get(name or "")
@@ -94,7 +95,7 @@ class Instruction:
     reads: tuple[RegisterUse, ...]
     writes: tuple[RegisterUse, ...]
     memory: tuple[MemoryUse, ...]
-    elements: tuple[str | None, str | None]  # float64 or float32, if it reads or writes them
+    elements: tuple[str | None, str | None]  # read, written: float64, float32 or neither
     scalar: bool  # computes with the lowest element of its registers only
     branches: bool  # a jump, a call or a return
     run_over: bool  # a single step does not suffice or leaves a trace
@@ -144,7 +145,7 @@ _INTEGERS = re.compile(r"v?p\w*s[ds]$")  # of signed doublewords: pmaxsd, pabsd
 
 
 def _elements(mnemonic: str) -> tuple[str | None, str | None]:
-    """Return the floats that an instruction reads and writes."""
+    """Return the float types that an instruction reads and writes."""
     if match := _CONVERSION.match(mnemonic):
         return _FLOATS.get(match[1]), _FLOATS.get(match[2])
     element = None if _INTEGERS.match(mnemonic) else _FLOATS.get(mnemonic[-2:])
@@ -195,7 +196,7 @@ def _stack(decoded: Any) -> list[MemoryUse]:
     ]
 
 
-# -- registers by their names
+# -- registers by name
 
 
 _X87 = re.compile(r"st\((\d)\)$")
@@ -232,9 +233,9 @@ _GENERAL = _general_names()
 
 @functools.cache
 def _named(name: str) -> _Named | None:
-    """Return the register of a name; None for flags, segments and control words.
+    """Return the register with this name; None for flags, segments and control words.
 
-    A vector register has its 512-bit name on every processor, so that records are equal.
+    A vector register gets its 512-bit name on every processor, so that records agree.
     """
     if name in _GENERAL:
         return _GENERAL[name]
@@ -251,10 +252,10 @@ class _Operands:
 
     reads: dict[str, RegisterUse] = field(default_factory=dict)
     writes: dict[str, RegisterUse] = field(default_factory=dict)
-    explicit: tuple[Touched, ...] = ()  # of each operand that the assembler names
+    explicit: tuple[Touched, ...] = ()  # one per operand that the assembler names
 
     def touch(self, name: str, bits: Touched, *, explicit: bool = False) -> None:
-        """Add bits of a register, counted from the lowest bit of the name."""
+        """Add bits of a register, counted from the lowest bit of the named part."""
         named = _named(name)
         if named is None:
             return
@@ -346,7 +347,7 @@ def _bits(decoded: Any) -> tuple[Touched, ...]:
 
 
 def _default(op: Any, width: int) -> Touched:
-    """Return the bits that capstone's access flags give, as wide as the operand's name."""
+    """Return the bits according to capstone's access flags, as wide as the named operand."""
     mask = low(width)
     reads, writes = bool(op.access & capstone.CS_AC_READ), bool(op.access & capstone.CS_AC_WRITE)
     whole = mask if width < 32 else low(max(64, width))
@@ -432,7 +433,7 @@ def _written(mnemonic: str, name: str) -> Touched:
 
 
 def _hidden(decoded: Any) -> Iterator[tuple[str, Touched]]:
-    """Yield registers that capstone omits: of system calls, the x87 stack top, cmpxchg."""
+    """Yield registers that capstone omits, for system calls, x87 instructions and cmpxchg."""
     name = decoded.mnemonic.split()[-1]
     if name == "syscall":
         for register in _CALL_READS:
@@ -456,7 +457,7 @@ _VECTOR_TESTS = re.compile(r"v?u?comis|v?p?test(p[sd])?$|v?pcmp[ei]str|kortest|k
 _ARITHMETIC_FLAGS = tuple(name for name in FLAG_BITS if name != "df")
 _STRINGS = re.compile(r"(movs|stos|lods|scas|cmps|ins|outs)[bwdq]$|pushf")
 _DIRECTIONS = ("cld", "std", "popf")
-# Flags that capstone's tables omit: read, written.
+# Flags that capstone's tables omit: those read, then those written.
 _LACKING_READS = {
     **dict.fromkeys(("rcl", "rcr", "cmc"), ("cf",)), "lahf": ("cf", "pf", "af", "zf", "sf"),
 }  # fmt: skip
@@ -475,11 +476,11 @@ def _flags(decoded: Any, all_of: _Operands, vector: bool) -> None:
     mnemonic = decoded.mnemonic.split()[-1]
     if vector or mnemonic.startswith(
         "k"
-    ):  # capstone has the flags of an instruction of the same name
+    ):  # capstone gives the flags of another instruction with the same name
         for name in _ARITHMETIC_FLAGS if _VECTOR_TESTS.match(mnemonic) else ():
             all_of.flag(name, reads=False, defined=True, clears=True)
         return
-    by_count = mnemonic in _SHIFTS and decoded.op_str.endswith("cl")  # zero changes no flag
+    by_count = mnemonic in _SHIFTS and decoded.op_str.endswith("cl")  # a zero count changes no flag
     if _STRINGS.match(mnemonic):
         all_of.flag("df", reads=True, defined=True, clears=False)
     elif mnemonic.startswith(_DIRECTIONS):

@@ -3,7 +3,7 @@
 Every result names its strategy: a sampling rule with a fault model, or an emulated injector, for
 comparison with published numbers. The released sources are the reference: ROSFI as
 in MAVBench/MAV_apps, branch mavfi, and PINFI as in DependableSystemsLab/pinfi, e14c129.
-docs/reference/instructions.md describes both and our differences.
+docs/reference/instructions.md describes both and how ours deviate.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ JUMP_FLAGS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstructionCorruption:
-    """The inverted bits, relative to one execution of one instruction."""
+    """The bits to invert at one execution of one instruction."""
 
     site: Site
     role: Role
@@ -69,10 +69,10 @@ class InstructionCorruption:
     operand: str  # as the assembler names it
     bits: tuple[int, ...] = ()  # bits of the full register, opcode bytes or memory operand
     memory_operand: int = 0  # index among the instruction's memory operands
-    inverts: str = ""  # only bits that invert the decision of a conditional jump are flipped
+    inverts: str = ""  # a conditional jump: flip only the bits that invert its decision
 
     def struck(self, flags: int) -> tuple[int, ...]:
-        """Return the inverted bits, given all flags if the corruption inverts a jump.
+        """Return the bits to invert; `flags` (all flags) matters only if a jump is inverted.
 
         If the jump tests two conditions ("below" or "equal"), all that hold are negated. If none
         holds, "equal" is made to hold.
@@ -117,7 +117,7 @@ class FaultModel:
     sites: frozenset[Site] = DATA_REGISTERS
     roles: frozenset[Role] = frozenset((Role.SOURCE, Role.DESTINATION))
     implicit: bool = True
-    field: Field = Field.ANY  # sign, exponent, mantissa: of the elements of float instructions
+    field: Field = Field.ANY  # sign, exponent, mantissa: only in elements of float instructions
     count: int = 1
 
     @classmethod
@@ -273,7 +273,7 @@ class Strategy:
     name: str
     rule: Rule
     model: FaultModel
-    imitates: Draw | None = None  # draws as another injector, in place of the model
+    imitates: Draw | None = None  # draws like another injector, instead of the model
     attempts: int = 1  # time rules: maximum number of attempts
     retry_s: float = 0.0  # time rules: delay between attempts
     whole_process: bool = False  # also hits code out of scope
@@ -287,7 +287,7 @@ class Strategy:
 
         Raises:
             UnknownName: no such rule or compatibility mode; the message suggests the nearest.
-            FaultSpecError: an emulated injector chooses operands and bits by its own rule.
+            FaultSpecError: an emulated injector, which chooses by its own rule, is given a model.
         """
         if compat is not None:
             if compat not in COMPAT:
@@ -315,8 +315,8 @@ class Strategy:
 # -- other injectors
 
 _ROSFI_MODEL = FaultModel(sites=frozenset((Site.GENERAL, Site.VECTOR)))
-# ROSFI refuses these registers, so that r8 to r13 and XMM get nearly all faults (regManip.cpp,
-# rosfi.cpp).
+# ROSFI refuses these registers, so r8 to r13 and the XMM registers get nearly all faults
+# (regManip.cpp, rosfi.cpp).
 _ROSFI_REFUSED = frozenset(
     "rip rax rbx rcx rdx rsi rdi rbp rsp r14 r15 esi edi eax ecx edx bl cl dl".split()  # noqa: SIM905
 )
@@ -328,7 +328,7 @@ _VECTOR = re.compile(r"([xyz])mm\d*(\d)$")
 def _draw_rosfi(
     instruction: Instruction, _following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw as ROSFI: move bits 52 to 62 (110 to 126 of XMM) to byte 0, refuse most registers."""
+    """Draw like ROSFI: map bits 52 to 62 (110 to 126 of XMM) to byte 0, refuse most registers."""
     drawn = _draw_corruption(instruction, _ROSFI_MODEL, rng)
     if drawn is None or drawn.operand in _ROSFI_REFUSED:
         return None
@@ -340,12 +340,12 @@ def _draw_rosfi(
 def _draw_pinfi(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw as PINFI: one bit of a register that the instruction writes, after it has executed.
+    """Draw like PINFI: one bit of a register that the instruction writes, after it has executed.
 
-    Flags are flipped only if no other register is written: to invert the conditional jump that
-    follows, or else as 64 bits, most of which are not flags and change nothing. Without such a
-    jump, a bit of the memory operand of an instruction that also writes memory is flipped before
-    it executes.
+    If only flags are written, the conditional jump that follows is inverted. Without such a jump,
+    a bit of a memory operand that the instruction also writes is flipped before the instruction
+    executes. If it writes no memory, one of 64 bits of the flags register is drawn. Most of these
+    are not flags, and drawing one changes nothing.
     """
     written = [use for use in instruction.writes if use.mask]
     if instruction.branches or not written:
@@ -369,10 +369,10 @@ def _draw_pinfi(
 def _draw_pinfi_with_bugs(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw as PINFI with its bugs: the last digit of its name numbers a vector register.
+    """Draw like PINFI with its bugs: it reads only the last digit of a vector register's name.
 
-    So it takes xmm10 to xmm15 for xmm0 to xmm5, and looks for a bit of a YMM register in its upper
-    half.
+    So it takes xmm10 to xmm15 for xmm0 to xmm5. It also looks for the bits of a YMM register in
+    its upper half.
     """
     drawn = _draw_pinfi(instruction, following, rng)
     if drawn is None or (match := _VECTOR.match(drawn.operand)) is None:

@@ -54,7 +54,7 @@ class _ElfFacts:
 
     @functools.cached_property
     def functions(self) -> tuple[Function, ...]:
-        """All functions, ascending; read on first use, because few objects of a process need it."""
+        """All functions, ascending; read on first use, because most objects never need them."""
         try:
             with open(self.path, "rb") as stream:
                 return tuple(sorted(set(_functions(ELFFile(stream)))))
@@ -64,8 +64,8 @@ class _ElfFacts:
     def function_at(self, address: int) -> Function | None:
         """Return the function that holds a linked address.
 
-        If several start at one address, the largest one with the last name is returned. A
-        function without a size extends to the next.
+        If several start at one address, the largest is returned, or the last by name among equals.
+        A function without a size extends to the next.
         """
         end = bisect.bisect_right(self.functions, address, key=attrgetter("start"))
         if not end:
@@ -182,7 +182,7 @@ class _LoadedObject:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
-    """Compiled code without a file, named by its build or by the bytes in memory."""
+    """Compiled code without a file, identified by its build or by its bytes in memory."""
 
     span: range  # addresses
     build_id: str = ""
@@ -347,7 +347,7 @@ def _mappings(pid: int) -> Iterator[_Mapping]:
 
 
 def executable_mapping(pid: int, address: int) -> range:
-    """Return the executable mapping of an address: the region of a JIT-compiled kernel.
+    """Return the executable mapping that holds an address, such as a JIT-compiled kernel's.
 
     Raises:
         FaultError: nothing executable is mapped there.

@@ -156,7 +156,7 @@ def _invert(
 def _execute_corrupted(
     tracee: Tracee, instruction: Instruction, corruption: InstructionCorruption
 ) -> tuple[int, int]:
-    """Execute the corrupted bytes once, then restore the code: a transient fetch error."""
+    """Emulate a transient fetch error: execute the corrupted bytes once, then restore the code."""
     corrupted = bits.flip_bytes(instruction.raw, corruption.bits)
     tracee.memory.write(instruction.address, corrupted)
     seen = tracee.memory.read(instruction.address, len(corrupted))
@@ -208,11 +208,11 @@ def _follow(
 def strike(
     tracee: Tracee, fault: InstructionFault, *, window: int, patience_s: float = math.inf
 ) -> tuple[Injection | None, Followed]:
-    """Corrupt the target at the stop before the attacked instruction; follow the bits.
+    """Corrupt the target at the stop before the attacked instruction, and follow the bits.
 
     Args:
-        tracee: the process, stopped there.
-        fault: the fault; without a corruption nothing is done.
+        tracee: the process, stopped before that instruction.
+        fault: the fault; if it has no corruption, nothing is done.
         window: number of instructions for which a destination fault is followed.
         patience_s: wall-clock time for which it is followed.
 
@@ -239,7 +239,7 @@ def _touch(
     place: int,
     remaining: int,
 ) -> tuple[bool, int]:
-    """Return whether an instruction reads the remaining bits, and the bits that it leaves."""
+    """Return whether an instruction reads the remaining bits, and which remain after it."""
     if corruption.site is Site.MEMORY:
         return _touch_memory(tracee, current, place, remaining)
     register = corruption.register

@@ -1,7 +1,7 @@
-"""ptrace, a process's memory and its time limits: system calls, independent of the architecture.
+"""System calls for ptrace, process memory and time limits, independent of the architecture.
 
 Request and option numbers: `<sys/ptrace.h>` of Linux; see ptrace(2), personality(2).
-A stopped thread is named by its thread id. ptrace obeys only the thread that attached.
+A stopped thread is identified by its thread id. ptrace obeys only the thread that attached.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OPTION_EXITKILL = 1 << 20
 TRACE_OPTIONS = (
     1 | (1 << 1) | (1 << 2) | (1 << 3) | (1 << 4)
 )  # marked call stops, fork, vfork, clone, exec
-CALL_STOP = signal.SIGTRAP | 0x80  # of PTRACE_O_TRACESYSGOOD
+CALL_STOP = signal.SIGTRAP | 0x80  # with PTRACE_O_TRACESYSGOOD
 EVENT_FORK, EVENT_VFORK, EVENT_CLONE, EVENT_EXEC, EVENT_STOP = 1, 2, 3, 4, 128
 WALL = 0x4000_0000
 ADDR_NO_RANDOMIZE = 0x0040000
@@ -58,7 +58,7 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
     """Make one ptrace request; the result of a peek is unsigned.
 
     Raises:
-        OSError: with the errno of the request.
+        OSError: the request failed; it carries the errno.
     """
     ctypes.set_errno(0)
     result = int(_ptrace(number, tid, address, data))
@@ -84,7 +84,7 @@ def require_supported() -> None:
 
 
 def seize(tid: int, *, kill_with_tracer: bool) -> None:
-    """Attach without stopping; new threads and children are attached by the kernel.
+    """Attach to a thread without stopping it; the kernel attaches new threads and children.
 
     Raises:
         TracingForbidden: the operating system refuses; the message explains how to allow it.
@@ -99,7 +99,7 @@ def seize(tid: int, *, kill_with_tracer: bool) -> None:
 
 
 def get_registers(tid: int, note: int, buffer: ctypes.Array[ctypes.c_char]) -> int:
-    """Fill `buffer` with a register set; return the number of bytes that the kernel has."""
+    """Fill `buffer` with a register set; return the number of bytes that the kernel wrote."""
     vector = _IoVector(ctypes.addressof(buffer), len(buffer))
     request(GETREGSET, tid, note, ctypes.addressof(vector))
     return int(vector.length)
@@ -147,7 +147,7 @@ class Memory:
 
 @contextmanager
 def fixed_addresses() -> Iterator[None]:
-    """Programs that start in this context have no address-space randomisation: addresses repeat."""
+    """Start programs without address-space randomisation in this context: addresses repeat."""
     before = int(_personality(0xFFFF_FFFF))
     if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
         yield  # a sandbox may refuse; then only offsets repeat, not addresses
@@ -162,7 +162,7 @@ def share_processor(pid: int) -> None:
     """Pin the calling thread and the main thread of `pid` to the processor where `pid` ran last.
 
     Tracer and target alternate at every step, which is twice as fast on one processor. Nothing
-    unpins them, so call it only from a thread, and for a process, made for this.
+    unpins them, so call it only from a thread and for a process created for this purpose.
     """
     stat = Path(f"/proc/{pid}/stat").read_text()
     processor = int(stat.rpartition(")")[2].split()[36])  # field 39, proc_pid_stat(5)
@@ -215,7 +215,7 @@ class Status:
 
 
 def wait(tid: int) -> Status:
-    """Wait for the next report of one thread, or of any thread for -1.
+    """Wait for the next report about one thread, or about any thread if `tid` is -1.
 
     Raises:
         ChildProcessError: there is no thread to wait for.
@@ -228,8 +228,9 @@ class ProcessTimer:
     """A timer on one process; leaving its context cancels it.
 
     It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
-    `wall_s` have passed, whichever is set and comes first. `fired` is true from then on. If it
-    has killed a stopped process, the next request to it leaves the context without an error.
+    `wall_s` has passed, whichever is set and comes first. `fired` is true from then on. If the
+    timer has killed a stopped process, the next request to that process ends the context without
+    an error.
     """
 
     def __init__(

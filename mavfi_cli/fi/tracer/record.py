@@ -38,7 +38,7 @@ def planned(
 
     Args:
         image: image of the process, for symbols and build ids.
-        names_symbol: include the symbol; to read those of a large object takes seconds.
+        names_symbol: include the symbol; reading those of a large object takes seconds.
         context: further entries: seed, sampling rule, scope, kernel, program, run.
     """
     target = fault.target
@@ -64,7 +64,7 @@ def planned(
 
 
 def undrawn(**context: Any) -> FaultRecord:
-    """Return the record of a fault that will be drawn at its moment. `context` as for `planned`."""
+    """Return the record of a fault that is drawn when it strikes. `context` as for `planned`."""
     record = {
         "version": VERSION,
         "state": "planned",

@@ -1,4 +1,4 @@
-"""The fields of a fault record that mavfi reads, apart from the code that writes them."""
+"""The fields of a fault record that mavfi reads, separate from the code that writes them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FaultRecord(TypedDict, total=False):
     instruction: str
     instruction_bytes: str  # hexadecimal
     k: int
-    trigger: list[StageRecord]  # empty if the fault is drawn at a moment
+    trigger: list[StageRecord]  # empty if the fault is drawn when it strikes
     corruption: Json | None  # None: a null run
     build_ids: dict[str, str | None]
     injection: Json

@@ -1,8 +1,8 @@
 """Registers of a stopped x86-64 thread: general, flags, x87, MMX, XMM, YMM, ZMM, opmask.
 
 Layouts: `user_regs_struct` of `<sys/user.h>`; FXSAVE and XSAVE areas of Intel SDM volume 1,
-sections 10.5 and 13.4. The XSAVE offsets differ between processors: leaf 0xD of CPUID gives them
-(section 13.5), which a few bytes of machine code execute.
+sections 10.5 and 13.4. The XSAVE offsets differ between processors, so a few bytes of machine code
+read them from CPUID leaf 0xD (section 13.5).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ CALL_ARGUMENTS = ("rdi", "rsi", "rdx", "r10", "r8", "r9")  # of a system call
 
 @functools.lru_cache(maxsize=1)
 def widest_vector() -> str:
-    """Return the name of the full vector registers of this processor."""
+    """Return the prefix of this processor's widest vector registers: zmm, ymm or xmm."""
     offsets = _xsave_offsets()
     return "zmm" if ZMM_HIGH in offsets else "ymm" if AVX in offsets else "xmm"
 
@@ -161,7 +161,7 @@ class Registers:
         return int.from_bytes(b"".join(parts), "little")
 
     def write(self, name: str, value: int) -> None:
-        """Write a full register. Read it again for the value that the kernel stored.
+        """Write a full register. Read it back for the value that the kernel stored.
 
         Raises:
             OSError: the kernel refuses the value.

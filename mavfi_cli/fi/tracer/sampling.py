@@ -42,7 +42,7 @@ class Segment:
 
     @functools.cached_property
     def ranks(self) -> NDArray[np.int64]:
-        """(n,) number of the execution of its instruction at each position, from 1."""
+        """(n,) at each position, which execution of its instruction this is, from 1."""
         order = np.argsort(self.trace, kind="stable")
         ordered = self.trace[order]
         fresh = np.r_[True, ordered[1:] != ordered[:-1]]
@@ -54,10 +54,10 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stratum:
-    """The windows that begin at one instruction, of which some were stepped."""
+    """The windows that begin at one instruction; some of them were stepped."""
 
     segments: tuple[Segment, ...]
-    windows_in_run: int  # windows of the run; the stepped ones are a sample of them
+    windows_in_run: int  # all windows of the run; the stepped ones are a sample
     marker: Location | None = None  # None: the start of the run
     detours: bool = True  # whether detours count executions
 
@@ -92,7 +92,7 @@ class Stratum:
     def trigger(
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger of one executed instruction, and k, the number of its execution."""
+        """Return the trigger of one executed instruction, and k, its execution number."""
         return _plan_trigger(*self._at(position), locate, code_at if self.detours else None)
 
     def _at(self, position: int) -> tuple[Segment, int]:
@@ -125,14 +125,14 @@ def record_window(
     markers: Sequence[int] = (),
     watch: Callable[[int], None] | None = None,
 ) -> NDArray[np.int64]:
-    """Step from the current stop to the end of the program, of the function, or to a marker.
+    """Step from the current stop to the end of the program or function, or to a marker.
 
     Args:
         tracee: the process, stopped at the start of the window.
         scope: the code whose instructions are recorded.
         until_return: the target is at a function's entry; the window ends when it returns.
-        markers: addresses in scope; the window ends before the next execution of one. It
-            always contains the instruction at which the target is stopped.
+        markers: addresses in scope; the window ends before the next execution of one. The
+            window always contains the instruction at which the target is stopped.
         watch: called regularly with the number of instructions recorded since the last call.
 
     Raises:
@@ -227,10 +227,10 @@ def _plan_trigger(
     shortly before the target and then counts the target's executions, or uses a detour.
 
     Args:
-        code_at: 16 bytes of code at an address; None if there may be no detours.
+        code_at: 16 bytes of code at an address; None forbids detours.
 
     Returns:
-        The trigger, and k, the number of the execution of its instruction in the segment.
+        The trigger, and k, the execution number of its instruction in the segment.
     """
     target, k = locate(int(segment.trace[index])), int(segment.ranks[index])
     best = _Way(cost=k, stages=(CountedStop(target, k),))
@@ -242,7 +242,7 @@ def _plan_trigger(
 
 
 def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
-    """Count to the instruction before the target from which the cost is lowest."""
+    """Count to the instruction before the target that makes the cost lowest."""
     target, k = segment.trace[index], int(segment.ranks[index])
     first = max(0, index - _HORIZON)
     before = segment.trace[first:index] == target
@@ -333,10 +333,10 @@ def draw_fault_here(
     """Draw a fault in the instruction before which a thread has stopped.
 
     Args:
-        execution: number of the execution for the record.
+        execution: execution number to record.
 
     Returns:
-        The fault, or None and why there is none.
+        The fault, or None and the reason.
     """
     here = tracee.registers.ip
     if tracee.registers.system_call is not None and not plan.in_system_calls:

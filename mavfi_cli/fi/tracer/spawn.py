@@ -1,8 +1,8 @@
 """Starts a program under the tracer, and watches the system calls of one run.
 
 The program is stopped at its first instruction or its entry point. The system calls of a fault-free
-run show whether it starts threads or other programs, which are not followed, which files it writes,
-and why it may have failed.
+run show whether it starts threads or other programs (which are not followed), which files it
+writes, and why it may have failed.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ _TERMINAL_IOCTLS = frozenset((0x5401, 0x5402, 0x5403, 0x5404, 0x5413))  # TCGETS
 _IOCTL, _MAPS = 16, (9, 25)  # mmap, mremap
 _NAMES = {56: "clone", 57: "fork", 58: "vfork", 59: "execve", 322: "execveat", 435: "clone3"}
 
-# Number: arguments with the folder's descriptor (-1: none), the path, and the flags of open.
+# By call number: argument indices of folder descriptor, path and open flags (-1: none).
 _PATHS = {
     2: (-1, 0, 1), 257: (0, 1, 2),  # open, openat
     437: (0, 1, -1), 85: (-1, 0, -1), 76: (-1, 0, -1),  # openat2, creat, truncate
@@ -222,7 +222,7 @@ class ObservedRun:
 
 
 def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
-    """Run a stopped program to its end, at most `wall_s`, and watch its system calls."""
+    """Run a stopped program to its end, for at most `wall_s`, and watch its system calls."""
     observed, entering, number = ObservedRun(), True, 0
     with linux.ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=None, wall_s=wall_s) as alarm:
         while True:

@@ -1,4 +1,4 @@
-"""Compares everything that stopped forks of one process can remember.
+"""Compares all state that stopped forks of one process retain.
 
 A fork shares the pages of its process until it writes to them, and then owns a copy. So two forks
 can differ only in pages that one of them owns (bit 56 of the page map, proc_pid_pagemap(5)), in
@@ -6,11 +6,11 @@ registers, and in what their system calls have changed in the operating system. 
 same system calls, with the same arguments, have the same files, signals, threads and limits; the
 list of mappings and the state of signals are compared as well.
 
-Three things do not count: what lies below the stack pointer and its red zone, the vector registers,
-which no function keeps for its caller (System V ABI, section 3.2.1), and readings of a clock. A
-clock leaves numbers that differ between unstruck forks, too. All forks have to run on one
-processor, because the operating system writes its number into their memory (struct rseq, the area
-of restartable sequences that the C library registers for each thread).
+Three things are ignored: memory below the stack pointer and its red zone; the vector registers,
+which no function preserves for its caller (System V ABI, section 3.2.1); and clock readings, which
+differ even between unstruck forks. All forks must run on one processor, because the operating
+system writes the processor's number into their memory (struct rseq, the area of restartable
+sequences that the C library registers for each thread).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mavfi_cli.fi.tracer.tracee import Tracee
 
 _PAGE = 4096
-_OWN = np.uint64(1 << 56 | 1 << 62)  # of a page that no other process maps, or that is swapped out
+_OWN = np.uint64(1 << 56 | 1 << 62)  # flags: no other process maps the page; it is swapped out
 _RED_ZONE = 128  # bytes below the stack pointer that a function may use
 _KEPT_X87, _KEPT_SSE = slice(0, 5), slice(24, 28)  # control, status and tags; MXCSR
 _KERNEL_OWN = ("[vvar]", "[vvar_vclock]", "[vsyscall]", "[vdso]")
@@ -35,12 +35,12 @@ _SIGNALS = re.compile(r"^(?:Sig|Shd|Threads)\w*:.*", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoppedFork:
-    """A fork that is stopped where it begins a system call.
+    """A fork that is stopped at the start of a system call.
 
     Attributes:
-        calls: number and arguments of its system calls since the forks were alike.
-        clock: bytes that a clock has put into its memory, as unaligned copies may have them; they
-            count as zeros.
+        calls: number and arguments of its system calls since the forks were identical.
+        clock: bytes of a clock reading in its memory, where copies may be unaligned; they count as
+            zeros.
     """
 
     tracee: Tracee
@@ -68,7 +68,7 @@ class StoppedFork:
         return (self._process / "maps").read_text()
 
     def _own_pages(self) -> NDArray[np.int64]:
-        """Return the numbers of the pages that may not be those of the process."""
+        """Return the numbers of the pages that the fork may not share with the process."""
         numbers = []
         with (self._process / "pagemap").open("rb", buffering=0) as table:
             for line in self._maps().splitlines():
@@ -81,7 +81,7 @@ class StoppedFork:
         return np.concatenate(numbers)
 
     def _words(self, pages: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Return the contents of pages (n,) as words, with zeros where they do not count."""
+        """Return the contents of pages (n,) as words, with zeros for what is ignored."""
         memory, data = self.tracee.memory, bytearray()
         for run in np.split(pages, np.flatnonzero(np.diff(pages) != 1) + 1):
             data += memory.read(int(run[0]) * _PAGE, len(run) * _PAGE)
@@ -102,13 +102,13 @@ class StoppedFork:
 
 
 def remembers_the_same(struck: StoppedFork, unstruck: Sequence[StoppedFork]) -> bool:
-    """Return True if a struck fork cannot behave differently from unstruck ones from now on.
+    """Return True if a struck fork can no longer behave differently from unstruck ones.
 
     Args:
-        unstruck: two, whose differences show which words of memory hold readings of a clock.
+        unstruck: two forks; words of memory in which they differ hold clock readings.
 
     Raises:
-        OSError: the operating system does not show the memory.
+        OSError: the operating system does not allow the memory to be read.
     """
     forks = (struck, *unstruck)
     if any(fork._outline() != struck._outline() for fork in unstruck):

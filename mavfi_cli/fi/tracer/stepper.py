@@ -1,6 +1,6 @@
 """The compiled single-step loop, in which a step costs little more than its system calls.
 
-The loop returns to Python for code out of scope, a system call, a push of the flags or a signal.
+The loop returns to Python for code out of scope, a system call, a push or pop of flags or a signal.
 `ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
 """
 
@@ -16,11 +16,11 @@ from mavfi_cli.core.compiled import compiled
 from mavfi_cli.fi.tracer import linux
 
 _PEEKTEXT, _PEEKUSER, _SINGLESTEP = 1, 3, 9
-_OF_OWN_THREAD = 0x6000_0000  # __WALL and __WNOTHREAD, as `Tracee` waits
+_OF_OWN_THREAD = 0x6000_0000  # __WALL and __WNOTHREAD, as in `Tracee`
 _STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
 
 # Why recording returned: the trace is full, foreign code is next, a step over the next instruction
-# would leave traces, the report was not that of a step, the window is over.
+# would leave traces, the report was not that of a step, or the window is over.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
 _IP, _SP = 128, 152  # offsets in `struct user`
 NO_END = np.array([-1, 0], np.int64)
@@ -36,7 +36,7 @@ _wait4: Any = types.ExternalFunction(
 
 @compiled
 def _is_repeated(word: int) -> bool:
-    """Return True for F2 or F3, optional REX and a string opcode (Intel SDM volume 2, REP)."""
+    """Return True for F2 or F3, an optional REX and a string opcode (Intel SDM volume 2, REP)."""
     first = word & 0xFF
     if first != 0xF2 and first != 0xF3:
         return False
@@ -111,7 +111,7 @@ def record_steps(
 
     Args:
         group: `Tracee.group`. A report about another of its threads ends the recording, because
-            Linux reports the end of a process only after those of its threads were read.
+            Linux reports the end of a process only after the ends of its threads have been read.
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start; a repeated string instruction is one entry.
         stop: (2 + n,) the window ends at the first address once the stack pointer is above the

@@ -7,12 +7,12 @@ report. Call all methods from the thread that attached.
 Two mechanisms stop exactly before the k-th execution of an instruction. The better one is `PERF`:
 the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-th
 (`perf_event_open` with `sigtrap`, Linux 5.13, perf_event_open(2)). It needs no performance counter,
-so it works in virtual machines. `DEBUG`: the tracer writes the debug register itself and counts,
-with one stop per hit.
+so it works in virtual machines. With `DEBUG`, the tracer writes the debug register itself and
+counts, with one stop per hit.
 
-Both take microseconds per hit. If no jump leads between the instructions at the counted address,
-many hits are counted in the target itself, by a detour. When the target has stopped, the detour has
-been removed and the memory is restored.
+Both take microseconds per hit. If no jump leads into the middle of the instructions at the counted
+address, many hits are counted in the target itself, by a detour. By the time the target has
+stopped, the detour is removed and the memory restored.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from mavfi_cli.fi.tracer.counted import Detour
 from mavfi_cli.fi.tracer.linux import ProcessTimer
 from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS, Registers
 
-DETOUR_COST = 20  # counted hits from which a detour is faster; making one costs about 15 hits
+DETOUR_COST = 20  # hits at which a detour becomes faster; making one costs about 15 hits
 _DISTANCES = (1 << 30, 1 << 24, 1 << 20)  # distance of a detour's pages from the code, bytes
 _PAGES_BYTES = 8192
 # System calls.
@@ -48,7 +48,7 @@ _DUP2, _SOCKET, _CONNECT = 33, 41, 42
 _CLONE_PARENT = 0x8000
 _LOOK_S, _POLL_S = 1e-3, 5e-4
 _SYSTEM_CALL = b"\x0f\x05"  # the instruction
-_NO_CALL = (1 << 64) - 1  # as the number of a system call that has begun, skips it
+_NO_CALL = (1 << 64) - 1  # replaces the number of a system call that has begun, to skip it
 _FREE = 512  # bytes below the stack pointer that no function uses, with room for a socket address
 _ALL_ACCESS, _PRIVATE_FIXED, _NO_FILE = 7, 0x10_0022, (1 << 64) - 1  # mmap, MAP_FIXED_NOREPLACE
 
@@ -91,7 +91,7 @@ def _open_event(tid: int, address: int, period: int, *, inherited: bool = False)
 
 
 class _DebugBreakpoint:
-    """Debug register 0 of a *stopped* thread: traps before every execution at `address`.
+    """Debug register 0 of a *stopped* thread, set to trap before every execution of `address`.
 
     Intel SDM volume 3, section 18.2.
     """
@@ -120,7 +120,7 @@ class ExecutionCounter:
 
     Args:
         stop_at: the thread traps before this execution; 0: never.
-        inherited: threads that it starts have a counter of their own.
+        inherited: threads that it starts get counters of their own.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ def _signal_code(tid: int) -> int:
 
 
 def _signal_of(status: linux.Status) -> int:
-    """Return the signal that a stop delivers to its thread, which is none of the tracer's."""
+    """Return the signal that a stop delivers to its thread, or 0 if it is the tracer's own."""
     if not status.stopped or status.event:
         return 0
     ours = status.signal == signal.SIGTRAP and _signal_code(status.tid) == _TRAP_PERF
@@ -178,14 +178,14 @@ def threads_of(pid: int) -> list[int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """The end of a process. At most one of the two fields is set; none if the status is unknown."""
+    """The end of a process. At most one field is set; neither is if the status is unknown."""
 
     exit_code: int | None
     signal: int | None
 
     @classmethod
     def of(cls, code: int) -> Ended:
-        """Read an exit code as `subprocess` gives it: a negative one is a signal."""
+        """Convert an exit code as `subprocess` returns it: a negative one is a signal."""
         return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
 
     def describe(self) -> str:
@@ -197,7 +197,7 @@ class Ended:
 
 
 class EndWatch:
-    """Notices the end of a process, which need not be a child: pidfd_open(2).
+    """Detects the end of a process, which need not be a child (pidfd_open(2)).
 
     Raises:
         ProcessLookupError: There is no such process.
@@ -209,7 +209,7 @@ class EndWatch:
         self._poller.register(self._descriptor, select.POLLIN)
 
     def look(self) -> Ended | None:
-        """Return how the process has ended, or None. The status is unknown once it was read."""
+        """Return how the process ended, or None. Once reaped, its status is unknown."""
         if not self._poller.poll(0):
             return None
         try:
@@ -217,7 +217,7 @@ class EndWatch:
         except (FileNotFoundError, ProcessLookupError):
             return Ended(exit_code=None, signal=None)
         state, *_, status = stat.rpartition(")")[2].split()  # field 52, proc_pid_stat(5)
-        if state != "Z":  # another process has its number
+        if state != "Z":  # another process has reused its id
             return Ended(exit_code=None, signal=None)
         return Ended.of(os.waitstatus_to_exitcode(int(status)))
 
@@ -257,7 +257,7 @@ class Tracee:
         Args:
             thread: the target; None for the main thread.
             mechanism: how executions are counted; by default the best that is allowed.
-            alone: the process has one thread, and the attaching thread may trace others.
+            alone: the process has one thread; the attaching thread may trace other processes.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -313,7 +313,7 @@ class Tracee:
         If the thread is stopped just before an execution, this execution counts as the first.
 
         Args:
-            detour: the location of a detour that can count them.
+            detour: the location of a detour that can count the executions.
 
         Returns:
             False if the process ended first.
@@ -332,9 +332,9 @@ class Tracee:
             return True
 
     def run_any_to(self, address: int) -> bool:
-        """Run until any thread is about to execute `address`. This thread becomes the target.
+        """Run until any thread is about to execute `address`. That thread becomes the target.
 
-        Without `PERF` only the target thread is awaited.
+        Without `PERF`, only the current target thread is awaited.
 
         Returns:
             False if the process ended first.
@@ -365,7 +365,7 @@ class Tracee:
             return False
 
     def run_for(self, duration_s: float) -> Ended | None:
-        """Let the stopped target run for a wall-clock time, and stop it wherever it is."""
+        """Let the stopped target run for a wall-clock time, then stop it wherever it is."""
         self.registers.forget()
         with contextlib.suppress(ProcessLookupError):  # killed at a stop: its end is reported next
             linux.request(linux.CONT, self.tid, 0, self._take_signal())
@@ -398,7 +398,7 @@ class Tracee:
         return count
 
     def breakpoint_at(self, address: int, count: int = 1) -> ExecutionCounter | _DebugBreakpoint:
-        """Set a breakpoint before execution `count` of `address`; DEBUG stops at every one."""
+        """Set a breakpoint before execution `count` of `address`; DEBUG stops at each execution."""
         if self.mechanism is Mechanism.PERF:
             try:
                 return ExecutionCounter(self.tid, address, count)
@@ -412,13 +412,13 @@ class Tracee:
             self.run_for(_LOOK_S)
 
     def fork(self) -> Tracee:
-        """Fork the stopped process, which must have been attached to `alone`.
+        """Fork the stopped process, which must have been attached with `alone` set.
 
         The fork has the same registers and memory, and waits in the same system call. It has
         the same parent as the process.
 
         Raises:
-            OSError: there is no memory or no process left.
+            OSError: no memory is left, or no further process is allowed.
         """
         before, here = self.registers.general(), self.registers.ip
         code = self.memory.read(here, len(_SYSTEM_CALL))
@@ -430,10 +430,10 @@ class Tracee:
         return fork
 
     def run_to_call(self, number: int, descriptor: int) -> list[tuple[int, ...]]:
-        """Run until a system call on a file descriptor begins, or until the process has ended.
+        """Run until system call `number` on a file descriptor begins, or the process ends.
 
         Returns:
-            Number and arguments of each system call on the way, this one included.
+            Number and arguments of each system call on the way, including that one.
         """
         calls, entering = list[tuple[int, ...]](), False
         while self.ended is None:
@@ -477,7 +477,7 @@ class Tracee:
         return result
 
     def step_back(self) -> None:
-        """Go back to the instruction that has begun a system call (`run_to_call`)."""
+        """Go back to the instruction that began the current system call (see `run_to_call`)."""
         before, call = self.registers.general(), self.registers.read("orig_rax")
         self.registers.write("orig_rax", _NO_CALL)
         linux.request(linux.SYSCALL, self.tid)
@@ -487,7 +487,7 @@ class Tracee:
         self.registers.write_together({"rip": start, "rax": call})
 
     def connect(self, descriptor: int, address: bytes) -> None:
-        """Replace a socket by a stream socket that is connected to a Unix address.
+        """Replace a socket with a stream socket that is connected to a Unix address.
 
         Raises:
             OSError: the operating system refuses.
@@ -505,8 +505,8 @@ class Tracee:
     def detach(self) -> None:
         """Let the process and its children continue without a tracer, or note its end.
 
-        The target thread must be stopped. A thread that its process has lost, such as a killed one,
-        is waited for with all others, because Linux reports the main thread's end last.
+        The target thread must be stopped. A thread that has left its process, such as a killed one,
+        is awaited like all others, because Linux reports the main thread's end last.
         """
         self.memory.close()
         while self.ended is None and (left := self._traced() - {self.tid}):
@@ -542,7 +542,7 @@ class Tracee:
             except OSError:  # it has ended
                 return False
 
-        # A machine has many threads, and the target is stopped meanwhile.
+        # Processes first: a machine has many threads, and the target is stopped meanwhile.
         processes = [int(pid) for pid in os.listdir("/proc") if pid.isdigit()]
         return {
             thread
@@ -594,7 +594,7 @@ class Tracee:
         """Handle a report and its successors, until the target stops for the caller or ends.
 
         Args:
-            how: the request that resumes the target after a passing stop.
+            how: the request that resumes the target after a stop that the caller does not await.
         """
         while True:
             if status.ended:
@@ -609,7 +609,7 @@ class Tracee:
             status = self._wait()
 
     def _wait(self, options: int = 0) -> linux.Status:
-        """Wait for a report; with WNOHANG, return one of thread 0 if there is none."""
+        """Wait for a report; with WNOHANG, return one about thread 0 if there is none."""
         stopped, raw = os.waitpid(self.group, linux.WALL | _NOT_FROM_OTHERS | options)
         return linux.Status(stopped, raw)
 
@@ -633,7 +633,7 @@ class Tracee:
                 self._continue(status, linux.CONT)
 
     def _trapped(self, status: linux.Status) -> bool:
-        """Return True if the caller waits for this stop of the target; False if it passes."""
+        """Return True if the caller awaits this stop of the target; False if the target runs on."""
         if status.event == linux.EVENT_STOP:
             return self._interrupting
         if status.trapped:
@@ -642,8 +642,8 @@ class Tracee:
             if sent or code in _TRACER_TRAPS:
                 return True
         if self._interrupting:
-            # Another stop, such as the end of an exec, came first in place of the interrupt,
-            # which Linux drops. A signal is delivered when the thread continues.
+            # Another stop, such as the end of an exec, came before the interrupt, which Linux
+            # then drops. A signal is delivered when the thread continues.
             self._pending_signal = status.signal if status.event == 0 else 0
             self._interrupting = False
             return True

@@ -41,7 +41,7 @@ _ZEROING = re.compile(r"v?(xorp[sd]|andnp[sd]|pxor[dq]?|pandn[dq]?|psub[bwdq]|pc
 
 _SCALAR_MOVES = {"movsd": 64, "movss": 32}
 
-Piece = tuple[str, int] | None  # operand "a" (first source) or "b" (last one) and its element; zero
+Piece = tuple[str, int] | None  # operand "a" (first source) or "b" (last), its element; None: zero
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ def low(count: int) -> int:
 
 
 class _VectorForm:
-    """The operands of one vector instruction, by their roles."""
+    """The operands of one vector instruction, by role."""
 
     def __init__(self, decoded: Any) -> None:
         self.mnemonic = decoded.mnemonic
@@ -88,7 +88,7 @@ class _VectorForm:
         self.touched = [Touched() for _ in operands]
 
     def source(self, name: str) -> int:
-        """Position of operand "a" or "b"."""
+        """Return the position of operand "a" or "b"."""
         return self.first if name == "a" else self.last
 
     def is_vector(self, position: int) -> bool:
@@ -140,7 +140,7 @@ def vector_bits(decoded: Any) -> tuple[Touched, ...] | None:
 
 
 def _scalar(form: _VectorForm) -> int:
-    """Handle scalar instructions. Return the width of the element, or 0 for any other."""
+    """Handle a scalar instruction. Return the width of its element, or 0 if it is not scalar."""
     name = form.mnemonic
     if match := _COMPARISON.match(name):
         for position in (form.target, form.last):
@@ -209,7 +209,7 @@ def _between(form: _VectorForm) -> bool:
 
 
 def _permuted(form: _VectorForm) -> bool:
-    """Handle instructions that move elements. Return False for any other."""
+    """Handle an instruction that moves elements. Return False for any other."""
     moved = _pieces(form)
     if moved is None:
         return False
@@ -286,7 +286,7 @@ def _inserted(
     return None
 
 
-_Lane = Callable[[int, int, int], list[Piece]]  # immediate, elements of 128 bits, number of lane
+_Lane = Callable[[int, int, int], list[Piece]]  # immediate, elements per 128-bit lane, lane number
 
 
 def _interleave(start: Callable[[int], int]) -> _Lane:
@@ -297,7 +297,7 @@ def _interleave(start: Callable[[int], int]) -> _Lane:
 
 
 def _chosen(operands: str, bits: int, step: int = 0) -> _Lane:
-    """Select every element by its own bits of the immediate, which differ between lanes."""
+    """Select each element by its own bits of the immediate, shifted by `step` per lane."""
 
     def lane(imm: int, count: int, number: int) -> list[Piece]:
         return [
@@ -379,7 +379,7 @@ _BY_IMMEDIATE = [lane for name, (_, lane) in _SHUFFLES.items() if not re.match("
 
 
 def _packed(form: _VectorForm) -> None:
-    """Handle all others: whole registers, except in conversions, sign masks and counts."""
+    """Handle all others, which use whole registers except in conversions, sign masks and counts."""
     name, width = form.mnemonic, form.widths[form.target]
     alone = form.same(form.first, form.last) and len(form.sources) == 1 + form.vex
     sources = [] if alone and _ZEROING.match(name) else list(form.sources)
@@ -410,7 +410,7 @@ def _packed(form: _VectorForm) -> None:
 
 
 def _repeated(element: int, mask: int) -> int:
-    """Return the same bits of every element."""
+    """Return a mask with the same bits of every element."""
     return sum(mask << place for place in range(0, 512, element))
 
 
@@ -430,7 +430,7 @@ _TWO_TABLES = re.compile(r"vperm([ti])2(ps|pd|[bwdq])$")
 
 
 def _mask(form: _VectorForm, lane: int) -> None:
-    """Apply an AVX-512 mask, a bit per element; without zeroing, masked elements stay."""
+    """Apply an AVX-512 mask, one bit per element; without zeroing, masked elements stay as is."""
     assert form.writemask is not None
     target = form.touched[form.target]
     compares = not form.is_vector(form.target)  # into a mask, whose masked bits are cleared
