@@ -49,7 +49,7 @@ DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 SEARCH = "world-search"  # folder of the campaign that finds fixed worlds
 _AT_ONCE = 4  # candidate worlds that are flown at the same time
 _APPEND = "--append adds what is new"
-# Missions that differ in these only are checked once. Each world is checked with its vehicle.
+# Missions that differ only in these are checked once. Each world is checked with its vehicle.
 _ALIKE = ("seed", "time_limit_s", "isolate", "world")
 
 
@@ -66,7 +66,7 @@ def chosen(
     Args:
         what: a preset, a TOML file, or the folder of an existing campaign.
         out: the folder; None means campaigns/NAME, or the named folder.
-        scale: fraction of the repetitions; an existing folder accepts only its own.
+        scale: fraction of the repetitions; None for an existing folder, which stores its own.
         changes: factors to replace, as in `replaced`; they become part of the default folder's
             name.
         programs: programs that a folder's missions may name; see
@@ -115,7 +115,7 @@ def chosen_spec(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Unflown(Spec):
-    """The missions that are left of a study's list, which has no factors."""
+    """The missions left on a study's list, which has no factors."""
 
     left: list[PlannedMission]
 
@@ -220,7 +220,7 @@ def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[S
         return spec, False
     with Ledger(folder) as ledger:
         stored = stored_spec(ledger)
-    if stored is None:  # killed before it was stored, or another study: the list decides
+    if stored is None:  # killed too early, or another study: `store_plan` compares the lists
         return spec, False
     ours = replace(spec, name=stored.name, about=stored.about, keep=stored.keep)
     grows = spec.repetitions > stored.repetitions
@@ -251,7 +251,7 @@ def stopped(ledger: Ledger) -> list[str]:
 
 
 def rounds_of(spec: Spec, ledger: Ledger) -> Rounds | None:
-    """Return the rounds of a stratified campaign, whose list is stored; None for a uniform one."""
+    """Return the rounds of a stratified campaign with a stored list; None for a uniform one."""
     if spec.sampling is Sampling.UNIFORM:
         return None
     return Rounds(ledger, spec.seed, spec.stop.batch if spec.stop else ROUND)
@@ -283,7 +283,7 @@ def begin(
         raise ConfigError("no campaign was begun there", path=folder)
     if begun:
         spec = _with_stored_worlds(spec, folder, append=append)
-    missions = None if begun else flyable(spec)  # before a folder exists
+    missions = None if begun else flyable(spec)  # checked before a folder exists
     if spec.fixed_world is not None and (append or not begun):
         spec = _with_worlds(
             spec, missions or flyable(spec), folder, options or Options(), spectator or Spectator()
@@ -294,7 +294,7 @@ def begin(
         ledger = undo.enter_context(Ledger(folder, writing=True))
         if begun and (
             isinstance(spec, _Unflown) or ledger.meta("spec") == text
-        ):  # the list is what it would expand to
+        ):  # the stored list is what it expands to
             require_unchanged(ledger)
         else:
             stored = stored_spec(ledger)
@@ -315,7 +315,7 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
     """Return the specification with the stored world seeds of its campaign.
 
     Raises:
-        ConfigError: missions to append have another rule of fixed worlds.
+        ConfigError: missions are appended under another rule for fixed worlds.
     """
     with Ledger(folder) as ledger:
         stored = stored_spec(ledger)
@@ -397,8 +397,8 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
             raise VehicleProcessError(str(error), error.exit_code) from None
 
 
-# Fixed worlds: candidates get golden runs in turn until one fits the rule. They are a campaign of
-# its own in a subfolder, so an interrupted search continues where it stopped.
+# Fixed worlds: golden runs are flown in one candidate after another until one fits the rule. They
+# form a campaign of their own in a subfolder, so an interrupted search continues where it stopped.
 
 
 def _with_worlds(
@@ -428,7 +428,7 @@ def _with_worlds(
         config = mission.config
         if config.world_seed is None and rule.rules(config.world):
             judged.setdefault(config.world, config.golden)
-    quiet = Spectator()  # without progress: that of a search is not the campaign's
+    quiet = Spectator()  # notes only: the progress of a search is not the campaign's
     quiet.on_note = spectator.on_note  # type: ignore[method-assign]
     for world, config in judged.items():
         golden = replace(config, seed=spec.first_seed)

@@ -1,6 +1,6 @@
 """The keys of a cluster: one certificate that scheduler, workers and runner share over TLS.
 
-The certificate is self-signed and the only authority, so exactly the holders of the key can
+The certificate is self-signed and the only trusted authority, so only holders of the key can
 connect.
 """
 
@@ -99,6 +99,6 @@ def _private(path: Path) -> Path:
         raise ConfigError(problem, path=path) from None
     if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise ConfigError(
-            "must be a file of yours that nobody else can read (chmod 600)", path=path
+            "must be your own file, which nobody else can read (chmod 600)", path=path
         )
     return path

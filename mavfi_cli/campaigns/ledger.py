@@ -5,10 +5,10 @@
     missions  the numbered list, written before the first mission flies
     results   one short row per finished mission
     records   its complete result.json, compressed
-    draws     of a stratified campaign: the faults that missions were given, strata and weights
+    draws     of a stratified campaign: the faults drawn for missions, with strata and weights
 
-A mission is missing until it has a row in `results`. A kill at any moment leaves it with a complete
-row or with none.
+A mission is missing until it has a row in `results`. A kill at any moment leaves a complete row or
+none.
 """
 
 from __future__ import annotations
@@ -92,14 +92,14 @@ CREATE TABLE IF NOT EXISTS draws (
     changes TEXT NOT NULL
 )
 """
-# The missions as they fly: those of a uniform list, and those of a stratified one.
+# The missions as flown: those of a uniform list, and those of a list with draws.
 _PLANNED = "(SELECT *, NULL AS stratum, 1.0 AS weight FROM missions)"
 _DRAWN = (
     "(SELECT m.number, cell, COALESCE(d.pair, m.pair) AS pair, COALESCE(d.changes, m.changes) AS "
     "changes, stratum, COALESCE(weight, 1.0) AS weight FROM missions AS m LEFT JOIN draws AS d "
     "USING (number))"
 )
-# Whether the flight of a mission repeats, for `columns`; a user's companion runs by the wall clock.
+# Whether a mission's flight repeats, for `columns`; a user's companion depends on the wall clock.
 REPEATS = "instr(changes, '\"companion\":') = 0"
 _SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
@@ -118,7 +118,7 @@ def _object(text: str | bytes) -> dict[str, Any]:
 
 
 class Drawn(NamedTuple):
-    """The fault that a mission of a stratified campaign was given.
+    """The fault drawn for a mission of a stratified campaign.
 
     Attributes:
         round: the round of draws, from 0.
@@ -252,7 +252,7 @@ class Ledger:
             RecordError: the ledger is damaged.
         """
         try:
-            for row in self._db.execute(query, values):  # noqa: UP028 (it closes, too late)
+            for row in self._db.execute(query, values):  # noqa: UP028 (yield from closes too late)
                 yield row
         except sqlite3.Error as error:
             raise RecordError(f"{self._path}: {error}") from None
@@ -297,18 +297,18 @@ class Ledger:
 
     @property
     def sampling(self) -> Sampling:
-        """The way in which the faults of the campaign are drawn."""
+        """How the faults of the campaign are drawn."""
         return Sampling.STRATIFIED if self.stratified else Sampling.UNIFORM
 
     def draw(self, rows: Iterable[Drawn]) -> None:
-        """Store the faults that missions are given instead of those on the list, all or none."""
+        """Store the faults that replace those on the list, all or none."""
         self._list = _DRAWN
         with self._transaction():
             self._db.execute(_DRAWS)
             self._db.executemany("INSERT INTO draws VALUES (?, ?, ?, ?, ?, ?)", rows)
 
     def draws(self) -> dict[int, Drawn]:
-        """Return the faults that missions were given, by number; empty in a uniform campaign."""
+        """Return the faults drawn for missions, by number; empty in a uniform campaign."""
         rows = self._rows("SELECT * FROM draws") if self.stratified else ()
         return {row[0]: Drawn(*row) for row in rows}
 
@@ -325,7 +325,7 @@ class Ledger:
         Args:
             cells: labels of the settings with their numbers.
             missions: number, cell, pair and changes of every mission.
-            draws: the faults that missions of a stratified campaign were given.
+            draws: the faults drawn for missions of a stratified campaign.
             results: columns of the table `results` by name; a missing column is empty.
 
         Raises:
@@ -344,12 +344,12 @@ class Ledger:
             self.draw(draws)
 
     def planned(self) -> int:
-        """Number of missions in the list."""
+        """Return the number of missions on the list."""
         ((count,),) = self._rows("SELECT count(*) FROM missions")
         return int(count)
 
     def cells(self) -> list[Labels]:
-        """The settings, by number.
+        """Return the settings, by number.
 
         Raises:
             RecordError: the ledger is damaged, for example because a mission's setting is missing.
@@ -375,9 +375,9 @@ class Ledger:
     def missing(
         self, *, errors: bool = False, among: Collection[int] | None = None
     ) -> Iterator[MissingMission]:
-        """Missions without a result, in the order of the list.
+        """Yield the missions without a result, in the order of the list.
 
-        They are read in portions, so results may be added meanwhile.
+        They are read in portions, so results may be added in the meantime.
 
         Args:
             errors: include missions that could not begin.
@@ -406,7 +406,7 @@ class Ledger:
                 return
 
     def mission_cells(self) -> list[int]:
-        """The setting of each mission, in the order of the list."""
+        """Return the setting of each mission, in the order of the list."""
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
     def fates(self, *, errors: bool = True) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
@@ -420,7 +420,7 @@ class Ledger:
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:
-        """Number of finished missions."""
+        """Return the number of finished missions."""
         ((count,),) = self._rows("SELECT count(*) FROM results")
         return int(count)
 
@@ -466,7 +466,7 @@ class Ledger:
         """Yield the results of finished missions in the order of the list.
 
         Args:
-            numbers: only these missions.
+            numbers: numbers of the missions; None means all.
         """
         chosen = "" if numbers is None else "WHERE number IN (SELECT value FROM json_each(?)) "
         rows = self._rows(
@@ -476,7 +476,7 @@ class Ledger:
             f"JOIN records USING (number) {chosen}ORDER BY number",
             *([] if numbers is None else [json.dumps(list(numbers))]),
         )
-        with contextlib.closing(rows):  # before the ledger, also after an error
+        with contextlib.closing(rows):  # closes before the ledger, even after an error
             for number, labels, pair, changes, state, outcome, reason, injected, *rest in rows:
                 wall_s, attempts, path, blob, stratum, weight = rest
                 with reading(self._path):
@@ -504,7 +504,7 @@ class Ledger:
         """Yield the configurations of these missions in the order of the list.
 
         Raises:
-            RecordError: an export holds changes that give no valid mission.
+            RecordError: the changes of a mission in an export are invalid.
         """
         rows = self._rows(
             f"SELECT number, changes FROM {self._list} "
@@ -520,7 +520,7 @@ class Ledger:
             yield config
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
-        """Yield portions of columns of the flown missions, in the order of the list.
+        """Yield columns of the flown missions in portions, in the order of the list.
 
         Args:
             names: columns of the tables `missions` and `results`, `stratum`, `weight`, REPEATS.
@@ -533,7 +533,7 @@ class Ledger:
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
-        """Number of missions that could not begin, for every cell with such missions."""
+        """Count the missions that could not begin, for every cell with such missions."""
         return dict(
             self._rows(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
@@ -542,7 +542,7 @@ class Ledger:
         )
 
     def planned_by_cell(self) -> list[int]:
-        """Number of missions per cell."""
+        """Count the missions per cell."""
         rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]
 
@@ -554,11 +554,11 @@ METADATA = b"mavfi"  # key of an export's provenance
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _LABEL = "label_"
 STRATUM, WEIGHT = "stratum", "weight"  # columns of a stratified sample; uniform missions weigh 1
-_ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # what an export without the column means
+_ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # values for columns that an export lacks
 
 
 def is_export(path: Path) -> bool:
-    """True if a path names an export rather than a folder."""
+    """Return True if a path names an export rather than a folder."""
     return path.suffix == EXPORT and not path.is_dir()
 
 
@@ -599,7 +599,7 @@ def _require_weights(table: pa.Table, path: Path, *, stratified: bool) -> None:
             isinstance(weight, float) and 0.0 < weight < math.inf
         ):
             raise RecordError(
-                f"{path}: mission {row['number']} is of a stratified sample and must have a weight "
+                f"{path}: mission {row['number']} is in a stratified sample and must have a weight "
                 f"above 0, got {weight}; export the campaign again"
             )
 
@@ -632,7 +632,7 @@ class ExportedLedger(Ledger):
             own = {name.removeprefix(_LABEL): row[name] for name in labels if row[name] is not None}
             try:
                 cell = cells.setdefault(canonical(own), len(cells))
-            except TypeError as error:  # a label of a foreign type
+            except TypeError as error:  # a label of an unsupported type
                 raise _no_export(path, error) from None
             missions.append((row["number"], cell, row["pair"], row["changes"]))
         name = str(origin.get("name") or path.stem)

@@ -21,7 +21,7 @@ from mavfi_cli.spec.mission import NOT_OF_GOLDEN, MissionConfig
 
 Label = str | int | float | bool | None
 Labels = Mapping[str, Label]  # of a setting, by name
-Changes = Mapping[str, Any]  # values of a mission by name, as JSON holds them
+Changes = Mapping[str, Any]  # values of a mission by name, as in JSON
 _FIRST = ("setting", "world")  # labels that come before the others
 
 
@@ -57,7 +57,7 @@ _shared = attrgetter(*_SHARED)
 
 @functools.lru_cache(maxsize=4096)
 def _pair_of(shared: tuple[Any, ...]) -> str:
-    """The digest of the golden mission with these values of _SHARED."""
+    """Return the digest of the golden mission with these values of _SHARED."""
     golden = MissionConfig(**dict(zip(_SHARED, shared, strict=True)))
     return hashlib.sha256(canonical(changes_of(golden)).encode()).hexdigest()[:16]
 
@@ -147,20 +147,20 @@ class MissingMission(NamedTuple):
 
 
 class Sampling(Enum):
-    """The way in which the faults of a campaign are drawn."""
+    """How the faults of a campaign are drawn."""
 
-    UNIFORM = "uniform"  # each fault by itself, by the rule of its level
+    UNIFORM = "uniform"  # each fault independently, by the rule of its level
     STRATIFIED = "stratified"  # in rounds, more where outcomes have varied; missions have weights
 
 
 class ResultState(Enum):
-    """The state of a mission with a result, or without one."""
+    """Whether a finished mission has a result."""
 
     FLOWN = "flown"  # it ended with the given `outcome`
     ERROR = "error"  # it could not begin, so it has no result and is not counted
 
 
-# By the activation in a record; any other is active.
+# Fate by the activation in a record; any other activation means active.
 _BY_ACTIVATION = {
     "read": "active",
     "withheld": "active",
@@ -174,11 +174,11 @@ _BY_ACTIVATION = {
 
 
 class Injected(Enum):
-    """The fate of the fault of a flown mission."""
+    """The fate of a flown mission's fault."""
 
     GOLDEN = "golden"  # the mission has no fault
     ACTIVE = "active"  # it struck, and what it struck was read afterwards
-    UNREAD = "unread"  # it struck, and nothing read the value while it was followed
+    UNREAD = "unread"  # it struck, and nothing read the value while it was tracked
     CAUGHT = "caught"  # it struck, and a detector withheld it before anything read it
     NOT_ACTIVATED = "not_activated"  # it struck a value that nothing read before it expired
     NOT_INJECTED = "not_injected"  # the mission ended, or the run diverged, before the trigger
@@ -186,7 +186,7 @@ class Injected(Enum):
 
     @classmethod
     def of(cls, flight: FlightRecord, *, faulty: bool) -> Injected:
-        """Return what happened to the fault of a mission, by its record."""
+        """Return the fate of a mission's fault, from its record."""
         fault = flight.fault
         if not faulty:
             return cls.GOLDEN
@@ -195,7 +195,7 @@ class Injected(Enum):
         if fault.state == "null":
             return cls.NULL
         activation = fault.activation
-        read = "read" if activation is None else activation.activation  # cut off: it may have been
+        read = "read" if activation is None else activation.activation  # cut off: may have been
         fate = cls(_BY_ACTIVATION.get(read, "active"))
         return cls.CAUGHT if fate is cls.NOT_ACTIVATED and _caught(flight) else fate
 
@@ -215,7 +215,7 @@ def _caught(flight: FlightRecord) -> bool:
     )
 
 
-# Missions whose success the fault, if there was one, could affect.
+# Fates with which a fault, if there was one, could affect the success of the mission.
 COUNTED = frozenset(
     fate.value for fate in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
 )

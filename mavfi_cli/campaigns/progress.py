@@ -12,7 +12,7 @@ class Progress:
     """A campaign at one moment of host time.
 
     Attributes:
-        total: missions of the list.
+        total: number of missions on the list.
         before: missions that were finished before this run began.
         over: missions that are finished now, including `before`.
         running: flights that have not ended; missions that share a flight count as one.

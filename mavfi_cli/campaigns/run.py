@@ -1,9 +1,9 @@
-"""Runs the missing missions of a campaign, up to the stopping rule of each setting.
+"""Runs the missing missions of a campaign until the stopping rule ends each setting.
 
 With a stopping rule, the interval of a setting's success rate is checked after every batch, over
-exactly the setting's missions up to that point of the list, in whatever order they ended. So the
-number of workers does not affect when a setting stops. Repeated checks make the true confidence
-slightly lower than the nominal one.
+exactly the setting's missions up to that point in the list, regardless of the order in which they
+ended. So the number of workers does not affect when a setting stops. Repeated checks make the true
+confidence slightly lower than the nominal one.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ from mavfi_cli.mission.run_folder import RESULT
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.strata import weighted_share
 
-Row = tuple[str | None, str | None]  # outcome, what happened to the fault
+Row = tuple[str | None, str | None]  # outcome, fate of the fault
 
 
 WORK, PROFILES = "work", "profiles"
-ATTEMPTS = 3  # most attempts at a mission that something outside ends
+ATTEMPTS = 3  # most attempts at a mission if something outside it ends them
 LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
 SHARING = 48  # most missions that share a flight
-_AHEAD = 5000  # missions of the list that are searched for others of a flight
+_AHEAD = 5000  # missions of the list that are searched for ones to share a flight
 _GIVE_UP = 5  # a campaign ends after this many missions that cannot begin, if none could
 _LOOK_S = 0.5
 
@@ -70,7 +70,7 @@ class Options:
     """Options of execution, which do not affect results.
 
     Attributes:
-        jobs: missions at the same time.
+        jobs: number of concurrent missions.
         limit_s: limit of a mission's wall time, s; longer missions are recorded as `hang`.
         task: module that flies a mission.
         whole: fly every mission alone from its start, which gives the same records.
@@ -81,7 +81,7 @@ class Options:
         kept: numbers of missions whose run folders are kept regardless of `keep`.
         profiles: folder of instruction-level profiles that several campaigns share. None selects
             the campaign's own, where profiles are removed after their last mission.
-        planned: numbers of the missions among which the last one is determined; None for all.
+        planned: numbers of the missions after which profiles are no longer needed; None for all.
         programs: programs that missions of the folder may name; see
             `MissionConfig.require_programs`.
     """
@@ -142,11 +142,11 @@ def run_campaign(
         stop: rule that ends settings early.
 
     Returns:
-        The ledger, open for reading; `results()` come in the order of the list.
+        The ledger, open for reading; `results()` follows the order of the list.
 
     Raises:
         ConfigError: the folder holds another list, or another process is writing to it.
-        CampaignStopped: a problem of the machine prevents flights.
+        CampaignStopped: a problem with the machine prevents flights.
         RecordError: the ledger cannot be written.
         Interrupted: the user pressed Ctrl-C; a second one kills the missions in flight.
     """
@@ -173,7 +173,7 @@ def store_plan(
         append: add missions that are not stored; stored ones always stay.
         differing: descriptions of the differences for the error; if empty, it names the first
             differing missions.
-        can_append: how to append new missions, for the error if no stored mission is missing.
+        can_append: hint on how to append missions, for the error if the list only adds missions.
 
     Raises:
         ConfigError: the stored list differs, or as `require_unchanged`.
@@ -214,7 +214,7 @@ def fly_missing(
     stop: Stop | None = None,
     rounds: Rounds | None = None,
 ) -> None:
-    """Fly every mission without a result, up to the stopping rule.
+    """Fly every mission without a result, subject to the stopping rule.
 
     Args:
         rounds: the rounds of a stratified campaign.
@@ -244,7 +244,7 @@ class MissionQueue:
     """The missing missions in the order of the list, in batches if there is a stopping rule.
 
     Args:
-        missing: missions without a result; None while the next one is not drawn yet.
+        missing: missions without a result; yields None while the next one is not drawn yet.
         stop: the stopping rule; None admits all missions.
         cells: setting of every mission, in the order of the list.
         over: number, outcome and fault's fate of every finished mission.
@@ -279,7 +279,7 @@ class MissionQueue:
             members.append(number)
         self._open = dict.fromkeys(self._members, stop.batch if stop else 0)
         self._over: dict[int, Row] = {}
-        self._finished: Counter[int] = Counter()  # missions over below the open boundary
+        self._finished: Counter[int] = Counter()  # finished missions below the open boundary
         self._drawn = {} if drawn is None else drawn
         self.stopped: set[int] = set() if stopped is None else stopped
         for number, row in over if stop else ():
@@ -308,7 +308,7 @@ class MissionQueue:
         return [self._take(number, waiting[number]) for number in ready[:most]]
 
     def _read_one(self) -> bool:
-        """Read one mission of the list; return False at its end."""
+        """Read the next mission of the list; return False if there is none, or none yet."""
         mission = next(self._missing, None)
         if mission is None:
             return False
@@ -434,7 +434,7 @@ class _Run:
                 over = workers.wait(_LOOK_S)
                 if not interrupts:
                     self._note_unforked(over)
-                self._fill(workers, interrupts)  # at once: the ledger is written while they fly
+                self._fill(workers, interrupts)  # so that they fly while the ledger is written
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress(workers.flights))
@@ -476,7 +476,7 @@ class _Run:
         if (mission := self._queue.next()) is None:
             return []
         left = self._total - self._over - len(self._flying)
-        most = min(SHARING, math.ceil(left / self._jobs))  # the last flights end together
+        most = min(SHARING, math.ceil(left / self._jobs))  # so that the last flights end together
         return [mission, *self._queue.mates(mission, most - 1)]
 
     def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
@@ -582,7 +582,7 @@ def _put_away(run: Path, runs: Path, number: int) -> Path:
     place = own_folder(runs) / f"{number:06d}-{stem}"
     sync_folder(run)
     with writing(place):
-        for old in runs.glob(f"{number:06d}-*"):  # of an attempt whose row was never written
+        for old in runs.glob(f"{number:06d}-*"):  # from an attempt whose row was never written
             shutil.rmtree(old)
         run.replace(place)
     return place

@@ -20,16 +20,16 @@ from mavfi_cli.spec.mission import MissionConfig
 
 SAMPLE = 20  # `sampled` keeps about one success in 20
 _WORD = 1 << 32
-Factors = Mapping[str, Any]  # values of factors by name, as TOML holds them
+Factors = Mapping[str, Any]  # values of factors by name, as in TOML
 
 
-# Factors: what may differ between missions, and the record that has it as a field ----------------
+# Factors: what may differ between missions, and the record that has the field ---------------------
 
 
 # Level at which faults strike -> the field of the mission, and its record.
 _LEVELS = {"source": ("fault", FaultConfig), "instruction": ("instruction", InstructionConfig)}
 _SEEDED = {"seed": (*_LEVELS,), "invocation_seed": ("instruction",)}
-# Other names in a specification for a field of either level's fault.
+# Aliases in a specification for a field of a fault at either level.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
@@ -99,7 +99,7 @@ class Keep(Enum):
         """Return True if the run folder of this mission is kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        mixed = number  # a sample of the successes covers all settings however they alternate
+        mixed = number  # so that sampled successes cover all settings, however they alternate
         for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
             mixed = mixed * factor % _WORD
             mixed ^= mixed >> 15
@@ -117,7 +117,7 @@ class FixedWorld:
     Attributes:
         replans: least and largest median of replans over the golden runs.
         flights: number of golden runs per candidate; seeds start at the campaign's first.
-        candidates: largest world seed to try; the first from 1 that fits is chosen.
+        candidates: largest world seed to try, starting at 1; the first that fits is chosen.
         worlds: the worlds that the rule covers; empty for all worlds of the campaign.
         world_seed: seed of every world, given by the user or chosen by the rule.
         flown: replans of the golden runs of candidates 1, 2, 3, ...; a candidate whose flights
@@ -169,7 +169,7 @@ class FixedWorld:
         return f"world seeds: {', '.join(phrases or ['none yet'])}; {self.rule()}"
 
     def rule(self) -> str:
-        """The rule in words."""
+        """Describe the rule."""
         least, most = self.replans
         often = f"{least} to {most} times" if most > least else f"{least} times"
         often = "once" if often == "1 times" else often
@@ -178,7 +178,7 @@ class FixedWorld:
 
 Axes = Mapping[str, tuple[Any, ...]]
 MOST = 1_000_000  # missions of one campaign
-# Factors whose value is a list already: a list of lists crosses several.
+# Factors whose values are lists; a list of lists crosses several values.
 LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles", "objects")
 
 
@@ -188,7 +188,7 @@ class Setting:
 
     name: str = ""
     axes: Axes = field(default_factory=dict)
-    repetitions: int | None = None  # None: as many as the campaign has
+    repetitions: int | None = None  # None: as many as the campaign
 
     def __post_init__(self) -> None:
         if self.repetitions is not None and self.repetitions < 1:
@@ -346,8 +346,8 @@ class Spec:
     def _mission(self, values: Factors, labels: Labels, repetition: int) -> PlannedMission:
         several = self.faults_per_invocation
         seed = values.get("seed", self.first_seed + repetition // several)
-        # The target is part of it, or the faults of all states would share one draw. Nothing else
-        # is: the same target gets the same fault under every detector and platform.
+        # The seed depends on the target, or the faults of all states would share one draw. No other
+        # factor changes it: a target gets the same fault with every detector and platform.
         target = next((str(values[name]) for name in _ALIASES if name in values), "")
         seeds = {"seed": Stream.FAULT.seed(self.seed, "campaign", seed, repetition, target)}
         if several > 1:
@@ -366,7 +366,7 @@ class Spec:
             repetitions: the word for repetitions.
         """
         there, here = self._choices(repetitions), other._choices(repetitions)
-        if there == here:  # equal values in other settings
+        if there == here:  # the same values in different settings
             there, here = self._by_setting(), other._by_setting()
         pairs = {key: (there.get(key), here.get(key)) for key in (*there, *here)}
         return [
@@ -376,7 +376,7 @@ class Spec:
         ]
 
     def _choices(self, repetitions: str) -> dict[str, list[Any]]:
-        """Return the factors with all their values, and the numbers."""
+        """Return all values of each factor, and the numbers."""
         choices: dict[str, list[Any]] = {}
         for axes in (self.axes, *(setting.axes for setting in self.settings)):
             for name, values in axes.items():
@@ -426,7 +426,7 @@ class Spec:
         plain["keep"] = self.keep.value
         if self.faults_per_invocation > 1:
             plain["faults_per_invocation"] = self.faults_per_invocation
-        if self.sampling is not Sampling.UNIFORM:  # other texts stay equal to those of ledgers
+        if self.sampling is not Sampling.UNIFORM:  # otherwise the text equals that in old ledgers
             plain["sampling"] = self.sampling.value
         return toml_text({**plain, **tables})
 

@@ -116,7 +116,7 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
         values = tuple(value) if several else (value,)
         for item in values:
             _require_usable(name, item, key, path)
-        if name == "planner":  # one planner is one setting, however it is written
+        if name == "planner":  # one planner is one setting, however its name is written
             values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
         if name not in LISTS and not values:
             raise ConfigError("must have at least one value, got []", path=path, key=key)
@@ -126,7 +126,7 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
     return axes
 
 
-_ODD = re.compile(r"[^\w.+=-]+")  # not in a folder's name
+_ODD = re.compile(r"[^\w.+=-]+")  # unsuitable for a folder's name
 _COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')  # outside double quotes
 _LONGEST = 100  # characters of a folder's name; a longer one ends with a digest of the changes
 
@@ -143,9 +143,8 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
             and all values may be written as one TOML list.
 
     Raises:
-        ConfigError: there is no such factor.
-        ConfigError: a change is not KEY=VALUE, the specification lacks this factor of faults, or
-            the values are invalid.
+        ConfigError: there is no such factor, a change is not KEY=VALUE, the specification lacks
+            this factor of faults, or the values are invalid.
     """
     if not changes:
         return spec

@@ -1,13 +1,15 @@
 """Draws the faults of a stratified campaign in rounds, more of them where outcomes have varied.
 
-A stratum is what a seed fixes of its fault before any flight: the field, its half and the state
-of the highest bit, or the node, and the moment. Every repetition has a pool of seeds. The
-shares of the strata in the pools are those in the population, whatever the rule that draws a fault
-from its seed. A round gives each stratum a number of missions, and each mission a seed from a pool.
-Its weight is the number of seeds for which it stands, so that no estimate depends on the choice.
+A stratum consists of what the seed determines about a fault before any flight: the bit field, its
+half and the state of the highest flipped bit, or the node, and the moment. Every repetition has a
+pool of seeds. The strata have the same shares in the pools as in the population, whatever rule
+draws a fault from its seed. A round allocates a number of missions to each stratum, and a seed from
+a pool to each mission. A mission's weight is the number of uniformly drawn missions that it stands
+for, so that the allocation does not bias estimates.
 
 The missions of a round are drawn after all earlier missions have ended, from their results and the
-campaign's seed. So a resumed campaign draws the same faults, in whatever order missions end.
+campaign's seed. So a resumed campaign draws the same faults, regardless of the order in which
+missions end.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.stats.strata import allocate, rounded, spread
 
 T = TypeVar("T")
-ROUND = 25  # repetitions of a round, if no stopping rule has batches
+ROUND = 25  # repetitions of a round without a stopping rule; with one, its batch
 POOL = 48  # seeds of each repetition from which faults are drawn
-_WIDE = 8  # bits of a field from which on its halves are apart
+_WIDE = 8  # fields with at least this many bits are split into halves
 _PLANNER = "planner"
 _THIRDS = ("early", "midway", "late")
 Stratum = tuple[str, ...]  # from the coarsest part to the finest
@@ -51,14 +53,14 @@ Fault = FaultConfig | InstructionConfig
 
 
 def stratum_of(fault: Fault, requests: int = 0) -> Stratum:
-    """Return the finest stratum of a fault, by its seed.
+    """Return the finest stratum of a fault, which its seed determines.
 
     Args:
-        requests: plans that the golden flight requests; 0 if that is unknown.
+        requests: number of plans that the golden flight requests; 0 if unknown.
     """
     if isinstance(fault, InstructionConfig):
         node = fault.node()
-        # The invocation is this number scaled to those of the golden flight.
+        # The invocation is this number, scaled to the invocations of the golden flight.
         drawn = int(Stream.FAULT.generator(fault.seed, "instruction").integers(1 << 32))
         moment = drawn / (1 << 32)
         if node != _PLANNER:
@@ -83,7 +85,7 @@ def _third(moment: float) -> str:
 
 
 def _part_of(kind: BitType, bit: int) -> tuple[str, str]:
-    """The field of a bit and its half, such as `exponent` and `upper half`."""
+    """Return the field of a bit and the half that contains it, such as `exponent`, `upper half`."""
     fields = {own: bits for own, bits in kind.fields.items() if own is not Field.ANY}
     name, bits = next(
         ((own.value, bits) for own, bits in fields.items() if bit in bits),
@@ -94,7 +96,7 @@ def _part_of(kind: BitType, bit: int) -> tuple[str, str]:
 
 
 def coarsened(strata: Sequence[Stratum], least: float) -> frozenset[Stratum]:
-    """Merge strata from the finest part on, so that each has a share of at least `least`.
+    """Merge strata, finest level first, so that each has a share of at least `least`.
 
     Returns:
         The strata that remain. A seed belongs to the longest prefix of its own stratum among them;
@@ -124,7 +126,7 @@ class _Strike:
 
     Attributes:
         config: one of these missions.
-        numbers, bare: the missions, and those without a detector.
+        numbers, bare: numbers of all its missions, and of those without a detector.
     """
 
     config: MissionConfig
@@ -144,12 +146,12 @@ class Rounds:
     Missions with equal faults but different detectors get the same draw, as on the list.
 
     Args:
-        ledger: ledger of the campaign, open for writing; its list is stored.
+        ledger: ledger of the campaign, open for writing, with a stored list.
         seed: root of the seeds of all faults.
         size: repetitions of a round; the last round has up to twice as many.
 
     Attributes:
-        drawn: the faults that missions were given so far, by number.
+        drawn: the faults drawn so far, by mission number.
     """
 
     def __init__(self, ledger: Ledger, seed: int, size: int = ROUND) -> None:
@@ -171,7 +173,7 @@ class Rounds:
             if config.detector is None:
                 strike.bare.append(number)
         self._groups = {kind: self._in_rounds([*own.values()]) for kind, own in strikes.items()}
-        begins = {  # the round in which a golden flight is needed first
+        begins = {  # the round in which a golden flight is first needed
             strike.config.golden: place
             for rounds in self._groups.values()
             for place in range(len(rounds) - 1, -1, -1)
@@ -220,7 +222,7 @@ class Rounds:
         ]
 
     def _parts(self, number: int) -> list[list[int]]:
-        """The missions of a round; its golden flights come first if draws depend on them."""
+        """Return the missions of a round, with golden flights first if draws depend on them."""
         strikes = self._strikes(number)
         plain = [mission for mission, _ in self._plain.get(number, ())]
         struck = [mission for strike in strikes for mission in strike.numbers]
@@ -274,7 +276,7 @@ class Rounds:
                 seeds = [seed for seed, own in pool if own == stratum]
                 picked = rng.choice(len(seeds), size=wanted, replace=wanted > len(seeds))
                 chosen[-1] += [(seeds[place], stratum, total / count) for place in picked]
-        # A repetition keeps its own world where it can; others are struck several times.
+        # Strikes keep the world of their own repetition where possible; others share one.
         further = [(strike, *draw) for strike, draws in zip(strikes, chosen, strict=True)
                    for draw in draws[1:]]  # fmt: skip
         for strike, draws in zip(strikes, chosen, strict=True):
@@ -284,7 +286,7 @@ class Rounds:
     def _rows(
         self, strike: _Strike, number: int, place: _Strike, seed: int, stratum: str, weight: float
     ) -> Iterator[Drawn]:
-        """Give the missions of a strike a fault in the world and flight of a repetition."""
+        """Move the missions of a strike to the world and flight of `place`, with a drawn fault."""
         for mission, config in zip(
             strike.numbers, self._ledger.configs(strike.numbers), strict=True
         ):
@@ -297,7 +299,7 @@ class Rounds:
     def _pools(
         self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
     ) -> list[list[tuple[int, Stratum]]]:
-        """Seeds and their strata, for each strike of a round."""
+        """Return seeds and their strata, for each strike of a round."""
         requests = self._requests(rounds[number])
         begin = sum(map(len, rounds[:number]))
         pools = []
@@ -311,14 +313,14 @@ class Rounds:
         return pools
 
     def _requests(self, strikes: Sequence[_Strike]) -> dict[MissionConfig, int]:
-        """Number of plans that the golden flight of each strike requests, where it is known."""
+        """Return how many plans each strike's golden flight requests, by flight, where known."""
         wanted = {strike.config.golden for strike in strikes
                   if isinstance(strike.fault, InstructionConfig)}  # fmt: skip
         numbers = [
             mission
             for missions in self._plain.values()
             for mission, config in missions
-            if config in wanted  # without a detector
+            if config in wanted  # excludes missions with a detector
         ]
         requests: dict[MissionConfig, int] = {}
         for result in self._ledger.results(numbers):
@@ -327,7 +329,7 @@ class Rounds:
         return requests
 
     def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
-        """Spread of the losses in each stratum, without a detector if such missions are flown."""
+        """Return the spread of losses per stratum, without a detector if such missions exist."""
         over = dict(self._ledger.fates())
         lost: dict[str, list[bool]] = {}
         for strike in itertools.chain.from_iterable(rounds):

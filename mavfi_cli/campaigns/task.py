@@ -1,4 +1,4 @@
-"""The work of a campaign's worker: fly a mission, or a flight from which several are forked."""
+"""The task of a campaign's worker: fly a mission, or a flight from which several are forked."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def prepare() -> None:
     structure({"fault": {"target": "waypoint_x"}, "detector": {"name": "gad"}}, MissionConfig)
     structure({"instruction": {"target": "planner"}}, MissionConfig)
     VehicleInProcess.warm_up()
-    table = pa.table({"": [0.0]})  # pyarrow imports pandas, if there is one, at its first array
+    table = pa.table({"": [0.0]})  # pyarrow imports pandas, if installed, at its first array
     pq.write_table(table, io.BytesIO(), compression="zstd")
 
 
 def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> Path:
-    """Fly a mission, or several that share a flight; return the run folder in its own folder.
+    """Fly a mission, or several that share a flight; return the mission's run folder.
 
     Args:
         task: "missions" as triples of number, `missions.changes_of` and folder; "limit_s" of each;
@@ -76,7 +76,7 @@ def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> P
     if any(config.instruction is not None for config, _ in branches.values()):
         from mavfi_cli.mission.instruction.injection import keep_orders, struck_nodes
 
-        if config.detector is not None:  # its nodes may get other orders than the golden ones
+        if config.detector is not None:  # a detector may change the requests to nodes
             keep_orders(config.golden, profiles, fly_golden)
         strike = partial(struck_nodes, profiles=profiles)
     flown = config.shared_flight

@@ -1,4 +1,4 @@
-"""Workers that fly missions on this machine or on dask.distributed, and judge their ends.
+"""Workers that fly missions on this machine or on dask.distributed, and judge how they ended.
 
 Dask workers import this module. Every thread of a dask worker keeps one local worker, so a dask
 worker with n threads flies n missions at a time.
@@ -72,7 +72,7 @@ class AttemptEnd:
         report: the mission's last message: folder, or error and text, or traceback.
         lost: reason why its end is unknown.
         unforked: reason why it was not forked from its shared flight; empty if it was.
-        wall_s: wall time of the whole attempt, the guard's work included, s.
+        wall_s: wall time of the whole attempt, including the guard's work, s.
     """
 
     number: int
@@ -90,7 +90,7 @@ class AttemptEnd:
         Args:
             out: the attempt's own folder.
             config: configuration of the mission.
-            limit_s: its limit of wall time, s.
+            limit_s: limit of its wall time, s.
 
         Raises:
             CampaignStopped: the machine cannot fly any mission, for example because the disk is
@@ -123,7 +123,7 @@ TASK = "mavfi_cli.campaigns.task"
 _STOP_S = 10.0  # time after which a worker with a closed channel counts as ended
 
 
-Attempt = tuple[int, Changes, Path]  # number of a mission, what it changes, own folder
+Attempt = tuple[int, Changes, Path]  # mission number, changes, the attempt's own folder
 
 
 class LocalWorkers:
@@ -133,7 +133,7 @@ class LocalWorkers:
         self._jobs = jobs
         self._server = ForkServer(module)
         self._selector = selectors.DefaultSelector()
-        self._flying: dict[socket.socket, list[int]] = {}  # missions without an end, by channel
+        self._flying: dict[socket.socket, list[int]] = {}  # missions still running, by channel
         self._shared: dict[socket.socket, Path] = {}  # folders of shared flights
 
     @property
@@ -186,7 +186,7 @@ class LocalWorkers:
             if (number := message.pop("key", None)) is not None:
                 flying.remove(number)
                 ended.append(AttemptEnd(number=number, **message))
-            elif "pid" not in message:  # not the begin of the worker
+            elif "pid" not in message:  # not the message about the worker's start
                 if channel in self._shared:
                     reason = _end_of_flight(message)
                     ended += [AttemptEnd(number=number, unforked=reason) for number in flying]
@@ -238,7 +238,7 @@ def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
 # What the end of an attempt means --------------------------------------------------------------
 
 FULL_BYTES = 16 << 20  # with less free space a disk counts as full
-# A fault can make a process kill itself by other signals than these; these come from outside.
+# A fault can make a process die from other signals; these come from outside.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
 # Errors that the machine may have caused, so that another attempt may succeed.
@@ -264,7 +264,7 @@ def _recorded(run: Path, config: MissionConfig) -> AttemptResult:
             reason = "the vehicle died before it had saved the truth"
             return AttemptResult(state=None, result={}, reason=reason)
     fault = flight.state_fault
-    # A fault kills a node itself, and programs of a user's companion end each other.
+    # A process fault kills its node, and the programs of a user's companion may end each other.
     by_fault = config.companion is not None or (fault is not None and fault.stage == PROCESS)
     doubtful = not by_fault and any(how.endswith(_OUTSIDE_WORDS) for how in crashes)
     return AttemptResult(
@@ -309,7 +309,7 @@ def _cut_off(outcome: Outcome, reason: str, out: Path, config: MissionConfig) ->
 
 CONNECT_S, WORKERS_S = 15.0, 60.0
 _BACKLOG = 2  # missions queued for each thread, so that it never waits for us
-_LARGEST_FILE = 1 << 30  # bytes, of a run folder
+_LARGEST_FILE = 1 << 30  # largest file of a run folder, bytes
 _LOOK_S = 2.0  # interval between queries for the number of threads
 
 
@@ -447,7 +447,7 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
             raise CampaignStopped(f"worker {worker} has other versions: {'; '.join(differing)}")
 
 
-_SMALL = (RESULT, FAULT)  # files that the runner reads of a run folder that is not kept
+_SMALL = (RESULT, FAULT)  # files that the runner reads from a run folder that is not kept
 _thread = threading.local()
 
 
@@ -472,8 +472,8 @@ def _fly(
         versions: the runner's versions.
 
     Returns:
-        Their ends, with the compressed files of each by path in its folder; or, without flying, the
-        differences of this worker's versions from the runner's.
+        How each mission ended, with its compressed files by path in its folder; or, if nothing was
+        flown, the differences between this worker's versions and the runner's.
     """
     differing = version_differences(versions, _worker_versions())
     if differing:

@@ -1,12 +1,12 @@
-"""The paper's tables, figures and claims: their missions, and our numbers beside the paper's.
+"""The paper's tables, figures and claims: their missions, and our numbers next to the paper's.
 
-items     the tables and figures, their missions, the form of their tables, the paper's numbers
+items     the tables and figures: their missions, table columns and printed numbers
 flying    flies the missions and runs the isolated kernels
 layouts   the rows of each item's table, from flights
 figures   the figure of each item
 status    the tables and the state of one campaign
 sources   reads campaigns, exports and runs of isolated kernels from folders
 claims    every claim of the paper, its range, and the measures of flights that decide it
-beyond    from kernel to mission, harm by bit, failures per hour, savings of mechanisms
-document  all of it as plain values, for the page
+beyond    faults from kernel to mission, harm by bit, failures per hour, what mechanisms save
+document  the content of the results page as plain values
 """

@@ -1,4 +1,4 @@
-"""The answers on the first screen: is the paper reproduced, where is it not, and what helps."""
+"""Answers for the first screen: whether the paper is reproduced, where it is not, what helps."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mavfi_cli.report.paper import DETECTOR_TITLES
 from mavfi_cli.stats.shares import Share, wilson
 
 LEVELS = {"source": "states", "instruction": "instructions"}
-_DECIDED = 0.25  # least share of the claims that an answer needs, and not fewer than are undecided
-_COMPUTER = "x86"  # of what protects; the table of balances has all computers
-_KINDS = {  # of faults: level, and what they do to their nodes
+_DECIDED = 0.25  # an answer needs this share of claims decided, and at least as many as are open
+_COMPUTER = "x86"  # platform of the answers; only the table of balances covers all platforms
+_KINDS = {  # kinds of faults: level, and effect on the struck node
     "a wrong value in a state": ("source", Fate.ALL),
     "a fault in an instruction, silent": ("instruction", Fate.SILENT),
     "a fault in an instruction that ends its node": ("instruction", Fate.DEAD),
@@ -31,7 +31,7 @@ _KINDS = {  # of faults: level, and what they do to their nodes
 
 
 def judgement_of(judged: JudgedClaim, stack: str, fate: Fate = Fate.ALL) -> Judgement | None:
-    """The judgement of a claim on a stack or in isolated kernels; None if there is none."""
+    """Return the judgement of a claim on a stack or in isolated kernels; None if there is none."""
     place = ISOLATED if judged.claim.isolated else stack
     return judged.judgements.get(place, {}).get(fate)
 
@@ -43,7 +43,7 @@ _SHORT = {
 
 
 def short_name(judged: JudgedClaim) -> str:
-    """A claim in two or three words, such as `Fig. 8 velocity`."""
+    """Return a claim's name in two or three words, such as `Fig. 8 velocity`."""
     item, *words = judged.claim.name.split("-")
     return " ".join([printed_name(item), *(_SHORT.get(word, word) for word in words)])
 
@@ -63,7 +63,7 @@ class Family:
 
     @classmethod
     def of(cls, claims: Sequence[JudgedClaim]) -> list[Self]:
-        """The claims by figure, table or section, in order."""
+        """Group claims by figure, table or section, in order."""
         families = []
         for name, members in groupby(claims, lambda judged: judged.claim.item):
             title = f": {BY_NAME[name].title}" if name in BY_NAME else ""
@@ -75,7 +75,7 @@ class Family:
 
 
 def answer(claims: Sequence[JudgedClaim], stack: str) -> str:
-    """One sentence with the verdicts on a stack and in the isolated kernels."""
+    """Summarise the verdicts on a stack and in the isolated kernels in one sentence."""
     counts = _count_verdicts(claims, stack)
     yes, no, open_ = (
         counts[verdict] for verdict in (Verdict.REPRODUCED, Verdict.CONTRADICTED, Verdict.UNDECIDED)
@@ -145,7 +145,7 @@ class Disagreement:
 
     @property
     def names(self) -> Mapping[str, str]:
-        """The short names of its claims by their names; each item is named only once."""
+        """Short names by claim name; consecutive claims of an item mention the item only once."""
         names, item = {}, ""
         for judged in self.claims:
             short, item_before, item = short_name(judged), item, judged.claim.item
@@ -155,7 +155,7 @@ class Disagreement:
 
 
 def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreement]:
-    """The contradicted claims, grouped by reason, in the order of the claims."""
+    """Group the contradicted claims by reason, in the order of the claims."""
     by_reason: dict[str, list[JudgedClaim]] = {}
     for judged in claims:
         judgement = judgement_of(judged, stack)
@@ -168,10 +168,10 @@ def disagreements(claims: Sequence[JudgedClaim], stack: str) -> list[Disagreemen
 
 
 def reason_of(judged: JudgedClaim, stack: str) -> str:
-    """The reason why a stack contradicts a claim; empty if it does not, or if none is known.
+    """Return why a stack contradicts a claim; empty if it does not, or if no reason is known.
 
     A reason explains one effect, on the paper's stack or in isolated kernels. It is returned only
-    for an effect that lies in the interval of the explained effect.
+    if the effect lies in the interval that the reason explains.
     """
     words, low, high = REASONS.get(judged.claim.name, ("", 0.0, 0.0))
     judgement = judgement_of(judged, stack)
@@ -191,7 +191,7 @@ def _read_reasons() -> Mapping[str, tuple[str, float, float]]:
 
 
 REASONS = _read_reasons()
-"""Why claims are contradicted, with the interval of the effect that it explains, by their names."""
+"""Reasons for contradicted claims, by claim name, with the interval of effects they explain."""
 
 
 # What a designer should do ------------------------------------------------------------------------
@@ -217,7 +217,7 @@ class DetectorBalance:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """The balance of every level, computer, detector and fate that has flown pairs."""
+        """Yield the balance of every level, platform, detector and fate with flown pairs."""
         watched = flights.comparable.chosen(detector=(*DETECTOR_TITLES,), bare_struck=True)
         for level, computer, detector in sorted(
             watched.by("level", "platform", "detector"), key=str
@@ -249,7 +249,7 @@ class _Against:
 
     @classmethod
     def of_pairs(cls, balance: Balance) -> _Against | None:
-        """Judge it on the same faults by McNemar's test; None without pairs."""
+        """Judge a protection on the same faults by McNemar's test; None without pairs."""
         if not balance.pairs:
             return None
         before, caused, pairs = balance.before, balance.caused, balance.pairs
@@ -262,7 +262,7 @@ class _Against:
 
     @classmethod
     def of_shares(cls, before: Share, after: Share) -> _Against | None:
-        """Judge it in the same scenes by the interval of the difference; None if one is empty."""
+        """Judge a protection by the difference of shares in equal scenes; None if one is empty."""
         if not (before.total and after.total):
             return None
         change = after.minus(before)
@@ -281,11 +281,11 @@ def _effect(ill: int, better: bool, proven: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Safeguard:
-    """The effect of a detector, or of another stack, against each kind of fault, and its cost.
+    """A detector or another stack: its effect against each kind of fault, and its cost.
 
     Attributes:
-        against: effect by the kind of fault; None where it was not flown.
-        costs: mean share of the flight time, by the words of the level; empty if not measured.
+        against: effect by kind of fault; None if that kind was not flown.
+        costs: mean share of the flight time, by name of the level; empty if not measured.
     """
 
     name: str
@@ -317,14 +317,14 @@ def protections(flights: Mapping[str, Flights]) -> list[Safeguard]:
 
 
 def _costs(flights: Flights, detector: str) -> dict[str, float]:
-    """The mean share of the flight time that detection and recovery take, by level."""
+    """Return the mean share of the flight time that detection and recovery take, by level."""
     seen = flights.comparable.struck(detector=detector, platform=_COMPUTER)
     shares = {level: seen.chosen(level=level).known(*COSTS) for level in LEVELS}
     return {LEVELS[level]: float(mine.mean()) for level, mine in shares.items() if len(mine)}
 
 
 def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
-    """The harmed missions by kind of fault, in the scenes that other flights share."""
+    """Return the share of harmed missions by kind of fault, in scenes that both sets contain."""
     scenes = {*zip(others["world"], others["seed"], strict=True)}
     mine = flights.struck(platform=_COMPUTER)
     mine = mine.where(scene in scenes for scene in mine.seeds)
@@ -339,11 +339,11 @@ def _harmed(flights: Flights, others: Flights) -> dict[str, Share]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delays:
-    """Added seconds of the same faults without and with detectors.
+    """Delays caused by the same faults, without and with detectors.
 
     Attributes:
         level: `source` or `instruction`.
-        added_s: added seconds (n,) by detector, None without one; infinite for a lost mission.
+        added_s: added flight time (n,), s, by detector (None: none); infinite for a lost mission.
         golden_s: mean flight time of the golden flights.
     """
 
@@ -354,7 +354,7 @@ class Delays:
 
     @classmethod
     def of(cls, stack: str, flights: Flights) -> Iterator[Self]:
-        """The delays at both levels, for the faults that were flown with every detector."""
+        """Yield the delays at each level, for faults that were flown with every detector."""
         hit = flights.comparable.chosen(struck=True, own_lost=False, platform=_COMPUTER)
         for level in ("source", "instruction"):
             mine = hit.chosen(level=level)

@@ -1,7 +1,7 @@
-"""Questions that the paper does not ask about its flights.
+"""Analyses that go beyond the paper.
 
-They follow a fault from the kernel to the mission, map where a flipped bit does harm, count
-failures per hour, compare what each mechanism saves, and what the restart of a dead node saves.
+They trace a fault from the kernel to the mission, map where a flipped bit does harm, count failures
+per hour, compare what each mechanism saves, and measure what restarting a dead node saves.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mavfi_cli.stats.shares import Share, cross_layer, wilson
 
 Row = Mapping[str, Any]  # one flight
 
-# What a struck kernel did, as far as the flight shows it. `same flight`: the fault was read, and
+# What a struck kernel did, as far as the flight shows. `same flight`: the fault was read, and
 # every measure equals that of the golden flight.
 FATES = ("never read", "same flight", "changed flight", "crashed", "hung")
 _UNREAD, _SAME, _CHANGED, _CRASH, _HANG = FATES
@@ -57,10 +57,10 @@ class KernelFlow:
 
 
 def kernel_flows(flights: Flights, alone: Mapping[str, tuple[int, int]]) -> list[KernelFlow]:
-    """The flow of each kernel that instruction-level faults struck.
+    """Return the flow of each kernel struck by instruction-level faults.
 
     Args:
-        alone: silent corruptions and faults of each isolated kernel.
+        alone: numbers of silent corruptions and of faults, for each isolated kernel.
     """
     own = {row["pair"]: row for row in flights.golden.rows("pair", *_MEASURES)}
     hit = flights.struck(level="instruction", own_lost=False).by("struck_kernel")
@@ -92,9 +92,10 @@ def _flow(
 
 
 def _fate_of(flight: Row, own: Row) -> str:
-    """The fate of a kernel that an instruction-level fault struck.
+    """Return the fate of a kernel struck by an instruction-level fault.
 
-    Missions repeat to the byte, so only the fault can make a flight differ from its golden one.
+    Repeated missions match byte for byte, so only the fault can make a flight differ from its
+    golden flight.
     """
     ended = set((flight["node_ended"] or "").split(";")) - {""}
     if ended:
@@ -104,7 +105,7 @@ def _fate_of(flight: Row, own: Row) -> str:
     return _SAME if flight["activation"] == "read" else _UNREAD
 
 
-# State by bit by phase of flight ------------------------------------------------------------------
+# Harm by state, bit and phase of flight -----------------------------------------------------------
 
 _BITS = {  # lowest bit of each class, highest class first
     DType.FLOAT64: (("bit 63, sign", 63), ("exponent 62 to 57", 57), ("exponent 56 to 52", 52),
@@ -118,7 +119,7 @@ BIT_CLASSES = tuple(tuple(name for name, _ in kinds) for kinds in _BITS.values()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCell:
-    """The harmed and the lost missions of faults in a class of bits of a state, in a phase."""
+    """Harmed and lost missions among faults in one bit class of a state, in one phase of flight."""
 
     state: str
     bits: str
@@ -128,7 +129,7 @@ class MapCell:
 
 
 def state_map(flights: Flights) -> list[MapCell]:
-    """The cells of all states, classes of bits and phases that faults struck, in sorted order.
+    """Return a cell for every state, bit class and phase that faults struck, in sorted order.
 
     It counts source-level faults without a detector whose golden flights succeed. A fault in
     several components counts for their group and for the highest bit that it flips.
@@ -154,12 +155,12 @@ def _class(flight: Row) -> str:
     return next(name for name, lowest in kinds if highest >= lowest)
 
 
-# Failures a flight hour ---------------------------------------------------------------------------
+# Failures per flight hour -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HourlyFailures:
-    """Failures per flight hour of one kind of fault in one world, by detector; empty means none.
+    """Failures per flight hour of one kind of fault in one world, by detector; "" means none.
 
     Attributes:
         where: the struck site, the kind of corruption, the world, and the computer.
@@ -173,7 +174,7 @@ class HourlyFailures:
 
 
 def hourly_failures(flights: Flights, upsets_per_hour: float) -> Iterator[HourlyFailures]:
-    """Failures per flight hour for each kind of fault in one world.
+    """Yield the failures per flight hour for each kind of fault in each world.
 
     Args:
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
@@ -205,8 +206,8 @@ def _kind(flight: Row) -> str:
 
 # What each mechanism saves ------------------------------------------------------------------------
 
-# An arm is a stack with or without a detector. Its faults are those that the arm without protection
-# has read, so all arms are counted on the same faults in the same scenes.
+# An arm is a stack with or without a detector. Only faults that were read in the unprotected arm
+# count, so all arms are compared on the same faults in the same scenes.
 _BASE = "mavbench"
 _WORDS, _ = read_toml(Path(__file__).parent / "arms.toml")
 PLAIN = _WORDS["stacks"][""]
@@ -218,7 +219,7 @@ class Arm:
 
     Attributes:
         golden: lost golden flights.
-        lost, by_site: lost missions over all faults, and for each injection site.
+        lost, by_site: shares of lost missions, over all faults and by injection site.
         p_value: p-value of McNemar's exact test against the unprotected arm; None for that arm.
         corrected_p: p-value corrected by Holm over all arms.
     """
@@ -270,7 +271,7 @@ _READ = ("stack", "detector", "level", "fault", "fault_target", "activation", "l
 
 
 def _arm_of(flight: Row) -> str:
-    """The name of a flight's arm; empty if its stack is no variant of mavbench."""
+    """Return the name of a flight's arm; empty if its stack is not a variant of mavbench."""
     base, _, changes = flight["stack"].partition(":")
     if base not in (_BASE, f"{_BASE}-protected"):
         return ""
@@ -283,7 +284,7 @@ def _arm_of(flight: Row) -> str:
 
 
 def _trial_of(flight: Row) -> str:
-    """Fault, world, start, noise and computer as text, which the flights of all arms share."""
+    """Return fault, world, start, noise and platform as text, which is the same in all arms."""
     config = json.loads(flight["changes"])
     return canonical({name: value for name, value in config.items() if name not in _APART})
 
@@ -304,19 +305,19 @@ def _by_site(flights: Sequence[Row]) -> dict[str, Share]:
     return {name: _lost(by_site[name]) for name in order if name in by_site}
 
 
-# What the restart of a dead node saves ------------------------------------------------------------
+# What restarting a dead node saves ----------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RestartComparison:
-    """Success of a stack in a world with the same faults, by when a dead node comes back.
+    """Success of a stack in a world on the same faults, by restart delay of a dead node.
 
     Attributes:
         paper: success that Table IV prints for golden flights and for faults, %; None if it has no
             such world.
         golden: success of the golden flights.
-        success: success with faults in instructions, for each of the restart rules.
-        lost: lost missions among the faults of each fate, for each of the rules.
+        success: success with faults in instructions, for each restart rule.
+        lost: lost missions among the faults of each fate, for each restart rule.
         p_value: p-value of McNemar's exact test between the earliest and the latest restart.
     """
 
@@ -330,12 +331,12 @@ class RestartComparison:
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """The restart rules, the earliest restart first."""
+        """The restart rules, earliest restart first."""
         return tuple(self.success)
 
 
 def restarts(flights: Flights) -> list[RestartComparison]:
-    """Compare the restart rules under which a stack flew the same faults in instructions."""
+    """Compare restart rules on the same instruction-level faults, for each stack and world."""
     hit = flights.struck(level="instruction").shared("stack", "world", arm="restart_s")
     by_place = {place: mine.by("restart_s") for place, mine in hit.by("stack", "world").items()}
     return [

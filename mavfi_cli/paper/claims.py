@@ -1,7 +1,7 @@
-"""Every claim of the paper: its words, the number that decides it, and the range that it gives.
+"""The claims of the paper: their words, the numbers that decide them, and their ranges.
 
-claims.toml has the claims, and measures.py the numbers. Each claim about faults is judged three
-times: for all faults, for those that are silent, and for those that end a node.
+claims.toml lists the claims, and measures.py computes the numbers. Each claim about faults is
+judged three times: for all faults, for silent ones, and for those that end a node.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from mavfi_cli.stats.paired import Count, recovered_share
 from mavfi_cli.stats.shares import Interval, wilson
 
 _FILE = Path(__file__).parent / "claims.toml"
-_FACTOR = 3.0  # a size is reproduced from a third of it to so many times it
+_FACTOR = 3.0  # effects from a third to three times a stated size reproduce it
 _NONE = {Fate.SILENT: "none of the faults is silent", Fate.DEAD: "none of the faults ends a node"}
-_WHOLE = ("points", "percent")  # units of shares, which end at 1
+_WHOLE = ("points", "percent")  # units of shares, which are at most 1
 
 
 def judged(
@@ -43,11 +43,11 @@ def judged(
     kernels: Kernels,
     settled: Mapping[str, Settling] | None = None,
 ) -> list[JudgedClaim]:
-    """All claims with their verdicts, in the order of CLAIMS.
+    """Return all claims with their verdicts, in the order of CLAIMS.
 
     Args:
         flights: flights by stack.
-        settled: the missions flown to settle claims, by stack; the other stacks have none.
+        settled: the missions flown to settle claims, by stack; other stacks have none.
     """
     settled = settled or {}
     judgements: dict[str, dict[str, dict[Fate, Judgement]]] = {claim.name: {} for claim in CLAIMS}
@@ -181,7 +181,7 @@ def _in_the_paper(words: str, counts: Sequence[Count]) -> str:
 
 
 def _spread(counts: Sequence[Count]) -> Interval:
-    """A rate, or the difference of two, the recovered share of three, or two losses compared."""
+    """Return a rate, a difference, a recovered share or a difference of losses, by the counts."""
     if len(counts) == 3:
         return recovered_share(*counts)
     first, *others = (wilson(*count) for count in counts)
@@ -192,7 +192,7 @@ def _spread(counts: Sequence[Count]) -> Interval:
 
 
 def _arguments(given: Mapping[str, Any], sets: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a measure; named flights are replaced by the columns that choose them."""
+    """Return a measure's arguments, with named flights replaced by the columns that select them."""
     arguments: dict[str, Any] = {}
     for name, value in given.items():
         if name == "flights":

@@ -72,14 +72,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DETECTORS = {None: "no detector"} | DETECTOR_TITLES
-_LONGEST = 5  # flights of a campaign that are listed although they succeed
-_PICTURES, _LARGEST_PICTURE = 40, 500_000  # of kept flights in the page; bytes
-Step = Callable[[str], object]  # is called with the name of each step
+_LONGEST = 5  # successful flights that are listed for a campaign
+_PICTURES, _LARGEST_PICTURE = 40, 500_000  # most pictures of kept flights on the page; bytes
+Step = Callable[[str], object]  # called with the name of each step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _StateMatrix:
-    """The state map of a phase: states as rows, classes of bits as columns; None where empty."""
+    """The state map of a phase: states as rows, bit classes as columns; None where empty."""
 
     stack: str
     phase: str
@@ -102,7 +102,7 @@ class _ItemPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ShownItem:
-    """An item of the paper with its parts, and the places without a part of it."""
+    """An item of the paper with its parts, and the places that have none."""
 
     item: Item
     parts: Sequence[_ItemPart]
@@ -114,8 +114,8 @@ class _ListedMission:
     """A mission that deserves a closer look.
 
     Attributes:
-        ratio: flight time divided by the golden one's; None if it is lost.
-        command: repeats the flight.
+        ratio: flight time divided by that of the golden flight; None if the mission is lost.
+        command: command that repeats the flight.
         picture: its top view as a data URL; empty if it was not kept.
     """
 
@@ -140,7 +140,7 @@ class _CampaignMissions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """The whole page. `stack` is the first stack that has flights; the others fold away."""
+    """The whole page. `stack` is the first stack with flights; the others are collapsed."""
 
     version: str
     stacks: Sequence[str]
@@ -179,11 +179,11 @@ class Document:
         return self.stacks[0]
 
     def reason(self, judged: JudgedClaim) -> str:
-        """The reason why a claim is contradicted; empty if it is not, or if none is known."""
+        """Return why a claim is contradicted; empty if it is not, or if no reason is known."""
         return reason_of(judged, self.stack)
 
     def verdicts(self) -> dict[str, dict[str, int]]:
-        """The number of claims with each verdict, by stack and for isolated kernels."""
+        """Count the claims with each verdict, by stack and for isolated kernels."""
         by_place = {
             place: [claim.verdict(place) for claim in self.claims] for place in (*STACKS, ISOLATED)
         }
@@ -318,7 +318,7 @@ def _forest(claims: Sequence[JudgedClaim], stacks: Sequence[str]) -> Picture | N
 
 
 def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
-    """Shares of faulty flights that take longer than golden by more than a number of seconds."""
+    """Draw the share of faulty flights with more than a given delay, over the delay."""
     if not parts:
         return None
     curves = {
@@ -341,7 +341,7 @@ def _delay_picture(parts: Sequence[Delays]) -> Picture | None:
 
 
 def _spread(stack: str, flights: Flights) -> Picture | None:
-    """Flight times with a fault in a state, relative to golden flights, by world and detector."""
+    """Draw flight times with faults in states, relative to golden, by world and detector."""
     seen = {"level": "source", "platform": "x86", "struck": True, "detector": (*_DETECTORS,)}
     hit = flights.comparable.timed.chosen(**seen)
     groups = hit.by("world", "detector")
@@ -390,7 +390,7 @@ def _arm_picture(campaign: str, rows: Sequence[Arm]) -> Picture:
 
 
 def _matrices(stack: str, cells: Sequence[MapCell]) -> Iterator[_StateMatrix]:
-    """A matrix for each phase and kind of state."""
+    """Yield a matrix for each phase and kind of state."""
     for phase in sorted({cell.phase for cell in cells}):
         for columns in BIT_CLASSES:
             mine = [cell for cell in cells if cell.bits in columns and cell.phase == phase]
@@ -432,7 +432,7 @@ def _missions(campaigns: Sequence[CampaignSource]) -> Iterator[_CampaignMissions
 def _listed(
     flight: Mapping[str, Any], source: CampaignSource, pictured: bool = False
 ) -> _ListedMission:
-    """Describe a mission; its command names an export by the given path if that is relative."""
+    """Describe a mission; its command names an export by its relative path or its file name."""
     struck_state = f"{flight['fault_target']}, {flight['fault_field'] or 'any'}"
     fault = "golden" if flight["level"] is None else struck_state
     kept = source.may_have_runs and _is_kept(flight["path"])
@@ -452,7 +452,7 @@ def _listed(
 
 
 def _flight_picture(run: Path) -> str:
-    """The top view of a kept run as an image, in which a browser runs no script."""
+    """Return the top view of a kept run as a data URL, in which a browser runs no script."""
     path = RunFolder(run).picture
     if path.is_symlink() or not path.is_file() or path.stat().st_size > _LARGEST_PICTURE:
         return ""
@@ -467,7 +467,7 @@ _SETTING = ("world", "platform", "planner", "fault_target", "fault_field", "faul
 
 
 def _items(evidence: Evidence, flights: Mapping[str, Flights]) -> Iterator[_ShownItem]:
-    """Every item of the paper in its order.
+    """Yield every item of the paper, in the paper's order.
 
     Args:
         flights: flights by stack, from `Evidence.flights`.
@@ -516,7 +516,7 @@ def _item_picture(item: Item, place: str, figure: Figure, csv: str) -> Picture:
 
 
 def _with_runs(item: Item, stack: str, evidence: Evidence) -> Flights | None:
-    """The item's flights in the first campaign that has kept the run folders of all of them."""
+    """Return the item's flights in the first campaign that kept all their run folders."""
     folders = [source for source in evidence.campaigns if source.may_have_runs]
     several = (Flights.pooled([source.flights], stack) for source in folders)
     own = (of_kind(item, stack, flights) for flights in several)
@@ -528,7 +528,7 @@ def _is_kept(run: str | None) -> bool:
 
 
 def _over_own(flights: Flights) -> Iterator[dict[str, Any]]:
-    """The successful faulty flights, with the columns in which they differ."""
+    """Yield the successful faulty flights, with the columns in which they differ."""
     rows = flights.timed.rows(*_SETTING)
     varying = [name for name in _SETTING if len({row[name] for row in rows}) > 1]
     for row, ratio in zip(rows, flights.timed.ratios, strict=True):

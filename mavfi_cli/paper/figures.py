@@ -45,7 +45,7 @@ def draw(table: PaperTable, flights: Flights | None, columns: str) -> Figure:
         columns: width, `one` or `two`.
 
     Raises:
-        RecordError: no flight belongs in the figure, or these folders do not exist.
+        RecordError: the figure has no flights, or their run folders do not exist.
     """
     if not table.rows or (flights is not None and not len(flights)):
         raise RecordError(_NOTHING)
@@ -113,7 +113,7 @@ def _fig12(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _fig14(flights: Flights) -> dict[str, list[_Row]]:
-    """The paper prints recovered shares of the worst increase; this computes what remains of it."""
+    """Build the panels, with the part of the worst increase that the paper leaves unrecovered."""
     panels: dict[str, list[_Row]] = {}
     for world in flights.worlds:
         here = flights.chosen(world=world)
@@ -129,7 +129,7 @@ def _fig14(flights: Flights) -> dict[str, list[_Row]]:
 
 
 def _short(stages: str) -> str:
-    """Protected stages as the paper abbreviates them."""
+    """Abbreviate protected stages as the paper does."""
     if stages in STAGES:
         return stages
     return "".join(stage[0].upper() for stage in stages.split("+"))
@@ -153,7 +153,7 @@ def _fig13(flights: Flights, columns: str) -> Figure:
     """Top view of the pair whose flight time grows most."""
     kept = [Path(path) for path in flights["path"] if path]
     if not kept:
-        raise RecordError("fig13 draws recorded flights, and no run folder was kept (--keep all)")
+        raise RecordError("fig13 needs recorded flights, but no run folder was kept (--keep all)")
     with Ledger(kept[0].parents[1]) as ledger:
         flown = Trajectories.of(pair(ledger, among=frozenset(flights["number"])))
     figure = flown.draw(across=1 if columns == "one" else 2)

@@ -25,9 +25,9 @@ from mavfi_cli.core.files import ScratchFolder
 from mavfi_cli.paper.items import ITEMS, KERNELS_FOLDER, FlightsPlan, Source
 from mavfi_cli.report.attacks import save_runs, summarise
 
-_MEASURED = 12  # missions that a forecast is from, if no more are over
-_OF_A_KIND = 4  # at least so many of each kind
-_NEWEST = 2000  # the most that are read
+_MEASURED = 12  # missions to measure for a forecast, if too few have finished
+_OF_A_KIND = 4  # finished missions of a kind that need no further measurement
+_NEWEST = 2000  # most finished missions that a forecast reads, newest first
 _ROW_BYTES, _FOLDER_BYTES = 20_000, 2_000_000  # of a mission in the ledger, and of a kept run
 _PROFILES_BYTES = 10_000_000  # of the profiles of one golden flight
 
@@ -40,8 +40,8 @@ class Forecast:
         missions, over: number of missions of the items, and how many of them are finished.
         seconds: wall time of the rest; it excludes missions if none has been measured.
         disk_bytes: space for the rest, including profiles that are removed later.
-        measured: number of missions behind the forecast; 0 if few are left.
-        jobs: number of missions or runs at the same time.
+        measured: number of missions on which the forecast is based; may be 0 if few are left.
+        jobs: number of concurrent missions or runs.
         runs: number of missing runs of isolated kernels.
     """
 
@@ -112,7 +112,7 @@ def reproduce(
 
 
 class _Ahead(Spectator):
-    """Passes all events on, and adds the work that follows the missions to the time left."""
+    """Forwards all events, and adds the work that follows the missions to the time left."""
 
     def __init__(self, spectator: Spectator, beyond_s: float) -> None:
         self._spectator, self._beyond_s = spectator, beyond_s
@@ -128,7 +128,7 @@ class _Ahead(Spectator):
 
 
 def opened(plan: FlightsPlan) -> Ledger:
-    """The ledger of the plan's stack with the list of all items at the plan's scale.
+    """Open the ledger of the plan's stack for writing, and store the missions of all items.
 
     Raises:
         ConfigError: the folder holds another campaign, or one begun with other versions.
@@ -162,7 +162,7 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
 
 
 def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
-    """Kinds of the wanted missions that are missing, by number."""
+    """Return the kinds of the wanted missions without a result, by mission number."""
     return {
         mission.number: _kind(mission.config.instruction, mission.config.fault)
         for mission in ledger.missing()
@@ -173,9 +173,9 @@ def _missing(ledger: Ledger, wanted: frozenset[int]) -> dict[int, str]:
 def _measured(
     ledger: Ledger, wanted: frozenset[int], options: Options, spectator: Spectator
 ) -> list[int]:
-    """Fly a few missions of each kind with few finished ones; return those that a forecast uses.
+    """Fly a few missions of each rarely finished kind; return the missions that a forecast uses.
 
-    The first missions also fly the golden flights of others, so the forecast uses later ones.
+    The first missions also fly golden flights that later ones share, so they are not measured.
     """
     missing = _missing(ledger, wanted)
     over = sorted(wanted.difference(missing))[-_NEWEST:]
@@ -201,23 +201,23 @@ def _measured(
 
 
 def _kind(instruction: object, fault: object) -> str:
-    """The kind of a mission: its level of faults or `golden`, which affects wall time most."""
+    """Return what affects a mission's wall time most: the level of its fault, or `golden`."""
     return "instruction" if instruction else "source" if fault else "golden"
 
 
 def _kinds(results: Iterable[MissionResult]) -> list[tuple[str, float]]:
-    """Kind and wall time of missions that are over."""
+    """Return the kind and wall time of finished missions."""
     configs = [(result.mission.config, result.wall_s) for result in results]
     return [(_kind(config.instruction, config.fault), wall_s) for config, wall_s in configs]
 
 
 def remaining_s(measured: Iterable[tuple[str, float]], missing: Mapping[str, int]) -> float:
-    """Wall time of the missing missions, flown one after another, from the mean of each kind, s.
+    """Estimate the wall time of missing missions, flown one by one, from each kind's mean, s.
 
     Args:
         measured: kind and wall time of finished missions.
-        missing: number of missing missions of each kind. A kind that was never measured takes as
-            long as the mean of all.
+        missing: number of missing missions of each kind. A kind without measurements gets the
+            mean of all.
     """
     times: dict[str, list[float]] = {}
     for kind, wall_s in measured:
@@ -233,7 +233,7 @@ def _with_flights(
     options: Options,
     measured: Sequence[int],
 ) -> Forecast:
-    """A forecast that includes the missing missions, estimated from the measured ones."""
+    """Return a forecast that includes the missing missions, estimated from the measured ones."""
     missing = _missing(ledger, wanted)
     flown = list(ledger.results(measured))
     left_s = remaining_s(_kinds(flown), Counter(missing.values()))
@@ -279,10 +279,10 @@ def _require_room(out: Path, forecast: Forecast) -> None:
 
 _PAPER_RUNS = 5000  # of each kernel
 _SEED = 1
-# The forecast measures the quickest kernel and takes the others from docs/results/kernels.json.
+# The forecast runs the quickest kernel, and scales the times in docs/results/kernels.json by it.
 _QUICKEST, _QUICK_RUNS = "control", 100
-_QUICKEST_RUN_S = 35.0 / 5000  # there
-_PREPARE_S, _RUN_OF_EACH_S = 738.0, 1965.0 / 5000  # of all kernels, there
+_QUICKEST_RUN_S = 35.0 / 5000  # in that file
+_PREPARE_S, _RUN_OF_EACH_S = 738.0, 1965.0 / 5000  # of all kernels together, in that file
 _RECORD_BYTES = 2000  # of the record of a run
 
 
@@ -291,9 +291,9 @@ class _KernelRuns:
     """The runs of all kernels in the folder of a reproduction.
 
     Attributes:
-        out: folder of all stacks; the runs are in KERNELS_FOLDER beside those.
+        out: folder of all stacks; its subfolder KERNELS_FOLDER holds the runs.
         runs: number of runs of each kernel.
-        jobs: runs at the same time.
+        jobs: number of concurrent runs.
     """
 
     out: Path
@@ -306,7 +306,7 @@ class _KernelRuns:
         return self.out / KERNELS_FOLDER
 
     def missing(self) -> int:
-        """Number of runs that the summary lacks."""
+        """Count the runs that the summary lacks."""
         path = self.folder / KERNELS
         if not path.is_file():
             return self.runs * len(select(()))
@@ -314,7 +314,7 @@ class _KernelRuns:
         return sum(max(0, self.runs - done.get(name, 0)) for name in select(()))
 
     def forecast_s(self) -> float:
-        """Wall time of the missing runs, from a few runs of the quickest kernel."""
+        """Estimate the wall time of the missing runs from a few runs of the quickest kernel, s."""
         with ScratchFolder("kernels") as scratch:
             targets = _targets([_QUICKEST], scratch)
             (measured,) = run_campaign(Plan(runs=_QUICK_RUNS, seed=_SEED), targets)
@@ -324,7 +324,7 @@ class _KernelRuns:
         return there_s * run_s / _QUICKEST_RUN_S
 
     def run(self, spectator: Spectator, forecast_s: float) -> None:
-        """Make the missing runs, and write their summary.
+        """Execute the missing runs, and write their summary.
 
         Raises:
             MavfiError: as `attack.campaign.run_campaign`.
@@ -335,7 +335,7 @@ class _KernelRuns:
         whole, missing = self.runs * len(names), self.missing()
 
         def show(name: str, done: int) -> None:
-            """Report the runs of the kernel, and the time left from the forecast."""
+            """Report a kernel's finished runs, and the time left according to the forecast."""
             place = names.index(name)
             left = min(1.0, (whole - place * self.runs - done) / missing)
             text = f"kernel {place + 1} of {len(names)}, {name}: {done}/{self.runs} runs"

@@ -1,7 +1,7 @@
-"""The items of the paper: figures and tables that are experiments, their numbers, their missions.
+"""The items of the paper: its figures and tables of experiments, with their numbers and missions.
 
-paper.toml has the items and all numbers that the paper prints. The missions of several items are
-one list, each mission once.
+paper.toml contains the items and all numbers that the paper prints. The missions of several items
+form one list without duplicates.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Item:
         name: as on the command line, such as `fig6`.
         labels, columns, notes: parts of its table, as paper.toml explains.
         origin: where the paper prints its numbers, and which results it only plots.
-        preset: the campaign that flies it; empty if its source is not flights.
+        preset: campaign with the item's missions; empty if its source is not flights.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Item:
     def table(
         self, rows: Sequence[PaperRow], worlds: Sequence[str] = (), notes: Sequence[str] = ()
     ) -> PaperTable:
-        """The item's table with these rows and additional notes."""
+        """Return the item's table with the given rows and additional notes."""
         return PaperTable(
             name=self.name,
             title=f"{self.paper}: {self.title}",
@@ -83,13 +83,13 @@ class Item:
 
 
 def printed_name(name: str) -> str:
-    """The paper's name for a figure, table or section, such as `Fig. 6` for `fig6`."""
+    """Return the paper's name for a figure, table or section, such as `Fig. 6` for `fig6`."""
     kind, number = name.rstrip("0123456789"), int(name.lstrip("abcdefghijklmnopqrstuvwxyz"))
     return f"Fig. {number}" if kind == "fig" else f"{kind.capitalize()} {_ROMAN[number]}"
 
 
 def printed(item: str, *keys: object) -> Printed:
-    """A number that the paper prints, or its words; None if it prints nothing there."""
+    """Return a number or text that the paper prints; None if it prints nothing there."""
     entry: Any = _PAPER.get(item, {})
     for key in keys:
         entry = entry.get(str(key)) if isinstance(entry, Mapping) else None
@@ -115,11 +115,11 @@ def _item(name: str, entry: Mapping[str, Any]) -> Item:
 ITEMS = tuple(_item(name, entry) for name, entry in _PAPER.items() if "title" in entry)
 BY_NAME = {item.name: item for item in ITEMS}
 LEFT_OUT: Mapping[str, str] = _PAPER["left_out"]
-"""Figures and tables of the paper that are no experiment, and why."""
+"""Figures and tables of the paper that are not experiments, and why."""
 
 
 def items_named(names: Sequence[str]) -> tuple[Item, ...]:
-    """The items of these names, in the order of ITEMS; no names mean all.
+    """Return the named items, in the order of ITEMS; without names, return all.
 
     Raises:
         UnknownName: there is no such item. The message suggests the nearest.
@@ -140,7 +140,7 @@ def items_named(names: Sequence[str]) -> tuple[Item, ...]:
 class FlightsPlan:
     """The flights of some items on one stack.
 
-    A method that takes items applies to all items if none are given.
+    Methods that take items apply to all items of the plan if none are given.
 
     Attributes:
         scale: fraction of the paper's number of missions.
@@ -154,7 +154,7 @@ class FlightsPlan:
 
     @classmethod
     def stored(cls, ledger: Ledger) -> FlightsPlan | None:
-        """The plan of a reproduction, with all items; None if the ledger has another campaign."""
+        """Return the stored plan of a reproduction, with all items; None for any other campaign."""
         text = ledger.meta(_META)
         if text is None:
             return None
@@ -173,12 +173,12 @@ class FlightsPlan:
 
     @property
     def command(self) -> str:
-        """The command that flies the plan's stack for all items."""
+        """The command that flies all items on the plan's stack."""
         options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
         return shlex.join(["mavfi", "reproduce", *options])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
-        """The missions, repetition by repetition, so that all items grow together.
+        """List the missions repetition by repetition, so that all items grow together.
 
         Raises:
             ConfigError: the scale leaves no missions, or the stack cannot be used.
@@ -194,33 +194,33 @@ class FlightsPlan:
         return list(once.values())
 
     def kinds(self, *items: Item) -> list[PlannedMission]:
-        """The first mission of each kind; the others differ in seeds."""
+        """Return the first mission of each kind; the others differ only in seeds."""
         return [mission for spec in self._specs(items, 1.0) for mission in spec.kinds()]
 
     def numbered(self, item: Item, first: int, end: int) -> list[tuple[PlannedMission, int]]:
-        """Missions of an item with their repetitions, from `first` to below `end`."""
+        """List an item's missions with their repetitions, which go from `first` to below `end`."""
         specs = (spec.scaled(end / spec.repetitions) for spec in self._specs([item], 1.0))
         missions = ((mission, mission.config.seed - spec.first_seed)
                     for spec in specs for mission in spec.missions())  # fmt: skip
         return [own for own in missions if own[1] >= first]
 
     def keys(self, *items: Item) -> list[Key]:
-        """The configurations of the missions, as the ledger stores them."""
+        """Return the configurations of the missions, as the ledger stores them."""
         return [key_of(mission) for mission in self.missions(*items)]
 
     def numbers(self, ledger: Ledger, *items: Item) -> list[int]:
-        """The numbers of the missions in a ledger, in the order of its list."""
+        """Return the numbers of the missions in a ledger, in the order of its list."""
         return _numbers_of(ledger, self.keys(*items))
 
     def kept(self, ledger: Ledger) -> list[int]:
-        """The numbers of the missions whose run folders any item needs."""
+        """Return the numbers of the missions whose run folders any item needs."""
         specs = (spec for spec in self._specs(ITEMS, self.scale) if spec.keep is Keep.ALL)
         return _numbers_of(
             ledger, (key_of(mission) for spec in specs for mission in spec.missions())
         )
 
     def _specs(self, items: Iterable[Item], scale: float) -> list[Spec]:
-        """The campaigns of items, each once, in the order of ITEMS."""
+        """Return the campaigns of items without duplicates, in the order of ITEMS."""
         wanted = set(items) or set(self.items)
         presets = dict.fromkeys(item.preset for item in ITEMS if item in wanted and item.preset)
         specs = (load_spec(preset).scaled(scale) for preset in presets)
@@ -233,5 +233,5 @@ def _numbers_of(ledger: Ledger, keys: Iterable[Key]) -> list[int]:
 
 
 def key_of(mission: PlannedMission) -> Key:
-    """The configuration of a mission, as the ledger stores it."""
+    """Return the configuration of a mission, as the ledger stores it."""
     return canonical(changes_of(mission.config))

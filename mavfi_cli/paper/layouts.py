@@ -1,8 +1,8 @@
-"""The layout of each flown item: turns missions into the paper's table.
+"""Layouts, which turn the missions of each flown item into the paper's table.
 
 A layout reads only the configuration and record of the item's missions, never labels, so it works
-for any campaign with such missions. It gives the cells of each row; paper.toml has headings,
-columns and notes.
+for any campaign with such missions. It yields the cells of each row; paper.toml contains
+headings, columns and notes.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from mavfi_cli.paper.items import BY_NAME, FlightsPlan, Item, printed
 from mavfi_cli.report.paper import DETECTOR_TITLES, PaperCell, PaperRow, PaperTable, Printed
 
 PROTECTED = (*STAGES, "planning+control", EVERY_STAGE)
-_GOLDEN = "golden"  # begins the labels of rows of golden flights
-_JOULES = 1e-3  # kJ
+_GOLDEN = "golden"  # prefix of row labels of golden flights
+_JOULES = 1e-3  # kJ per J
 _NOTHING = "nothing flown yet"
 
 
 def of_flights(name: str, flights: Flights) -> PaperTable:
-    """The table of a flown item.
+    """Return the table of a flown item.
 
     Args:
         flights: the item's missions.
@@ -48,7 +48,7 @@ _SEEDS = ("seed", "world_seed", "time_limit_s")
 
 
 def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
-    """The flights that differ from the item's missions on a stack only in _SEEDS.
+    """Select the flights that differ from the item's missions on a stack only in _SEEDS.
 
     The result is empty if all are golden and the item needs flights with a fault.
     """
@@ -64,7 +64,7 @@ def of_kind(item: Item, stack: str, flights: Flights) -> Flights:
 
 
 _GOLDEN_ONLY = ("fig11",)
-_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # have no flights with a part of the stages
+_ONLY_COMPARABLE = ("fig12", "table4", "table5")  # exclude flights that protect only some stages
 
 
 def _unpaired(flights: Flights) -> list[str]:
@@ -100,7 +100,7 @@ def _effects(flights: Flights) -> list[PaperCell]:
 
 
 def _fig7(flights: Flights) -> Iterator[PaperRow]:
-    """Faults in each kernel beside the golden flights with the same planner."""
+    """Faults in each kernel, after the golden flights with each planner."""
     groups = {
         f"{_GOLDEN}, {title}": flights.golden.chosen(planner=name)
         for name, title in _PLANNERS.items()
@@ -115,7 +115,7 @@ def _fig7(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _by_value(name: str, column: str) -> Callable[[Flights], Iterator[PaperRow]]:
-    """Faults by the values of a column, with the paper's word for each value."""
+    """Return a layout of faults by value of a column, with the paper's word for each value."""
 
     def rows(flights: Flights) -> Iterator[PaperRow]:
         yield _row(_GOLDEN, "", cells=_effects(flights.golden))
@@ -164,7 +164,7 @@ def _table4(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _fig12(flights: Flights) -> Iterator[PaperRow]:
-    """Worst flight time with faults, and what each detector recovers of it, in points."""
+    """Worst flight time with faults, and how much of it each detector recovers, in points."""
     for world in flights.worlds:
         here = flights.chosen(world=world)
         bare, struck = here.golden, here.faulty()
@@ -178,7 +178,7 @@ def _fig12(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _recovered(flights: Flights, item: str, unit: str, place: str) -> Iterator[PaperCell]:
-    """The part of the worst flight that each detector recovers, beside the paper's numbers."""
+    """Yield the part of the worst flight that each detector recovers, with the paper's number."""
     measure = "recovered" if unit == "recovered_points" else "recovered_share"
     for name in DETECTOR_TITLES:
         yield _recovery(flights.faulty(name), measure, printed(item, unit, name, place))
@@ -215,7 +215,7 @@ def _table5(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _unknown_costs(flights: Flights) -> list[str]:
-    """Give the reason why flights with a detector have no costs."""
+    """Explain why flights with a detector have no costs; empty if they have."""
     watched = any(flights["detector"])
     if not watched or len(flights.known("check_share")):
         return []
@@ -223,7 +223,7 @@ def _unknown_costs(flights: Flights) -> list[str]:
 
 
 def _parts(detector: str) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
-    """Rows of a detector: columns that add up, and the keys of the paper's number."""
+    """Return the rows of a detector: columns to add up, and the keys of the paper's number."""
     recovery = [f"recovery_share_{stage}" for stage in STAGES]
     apart = {
         stage: ([column], ["recovery", detector, stage])
@@ -244,9 +244,9 @@ SHOWN_STATES = ("waypoint_x", "waypoint_vx", "waypoint_ax")
 
 
 def values_and_deltas(flights: Flights) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Values of SHOWN_STATES at all control ticks, and their changes from tick to tick.
+    """Read SHOWN_STATES at all control ticks, and their changes from tick to tick.
 
-    Reads the traces of the successful flights whose run folders exist.
+    The values come from the traces of the successful flights whose run folders exist.
     """
     runs = [Path(path) for path in flights.chosen(lost=False)["path"] if path]
     traces = [read_parquet(run / TRACE, "trace") for run in runs if (run / TRACE).is_file()]
@@ -272,7 +272,7 @@ def _fig11(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _span(values: FloatArray, share: float) -> float:
-    """The range of the middle share of the values; NaN without values."""
+    """Return the range of the middle `share` of the values; NaN without values."""
     if not len(values):
         return math.nan
     low, high = np.quantile(values, (0.5 - share / 2.0, 0.5 + share / 2.0))
@@ -284,7 +284,7 @@ def _reduction(values: float, deltas: float) -> float:
 
 
 def _fig13(flights: Flights) -> Iterator[PaperRow]:
-    """For each stage, the flight that a fault prolongs most, and the same with the autoencoder."""
+    """For each stage, the flight that a fault prolongs most, without and with the autoencoder."""
     for (stage,), struck in flights.faulty().by("fault_target").items():
         yield _row(stage, cells=[
             _maximum(struck.increases, printed("fig13", "increase_percent", stage)),
@@ -294,7 +294,7 @@ def _fig13(flights: Flights) -> Iterator[PaperRow]:
 
 
 def _with(struck: Flights, protected: Flights) -> FloatArray:
-    """Increase of the protected flight with the fault that prolongs most, (1,) or (0,)."""
+    """Return the protected flight's increase for the fault that prolongs most, (1,) or (0,)."""
     if not len(struck.ratios):
         return np.zeros(0)
     pair, fault = struck.faults[int(np.nanargmax(struck.numbers("over_own")))]
@@ -305,7 +305,7 @@ def _with(struck: Flights, protected: Flights) -> FloatArray:
 
 
 def _fig16(flights: Flights) -> Iterator[PaperRow]:
-    """Worst flight time on each platform, and what each detector recovers of it."""
+    """Worst flight time on each platform, and how much of it each detector recovers."""
     for (platform,), here in flights.by("platform").items():
         struck = here.faulty()
         yield _row(platform, cells=[
@@ -336,7 +336,8 @@ def _joined(
 
     Args:
         form: format of a part: the row's labels, its numbers `c` in per cent, `s` in seconds and
-            `n` without a unit, the `last` of them, and the titles of the first and last column.
+            `n` without a unit, the `last` of `c`, and the titles `one` and `end` of the first and
+            last column.
     """
 
     def joined(table: PaperTable) -> str:
@@ -360,7 +361,7 @@ def _labelled(label: str) -> Callable[[PaperTable], Sequence[PaperRow]]:
 
 
 def _worst_and_lowest(table: PaperTable) -> str:
-    """The row with the longest flight, and the one with the lowest success."""
+    """Describe the rows with the longest flight and with the lowest success."""
     struck = [row for row in table.rows if not row.labels[0].startswith(_GOLDEN)]
     longest = table.ranked(2)
     if not longest:
@@ -413,7 +414,7 @@ def _maximum(values: FloatArray, paper: Printed = None) -> PaperCell:
 
 
 def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> PaperCell:
-    """The increase from the mean golden flight to the longest flight, in per cent."""
+    """Return the increase from the mean golden flight to the longest flight, in per cent."""
     golden_s, times_s = (_of_successes(those, "flight_time_s") for those in (bare, flights))
     if not (len(golden_s) and len(times_s)):
         return PaperCell(paper=paper)
@@ -422,7 +423,7 @@ def _worst_mean(bare: Flights, flights: Flights, paper: Printed = None) -> Paper
 
 
 def _recovery(protected: Flights, measure: str, paper: Printed) -> PaperCell:
-    """The part of the worst case that a protection recovers, in per cent or in points.
+    """Return the part of the worst case that a protection recovers, in per cent or in points.
 
     Args:
         measure: attribute of `WorstCase`.

@@ -1,8 +1,8 @@
-"""Measures: the number, from flights or isolated kernels, that decides a claim.
+"""Measures, which compute the number that decides a claim from flights or isolated kernels.
 
-claims.toml names them. A measure takes flights, and values of columns that choose some of them. It
-counts the faults that flipped a bit. Missions of one world and seed are a cluster: the intervals of
-shares have the design effect of these clusters.
+claims.toml refers to them by name. A measure takes flights, and column values that select some of
+them. It counts only faults that flipped a bit. Missions with the same world and seed form a
+cluster, and the intervals of shares include the design effect of these clusters.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from mavfi_cli.stats.shares import Interval, Share
 Where = Mapping[str, Any]  # values of columns; a tuple allows several
 Kernels = Mapping[str, IsolatedKernel]  # by name
 NOT_FLOWN = Finding(why="not flown")
-_DRAWS = 20_000  # of a rank correlation
-_FEWEST = 5  # kernels of a rank correlation, and hits of a share of hits
+_DRAWS = 20_000  # posterior draws for a rank correlation
+_FEWEST = 5  # kernels for a rank correlation, and harmed missions for a share of them
 _DETECTORS = ("gad", "aad")
 
 
@@ -44,7 +44,7 @@ def _of_share(share: Share, what: str, why: str = NOT_FLOWN.why) -> Finding:
 
 
 def _difference(shares: Sequence[Share], counts: str) -> Finding:
-    """The first minus the second of two shares."""
+    """Subtract the second of two shares from the first."""
     first, second = shares
     if not (first.total and second.total):
         return NOT_FLOWN
@@ -59,7 +59,7 @@ def _harm_gap(groups: Mapping[str, Flights], what: str) -> Finding:
 
 
 def _mean(flights: Flights, values: Sequence[float], counts: str) -> Finding:
-    """The mean of a value over clusters of flights; NaN is left out."""
+    """Average a value over clusters of flights; NaN is left out."""
     clusters: dict[tuple[str, int], list[float]] = {}
     for seed, value in zip(flights.seeds, values, strict=True):
         if not math.isnan(value):
@@ -117,7 +117,7 @@ def _success_lost(flights: Flights, **where: Any) -> Finding:
 
 
 def _most_lost_kernel(flights: Flights, **where: Any) -> Finding:
-    """Success lost by faults in the kernel that loses most."""
+    """Success lost to faults in the kernel with the highest loss."""
     hit = flights.struck(**where).by("struck_kernel")
     kernels = {name: those.share().share for (name,), those in hit.items() if name}
     if not kernels:
@@ -151,7 +151,7 @@ def _loss_difference(
 
 
 def _longer(flights: Flights, **where: Any) -> Finding:
-    """Share of successful flights that take more than LONGER times as long as golden."""
+    """Share of successful flights that take over LONGER times as long as their golden flights."""
     timed = flights.struck(**where).timed.chosen(lost=False)
     ratios = timed.ratios
     if not len(ratios):
@@ -162,7 +162,7 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Share of longer flights that succeed in the first of two groups minus that in the second."""
+    """Share of longer flights among successes in the first of two groups minus in the second."""
     timed = {name: flights.struck(**where).timed for name, where in groups.items()}
     return _harm_gap(timed, "over 10 % longer")
 
@@ -184,7 +184,7 @@ def _mean_change(flights: Flights, column: str, *, ratio: bool = True, **where: 
 
 
 def _single_flight(flights: Flights, why: str, **where: Any) -> Finding:
-    """Report our longest flight without an effect, because one flight decides nothing."""
+    """Report our longest flight but no effect, because one flight decides nothing."""
     ratios = flights.struck(**where).ratios
     if not len(ratios):
         return NOT_FLOWN
@@ -215,12 +215,12 @@ def _net(seen: Flights, column: str, what: str) -> Finding:
 
 
 def _recovered(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of lost missions that a detector saves, minus those that it loses."""
+    """Share of lost missions that a detector saves, minus the share that it causes."""
     return _net(flights.protected(detector, **where), "lost", "lost")
 
 
 def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
-    """Share of longer flights that a detector shortens again, minus those that it lengthens."""
+    """Share of longer flights that a detector shortens again, minus the share that it causes."""
     seen = flights.protected(detector, **where).chosen(bare_lost=False, lost=False)
     return _net(seen, "harmed", f"over {100 * (LONGER - 1):.0f} % longer")
 
@@ -228,7 +228,7 @@ def _shortened(flights: Flights, detector: str, **where: Any) -> Finding:
 def _undone_difference(
     flights: Flights, detector: str, first: str, others: Sequence[str], **where: Any
 ) -> Finding:
-    """Net share of harm undone by watching some stages minus that by the best of others.
+    """Net share of harm undone by watching some stages minus that by the best other choice.
 
     Args:
         first, others: stages that the detector watches, joined by `+`.
@@ -307,7 +307,7 @@ def _gaussian_dearer(flights: Flights, **where: Any) -> Finding:
 def _overheads(
     flights: Flights, detector: str, parts: Collection[str], where: Where
 ) -> tuple[Flights, FloatArray]:
-    """The flights with a detector, and the share of each flight time; NaN if unknown."""
+    """Return the flights with a detector, and the share of time in each; NaN if unknown."""
     seen = flights.struck(detector=detector, protect=EVERY_STAGE, **where)
     return seen, np.sum([seen.numbers(name) for name in parts], axis=0)
 
@@ -323,11 +323,11 @@ def _costs(seen: Flights, costs: Sequence[float] | FloatArray, counts: str) -> F
 def _outcome_beside(
     kernels: Kernels, kernel: str, outcome: str, extreme: str, others: Sequence[str] = ()
 ) -> Finding:
-    """The share of an outcome in one kernel minus that in the most extreme of others.
+    """Share of an outcome in one kernel minus that in the most extreme of the others.
 
     Args:
         extreme: `most` or `least`.
-        others: none mean all.
+        others: names of the other kernels; empty means all.
     """
     there = [name for name in others or kernels if name in kernels and name != kernel]
     if kernel not in kernels or not there:
@@ -341,7 +341,7 @@ def _outcome_beside(
 
 
 def _least_benign(kernels: Kernels, but: str) -> Finding:
-    """The least share of benign runs of all kernels but one."""
+    """Lowest share of benign runs among all kernels but one."""
     shares = {name: kernels[name].outcomes["benign"] for name in kernels if name != but}
     if not shares:
         return NOT_FLOWN
@@ -350,7 +350,7 @@ def _least_benign(kernels: Kernels, but: str) -> Finding:
 
 
 def _benign(kernels: Kernels, kernel: str) -> Finding:
-    """The share of benign runs of a kernel."""
+    """Share of benign runs of a kernel."""
     if kernel not in kernels:
         return NOT_FLOWN
     return _of_share(kernels[kernel].outcomes["benign"], "benign")
@@ -392,7 +392,7 @@ def _posterior(share: Share, rng: np.random.Generator) -> FloatArray:
 
 
 def _spearman(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Rank correlation down the columns of two arrays, (kernels, n); ties have mean ranks."""
+    """Correlate the ranks in each column of two arrays, (kernels, n); ties get mean ranks."""
     from scipy.stats import rankdata
 
     ranks = [rankdata(values, axis=0) for values in (first, second)]
@@ -406,7 +406,7 @@ MEASURES: Mapping[str, Callable[..., Finding]] = {measure.__name__[1:]: measure 
     _recovered, _shortened, _undone_difference, _density_gap, _autoencoder_better, _overhead_of,
     _gaussian_dearer, _outcome_beside, _least_benign, _benign, _ranking,
 )}  # fmt: skip
-"""By the names that claims.toml uses."""
+"""The measures by their names in claims.toml."""
 OF_KERNELS = frozenset({"outcome_beside", "least_benign", "benign"})
 """The measures that take isolated kernels and no flights."""
 WITHOUT_FATES = OF_KERNELS | {

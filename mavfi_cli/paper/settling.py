@@ -1,7 +1,7 @@
-"""Settles claims: flies missions for undecided claims until all are decided or the time is over.
+"""Settles claims: flies missions for undecided claims until all are decided or time runs out.
 
-Every look judges all claims again, by tests that hold at any look (`stats.sequences`). The next
-missions are those of the claim that the fewest seconds would decide, if its effect stays as it is.
+Every look judges all claims again, with tests that are valid at any look (`stats.sequences`). The
+next missions are for the claim that would be decided soonest if its effect stays as it is.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from mavfi_cli.paper.items import BY_NAME, KERNELS_FOLDER, FlightsPlan, Source, 
 from mavfi_cli.paper.verdicts import Claim, FirstLook, Judgement, SettledClaim, Settling, Verdict
 
 BATCH = 10  # repetitions between two looks
-_MOST = 100_000  # repetitions of a claim's missions
-_SEARCHED = 100  # of them at once
+_MOST = 100_000  # most repetitions of a claim's missions
+_SEARCHED = 100  # repetitions that are searched at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,9 +40,9 @@ class _OpenClaim:
 
     Attributes:
         judgement: its judgement so far.
-        kinds: kinds of missions that it counts.
+        kinds: kinds of missions that the claim counts.
         missions, seconds: missions that would decide it if the effect stays as it is, and their
-            wall time; infinite if no number decides.
+            wall time; infinite if no number would.
         repetition_s: wall time of one more repetition of its missions, s.
     """
 
@@ -68,7 +68,7 @@ def require_settleable(plan: FlightsPlan) -> None:
     """Refuse a list that cannot grow.
 
     Raises:
-        ConfigError: the items fly no missions, or the place holds an export.
+        ConfigError: the items have no missions, or the plan's path is an export.
     """
     if plan.out.suffix == ".parquet" or plan.folder.is_file():
         raise ConfigError("the list of an export is frozen: no mission can be added", path=plan.out)
@@ -84,12 +84,12 @@ def settle(
     spectator: Spectator,
     hours: float | None,
 ) -> list[str]:
-    """Fly missions until the claims of the items are decided, or the time is over.
+    """Fly missions until the claims of the items are decided, or time runs out.
 
     Args:
         plan: a plan whose missions have been flown.
         ledger: its ledger, open for writing.
-        hours: most wall time, h; None has no limit.
+        hours: limit of wall time, h; None means no limit.
 
     Returns:
         A line for each claim that was undecided: how it was decided, or that it is still undecided.
@@ -178,12 +178,12 @@ class _Look:
         }
 
     def _flown(self, table: pa.Table) -> Flights:
-        """The flights that claims count."""
+        """Select the flights that claims count."""
         whole = Flights.of(table)
         return whole.chosen(stack=self._plan.stack, as_paper=True, at=(None, "random"))
 
     def open_claims(self, ledger: Ledger, settling: Settling) -> list[_OpenClaim]:
-        """Return the undecided claims of the items that missions may decide."""
+        """Return the items' undecided claims that more missions may decide."""
         stack = self._plan.stack
         table = flights(ledger)
         flown = self._flown(table)
@@ -242,7 +242,7 @@ def _counted_kinds(
     planned: Iterable[str],
     kernels: Mapping[str, IsolatedKernel],
 ) -> frozenset[str]:
-    """The planned kinds of missions on which a claim's effect depends.
+    """Return the planned kinds of missions on which a claim's effect depends.
 
     A kind is included if leaving out its flights changes the effect.
     """
@@ -280,7 +280,7 @@ def _fly(
 
 
 def _first_missing(plan: FlightsPlan, entry: _OpenClaim, flown: Collection[str]) -> int:
-    """The first repetition with a mission that has not flown."""
+    """Return the first repetition with a mission that has not been flown."""
     item = BY_NAME[entry.claim.item]
     for first in range(0, _MOST, _SEARCHED):
         for mission, repetition in plan.numbered(item, first, first + _SEARCHED):
@@ -319,7 +319,7 @@ def _undecided(entry: _OpenClaim) -> str:
 
 
 def _bounds(claim: Claim, judgement: Judgement) -> str:
-    """The bounds of an effect, and whether they exclude the claim's size."""
+    """Describe the bounds of an effect, and whether they exclude the claim's size."""
     effect, bounds = judgement.effect, judgement.bounds
     if effect is None or bounds is None:
         return f" ({judgement.why})"

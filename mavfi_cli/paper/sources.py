@@ -25,7 +25,7 @@ from mavfi_cli.paper.items import FlightsPlan
 from mavfi_cli.paper.verdicts import Settling
 
 _EXPORT, _SPEC = ".parquet", ".toml"
-_OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # of runs, beside their summaries
+_OTHERS = ("trace.parquet", "plans.parquet", "kernels.parquet")  # not exports
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,15 +34,15 @@ class CampaignSource:
 
     Attributes:
         path: the campaign's folder, or the exported file.
-        spec: None if a program made the list, or if there is no specification beside an export.
+        spec: None if a program made the list, or if there is no specification next to an export.
         planned: number of missions on its list; None if an export does not record it.
-        flights: the missions that flew.
+        flights: the flown missions.
         errors: missions that could not begin.
         versions: versions of the programs that flew it; empty if an export does not record them.
         host: host of the first record; empty if an export does not record it.
         digest: SHA-256 of an exported file; empty for a folder.
         settling: the missions flown to settle claims; None if there were none.
-        again: command that flies the rest of its list; empty if it is not known.
+        again: command that flies the rest of its list; empty if unknown.
     """
 
     path: Path
@@ -59,12 +59,12 @@ class CampaignSource:
 
     @property
     def may_have_runs(self) -> bool:
-        """Whether run folders are read; an export could name folders of anybody."""
+        """Whether run folders may be read; an export could name anyone's folders."""
         return self.path.is_dir()
 
     @property
     def stacks(self) -> list[str]:
-        """The stacks that flew, sorted."""
+        """The flown stacks, sorted."""
         return sorted(set(self.flights["stack"]))
 
     @property
@@ -76,11 +76,11 @@ class CampaignSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """The campaigns and the summaries of kernels that were read.
+    """The campaigns and kernel summaries that were read.
 
     Attributes:
         problems: one sentence for each source that could not be read, is incomplete, or does not
-            fit.
+            match the paper or the other sources.
     """
 
     campaigns: Sequence[CampaignSource]
@@ -92,10 +92,10 @@ class Evidence:
         """Read all campaigns and summaries at the places.
 
         Args:
-            places: folders of campaigns, of `mavfi kernels`, folders of such folders, exports.
+            places: exports, and folders with campaigns or results of `mavfi kernels` at any depth.
 
         Raises:
-            RecordError: a place does not exist, or nothing in them can be read.
+            RecordError: a place does not exist, or nothing there can be read.
         """
         campaigns: list[CampaignSource] = []
         kernels: list[KernelSummary] = []
@@ -140,12 +140,12 @@ class Evidence:
         }
 
     def flights(self, stack: str | None = None) -> Flights:
-        """The flights of a stack, each mission once; None means all stacks."""
+        """Return the flights of a stack (None: all stacks), each mission once."""
         return Flights.pooled([campaign.flights for campaign in self.campaigns], stack)
 
 
 def _paths_in(place: Path) -> Iterator[Path]:
-    """Ledgers, summaries of kernels and exports at a place, in the order of their names."""
+    """Yield the ledgers, kernel summaries and exports at a place, sorted by path."""
     if not place.exists():
         raise RecordError(f"{place}: does not exist")
     if place.is_file():
@@ -161,7 +161,7 @@ def _paths_in(place: Path) -> Iterator[Path]:
 
 
 def _inside_campaign(path: Path, place: Path) -> bool:
-    """Whether a path is in a campaign's own folders: kept runs, the search for a world."""
+    """Return True for a path in a campaign's subfolders, such as kept runs or a world search."""
     above = [folder for folder in path.parent.parents if folder.is_relative_to(place)]
     return any((folder / LEDGER).is_file() for folder in above)
 
@@ -209,7 +209,7 @@ def _campaign(
 
 
 def _spec_beside(path: Path) -> Spec | None:
-    """The specification of an export: NAME.toml, also for NAME-part1.parquet, or the preset."""
+    """Load an export's specification: NAME.toml, also for NAME-part1.parquet, or the preset."""
     for stem in (path.stem, path.stem.rpartition("-part")[0]):
         if stem and (beside := path.with_name(stem + _SPEC)).is_file():
             return load_spec(str(beside))
@@ -234,7 +234,7 @@ def _incomplete(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
 
 
 def _unpaired(campaigns: Sequence[CampaignSource]) -> Iterator[str]:
-    """Flights that cannot be compared with the paper: without golden flights, or other missions."""
+    """Report flights without golden flights, and campaigns without flights like the paper's."""
     pooled = Flights.pooled([source.flights for source in campaigns])
     paired = {
         changes

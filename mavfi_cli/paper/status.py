@@ -1,4 +1,4 @@
-"""A campaign beside the paper: the tables of its items, and its state on one screen."""
+"""A campaign compared with the paper: the tables of its items, and its state on one screen."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from mavfi_cli.report.setting_table import BY_WEIGHT, UNPAIRED, SettingColumns
 from mavfi_cli.vpm.model import ModelVehicle, schemes_with
 from mavfi_cli.vpm.report import Choices, report
 
-_ROWS = 14  # of a table on one screen
+_ROWS = 14  # rows of a table on one screen
 _WIDE = 2  # columns of settings on one screen
-_DEVIATION = "SD of time, s"  # of flights that do not repeat; on one screen as well
+_DEVIATION = "SD of time, s"  # of flights that do not repeat; also shown on one screen
 _SETTINGS = "settings"  # name of the table of a user's own campaign
 
 
 def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights | None]:
-    """The main table of a campaign, and the flights that its figure needs; None if it needs none.
+    """Return the main table of a campaign, and the flights for its figure; None if it needs none.
 
-    It is the table of the named item, or of the preset's item. An export has the items whose
-    flights it contains. Without an item, a reproduction has the table of its items, and another
-    campaign that of its settings.
+    This is the table of the named item, or else of the preset's item. In an export, any item with
+    flights may be named. Without an item, it is the table of items for a reproduction, and the
+    table of settings for any other campaign.
 
     Raises:
-        UnknownName: the campaign flies no item of this name.
+        UnknownName: the campaign has no item of this name.
         ConfigError: the item of the paper is not an experiment.
         RecordError: the kernels were not run, or an export contains no flight of the item.
     """
@@ -66,7 +66,7 @@ def shown(ledger: Ledger, name: str | None = None) -> tuple[PaperTable, Flights 
 
 
 def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
-    """The flights of an item in an export, which holds no plan: those of the item's kind."""
+    """Select an item's flights from an export by their kind, because an export holds no plan."""
     parts = [of_kind(item, stack, flights.chosen(stack=stack)) for stack in set(flights["stack"])]
     flown = [part for part in parts if len(part)]
     if len(flown) > 1:
@@ -77,7 +77,7 @@ def _of_export(item: Item, flights: Flights, path: Path) -> Flights:
 
 
 def _item_of(ledger: Ledger, name: str | None) -> Item | None:
-    """The named item of a campaign, or the one of its preset; None if the paper has none."""
+    """Return the named item of a campaign, or its preset's item; None if the paper has none."""
     preset = (ledger.meta("name") or "").partition("-")[0]  # with or without changes
     own = [item for item in ITEMS if item.preset == preset] if preset in PRESETS.names else []
     if name is None:
@@ -97,7 +97,7 @@ def _flights_of(item: Item, plan: FlightsPlan, flights: Flights) -> Flights:
 
 
 def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
-    """The table of each item of a plan, from the flights and runs that exist.
+    """Yield the table of each item of a plan, from the flights and runs that exist.
 
     Raises:
         RecordError: nothing was flown, or the kernels were not run.
@@ -115,7 +115,7 @@ def tables(plan: FlightsPlan) -> Iterator[PaperTable]:
 
 # Items that are not flown: Figs. 6 and 15 --------------------------------------------------------
 
-_PAPER_KERNELS = {"control": "pid"}  # the paper's name where it is another
+_PAPER_KERNELS = {"control": "pid"}  # the paper's name where it differs
 
 
 def _unflown(item: Item, out: Path) -> PaperTable:
@@ -128,7 +128,7 @@ def _unflown(item: Item, out: Path) -> PaperTable:
 
 
 def of_kernels(kernels: Iterable[IsolatedKernel]) -> PaperTable:
-    """The table of Fig. 6."""
+    """Return the table of Fig. 6."""
     rows = []
     for kernel in kernels:
         paper = printed("fig6", "benign_percent", _PAPER_KERNELS.get(kernel.name, kernel.name))
@@ -142,7 +142,7 @@ def of_kernels(kernels: Iterable[IsolatedKernel]) -> PaperTable:
 
 
 def of_model() -> PaperTable:
-    """The table of Fig. 15, of the performance model with the paper's overheads."""
+    """Return the table of Fig. 15, from the performance model with the paper's overheads."""
     item = BY_NAME["fig15"]
     names = [column.title for column in item.columns]
     model = report([ModelVehicle.load(name) for name in names], Choices(), schemes_with({}))
@@ -162,7 +162,7 @@ def of_model() -> PaperTable:
     return replace(table, result=f"flight time with TMR: x {', x '.join(times)}")
 
 
-# Campaigns that are no item's --------------------------------------------------------------------
+# Campaigns that belong to no item -----------------------------------------------------------------
 
 
 _MEANS = {
@@ -232,7 +232,7 @@ def _progress_table(ledger: Ledger, plan: FlightsPlan) -> PaperTable:
 
 
 def short(table: PaperTable) -> PaperTable:
-    """The table cut to one screen: its first rows, and the first columns of a table of settings."""
+    """Cut a table to one screen: its first rows, and the first columns of a table of settings."""
     titles = [column.title for column in table.columns]
     wide = _WIDE + (_DEVIATION in titles) if table.name == _SETTINGS else len(titles)
     left = [title.partition(",")[0] for title in titles[wide:]]
@@ -248,7 +248,7 @@ def short(table: PaperTable) -> PaperTable:
 
 
 def progress_lines(ledger: Ledger) -> list[str]:
-    """Lines about the progress, and the time left at the pace so far."""
+    """Return lines about the progress, and the time left at the pace so far."""
     planned, over = ledger.planned(), ledger.over()
     errors = sum(ledger.errors_by_cell().values())
     name = ledger.meta("name") or ledger.folder.name

@@ -1,8 +1,8 @@
-"""Claims and their verdicts, which compare an effect with the range that a claim gives.
+"""Claims and their verdicts, which compare an effect with the range of a claim.
 
-The range was written before the data, in claims.toml. A verdict is a test of the nearest end of the
-range. The tests of one figure or table are a family, corrected by S. Holm (Scand. J. Statistics 6,
-1979).
+The ranges in claims.toml were written before the data existed. A verdict tests the effect against
+the nearest end of the range. The tests of one figure or table form a family, corrected by Holm's
+method (S. Holm, Scand. J. Statistics 6, 1979).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mavfi_cli.stats.shares import Interval, wilson, z_of
 ISOLATED = "isolated kernels"
 LEVEL = 0.05  # of a family
 _FAMILY = 4  # claims of a figure or table that `margin` allows for
-_HALVES = 2  # of the level: for the first look, and for all looks together
+_HALVES = 2  # of the level: one for the first look, one for all looks together
 _STEP = 0.005  # margins are multiples of half a point
 _Z = z_of(1.0 - LEVEL)
 
@@ -61,17 +61,17 @@ class Judgement:
     Attributes:
         effect: number with its 95 % interval, which is not corrected; None if there is none.
         counts: description of the missions behind the effect.
-        why: the reason why nothing can decide the claim; empty for the other verdicts.
+        why: the reason why the claim is not decidable; empty for the other verdicts.
         p: p-value of the test against the nearest end of the range, corrected for its family; 1
             without an effect.
         p_alone: p-value of the same test without a correction for its family or for looks.
-        needed: observations that decide an undecided claim if the effect stays as it is; infinite
-            if it lies on an end of the range.
-        bounds: the 95 % interval of settled missions at all looks together; else None.
+        needed: number of observations that would decide an undecided claim if the effect stays as
+            it is; infinite if it lies on an end of the range.
+        bounds: the 95 % interval that holds at all looks together; None if nothing was settled.
         without_size: whether the bounds exclude an effect of the claim's size on either side of 0:
             two one-sided tests (D. J. Schuirmann, J. Pharmacokinetics and Biopharmaceutics 15,
             1987).
-        history: the settled missions that were flown for this claim, in words.
+        history: description of the missions that were added to settle this claim.
     """
 
     verdict: Verdict
@@ -122,14 +122,14 @@ class JudgedClaim:
     """A claim with its verdicts.
 
     Attributes:
-        judgements: judgement of each stack, or of ISOLATED, by what the faults do to their nodes.
+        judgements: judgement for each stack or ISOLATED, by the effect of faults on their nodes.
     """
 
     claim: Claim
     judgements: Mapping[str, Mapping[Fate, Judgement]]
 
     def verdict(self, place: str, fate: Fate = Fate.ALL) -> Verdict | None:
-        """The verdict on a stack, or on ISOLATED; None if the claim is not judged there."""
+        """Return the verdict on a stack, or on ISOLATED; None if the claim is not judged there."""
         judgement = self.judgements.get(place, {}).get(fate)
         return None if judgement is None else judgement.verdict
 
@@ -188,7 +188,7 @@ class Settling:
         return structure(json.loads(stored) if isinstance(stored, str) else stored, cls)
 
     def to_json(self) -> str:
-        """The text that `of` reads."""
+        """Return the text that `of` reads."""
         return json.dumps(asdict(self), sort_keys=True)
 
     def first_look(self, name: str, fate: str) -> FirstLook | None:
@@ -213,14 +213,14 @@ def judge(
 ) -> list[Judgement]:
     """Judge a family of claims.
 
-    Where missions were added until claims were decided, half of the level is spent on the first
-    look, whose number of missions was planned, and half on all looks together. So a p-value is
-    twice the smaller of the p-value at the first look and `anytime_p`.
+    If missions were added to settle claims, half of the level is spent on the first look, whose
+    number of missions was planned, and half on all looks together. So a p-value is twice the
+    smaller of the p-value at the first look and `anytime_p`.
 
     Args:
         findings: finding of each claim.
-        ranges: low and high end of each claim's range, which belong to it.
-        first: the first look at each claim, which is None if it had no effect; None for all if no
+        ranges: low and high end of each claim's range, both inclusive.
+        first: first look at each claim, None for a claim without an effect then; None if no
             missions were added.
     """
     z = [_z(finding.effect, *ends) for finding, ends in zip(findings, ranges, strict=True)]
@@ -267,7 +267,7 @@ def judge(
 
 
 def _z(effect: Interval | None, low: float, high: float) -> float:
-    """Standard errors between the effect and the nearest end; NaN without an interval.
+    """Return the standard errors from the effect to the nearest end; NaN without an interval.
 
     The standard error comes from the side of the interval that faces the end.
     """
@@ -298,11 +298,11 @@ def _two_sided(z: float) -> float:
 
 
 def margin(missions: int) -> float:
-    """The smallest effect that counts, at the number of missions of each of the paper's groups.
+    """Return the smallest effect that counts, given the size of each of the paper's groups.
 
-    A result of 0 of that many missions rules it out in a family of four claims, so that a claim can
-    be contradicted. It is the upper end of Wilson's interval of 0 of n at 1 - 0.05/4, rounded up to
-    half a point.
+    A result of 0 in that many missions rules it out in a family of four claims, so that a claim can
+    be contradicted. It is the upper end of Wilson's interval for 0 of n at confidence 1 - 0.05/4,
+    rounded up to half a point.
     """
     high = wilson(0, missions, confidence=1.0 - LEVEL / _FAMILY).high
     return math.ceil(high / _STEP) * _STEP

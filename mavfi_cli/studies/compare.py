@@ -1,7 +1,7 @@
 """`mavfi compare`: the same missions on several platforms, as in the preset fig16.
 
-The folder is a campaign's. Its folder `timeline` is a campaign of one golden flight per platform
-with its complete record.
+The folder holds a campaign. Its subfolder `timeline` holds a campaign of one golden flight per
+platform, with complete records.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ComparePlan:
         detectors: names; `none` is always flown, named or not.
         missions: number per platform, setting and target of `inject`.
         seed: root of the faults' seeds.
-        field: field of the bits; None draws any bit.
+        field: bit field to strike; None draws any bit.
     """
 
     platforms: tuple[str, ...] = ("x86", "tx2")
@@ -87,13 +87,13 @@ class ComparePlan:
         return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
 
     def described(self) -> ComparedPlan:
-        """The plan with descriptions of the platforms."""
+        """Return the plan with descriptions of the platforms."""
         own = {part.name: getattr(self, part.name) for part in fields(self)}
         return ComparedPlan(**{**own, "platforms": summaries(self.platforms)},
                             settings=self.settings)  # fmt: skip
 
     def spec(self) -> Spec:
-        """The specification of the campaign."""
+        """Return the specification of the campaign."""
         faults: dict[str, tuple[Any, ...]] = {
             "stage" if set(self.inject) <= set(STAGES) else "site": self.inject,
             **({} if self.field is None else {"field": (self.field,)}),

@@ -2,7 +2,7 @@
 
 The folder contains the campaign `bare` without detectors, and in `protected` one campaign for each
 model of a detector. `bare` keeps its traces, because detectors are replayed on them. `protected`
-keeps only records. The missions with detectors depend on the faults that do harm without them.
+keeps only records. Its missions depend on which faults do harm without a detector.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 from mavfi_cli.spec.mission import MissionConfig
 from mavfi_cli.studies import fly
 
-# Of evaluation.json; version 1 counted harm from 5 % on, and where the golden flight fails.
+# Of evaluation.json; version 1 counted delays over 5 % as harm, even if the golden flight failed.
 SCHEMA = 2
 BARE, PROTECTED = "bare", "protected"
 WORLDS = ("sparse", "dense", "factory", "farm")
@@ -63,7 +63,7 @@ SOURCE, INSTRUCTION = "source", "instruction"
 _DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
 
 
-# Parts of a plan that its description has unchanged.
+# Fields of a plan that its description copies unchanged.
 _DESCRIBED = ("worlds", "protect", "level", "flights", "harmless_flights", "golden_flights",
               "first_seed", "seed")  # fmt: skip
 
@@ -81,13 +81,13 @@ class EvaluationPlan:
     Attributes:
         detectors: names; `none` is always flown, named or not.
         flights: missions per world that are flown with a fault at each site, one per flight.
-        harmless_flights: number of these missions, from the first on, whose faults are all flown
-            with the detectors; of the others only harmful faults are.
+        harmless_flights: number of these missions, starting with the first, whose faults are all
+            flown with the detectors; for the others, only harmful faults are.
         golden_flights: error-free missions per world; the first ones also get faults.
-        first_seed: seeds of missions count up from here; training flies from 10 000 on.
-        models: folder of model files `NAME.json`; None takes those shipped for the stack of `base`.
+        first_seed: first seed of the missions; training seeds start at 10 000.
+        models: folder of model files `NAME.json`; None means those shipped for the stack of `base`.
         level: source or instruction.
-        fields: fields of the bits at source level.
+        fields: bit fields to strike at source level.
         seed: root of the faults' seeds.
         base: the other parameters of all missions.
 
@@ -126,11 +126,11 @@ class EvaluationPlan:
         return range(self.first_seed, self.first_seed + self.golden_flights)
 
     def complete(self, seed: int) -> bool:
-        """Whether the detectors fly all faults of this mission, including harmless ones."""
+        """Return True if all faults of a mission, even harmless ones, are flown with detectors."""
         return seed in self.seeds[: self.harmless_flights]
 
     def detector_config(self, detector: str) -> DetectorConfig:
-        """Configuration of a detector for missions.
+        """Return the configuration of a detector for missions.
 
         Raises:
             ModelError: the folder of models has no such file.
@@ -138,12 +138,12 @@ class EvaluationPlan:
         return DetectorConfig.with_model(detector, self.models, self.protect)
 
     def require_held_out(self) -> None:
-        """Reject detectors that cannot be loaded, and missions that trained a model.
+        """Reject detectors that cannot be loaded, and missions on which a model was trained.
 
         Seeds are compared across worlds, because two worlds may use the same random numbers.
 
         Raises:
-            ModelError: a model cannot be used; the message names the training flight.
+            ModelError: a model cannot be used, or was trained on one of these missions.
         """
         for detector in map(self.detector_config, self.protectors):
             detector.build(self.base.stack)
@@ -159,7 +159,7 @@ class EvaluationPlan:
                     )
 
     def described(self) -> EvaluatedPlan:
-        """The plan with thresholds and digests of the models."""
+        """Return the plan with thresholds and digests of the models."""
         stack = self.base.stack
         configs = [self.detector_config(name) for name in self.protectors]
         return EvaluatedPlan(
@@ -188,11 +188,11 @@ class EvaluationPlan:
     def missions(
         self, detector: str = NONE, harmful: Collection[tuple[Any, ...]] = ()
     ) -> list[PlannedMission]:
-        """Golden flights, then flights with a fault, with or without a detector.
+        """List golden flights, then flights with a fault, with or without a detector.
 
         Args:
             harmful: world, seed, stage, target and field of the faults that do harm without a
-                detector. Detectors fly these, and all faults of complete missions.
+                detector. These, and all faults of complete missions, are flown with detectors.
         """
         golden = itertools.product(self.worlds, self.seeds)
         faulty = itertools.product(self.worlds, self.seeds[: self.flights], self.places())
@@ -228,7 +228,7 @@ class EvaluationPlan:
                 field=Field.ANY.value if whole else site.field,
                 seed=Stream.FAULT.seed(*drawn, number),
             )
-            # Draw again until the state has the required type: all of them are equally likely.
+            # Redraw until the state has the required type; all such states are equally likely.
             if (fault.draw().states[0].dtype is DType.FLOAT64) is not whole:
                 return {"fault": fault}
         raise ConfigError(f"no state of {site.target} has a bit field {site.field}")
@@ -242,19 +242,19 @@ def evaluate(
     A larger plan of the same kind extends a smaller one.
 
     Returns:
-        The evaluation, and its pairs: without faults, and with one.
+        The evaluation, and its pairs: those without faults, and those with one.
 
     Raises:
-        UnknownName, VehicleProcessError: a world or platform that does not exist.
-        ModelError: a model that cannot be used, or that was made with one of these seeds.
-        ConfigError: other versions of mavfi or its libraries flew in the folder.
+        UnknownName, VehicleProcessError: a world or platform does not exist.
+        ModelError: a model cannot be used, or was fitted to a flight with one of these seeds.
+        ConfigError: the folder was flown with other versions of mavfi or its libraries.
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.
     """
     plan.require_held_out()
     for world in plan.worlds:
         check_names(replace(plan.base, world=world, seed=plan.first_seed))
     spectator.on_note("flights without detectors")
-    profiles = folder / BARE / PROFILES  # flights with detectors have the same golden flights
+    profiles = folder / BARE / PROFILES  # flights with detectors share the golden flights
     options = replace(options, profiles=profiles)
     tables = [fly(plan.missions(), folder / BARE, Keep.ALL, options, spectator)]
     _, faults = pairs_of([flown(tables[0])], [NONE], plan.complete)
@@ -279,7 +279,7 @@ def evaluate(
 def evaluation_of(
     plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
 ) -> Evaluation:
-    """Results of these pairs.
+    """Return the results of these pairs.
 
     Args:
         scored: see `analysis.detectors.results`.

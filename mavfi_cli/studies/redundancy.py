@@ -78,13 +78,13 @@ class FlightPlan:
         models: Path | None = None,
         stack: str = DEFAULT,
     ) -> FlightPlan:
-        """The mission that flies a scheme at the model's safe velocity.
+        """Plan the flights of a scheme at the model's safe velocity.
 
         Args:
             platform: platform whose latencies are scaled to the model's response time.
             chain_s: response time of that platform in the model.
             folder: absolute path of the folder for the files.
-            models: folder of model files NAME.json; None takes the shipped ones.
+            models: folder of model files NAME.json; None means the shipped ones.
 
         Raises:
             CannotLift: the rotors cannot lift this many boards.
@@ -136,7 +136,7 @@ class FlightPlan:
 
 
 def _vehicle(inputs: ModelInputs, scheme: Scheme, acceleration_mps2: float) -> dict[str, Any]:
-    """The simulated equivalent of the model's vehicle, with a scheme's boards and heat sinks."""
+    """Return the simulated equivalent of a vehicle, with a scheme's boards and heat sinks."""
     vehicle, board, boards = inputs.vehicle, inputs.board, scheme.copies
     return {
         "name": f"{vehicle.name}-{scheme.name}",
@@ -164,7 +164,7 @@ def _platform(platform: PlatformProfile, factor: float) -> dict[str, Any]:
 
 
 def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
-    """The nearest value that a mission allows, and a message if it differs."""
+    """Return the nearest value that a mission allows, and a message if it differs."""
     low, high = LIMITS[key]
     taken = min(max(wanted, low), high)
     change = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
@@ -184,14 +184,14 @@ class RedundancyPlan:
     Attributes:
         missions: number per scheme and world.
         folder: folder of flights and pictures; recorded missions are not flown again.
-        models: folder of the detectors' models; None takes the shipped ones.
-        train: flights in each training world to which detectors are fitted for each vehicle; 0 fits
-            none.
+        models: folder of the detectors' models; None means the shipped ones.
+        train: number of flights in each training world to which each vehicle's detectors are
+            fitted; 0 fits none.
         stack: stack of all flights.
 
     Raises:
         ConfigError, UnknownName: no world is named, one is named twice, or the missions have seeds
-            of training flights, which no flight may share in any world.
+            of training flights, which are reserved in all worlds.
     """
 
     vehicles: Sequence[ModelVehicle]
@@ -227,7 +227,7 @@ class RedundancyPlan:
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
     def missions_of(self, plans: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """Planned missions ordered by seed, so that an interrupted campaign has complete pairs."""
+        """List the missions ordered by seed, so that an interrupted campaign has complete pairs."""
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
             PlannedMission(
@@ -248,7 +248,7 @@ def _plans_of(
     options: Options,
     spectator: Spectator,
 ) -> Iterator[tuple[Key, FlightPlan | str]]:
-    """Each scheme's plan or the reason for its absence; the first one has one bare board."""
+    """Yield each scheme's plan, or why there is none; the first scheme is one bare board."""
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
     inputs, models = plan.choices.inputs(vehicle), plan.models
@@ -274,7 +274,7 @@ def _plans_of(
 def fitted(
     plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
 ) -> Path:
-    """The folder of detectors fitted to error-free flights of a plan.
+    """Return the folder of detectors fitted to error-free flights of a plan.
 
     Existing models are reused, because the folder's name contains a digest of the mission and of
     the number of flights.
@@ -298,16 +298,16 @@ def fly_and_report(
     options: Options,
     spectator: Spectator,
 ) -> tuple[ModelReport, FlightsReport]:
-    """The model's report, and that of the flights of all its rows.
+    """Fly all rows of the model; return the report of the model and that of the flights.
 
-    The flights and the model beside them use the given overheads, or else the paper's. The model's
-    own rows use the given overheads, or else those measured in the flights.
+    The flights, and the model compared with them, use the given overheads, or else the paper's. The
+    report of the model uses the given overheads, or else those measured in the flights.
 
     Args:
         overheads: per cent and source, by the detector's name.
 
     Raises:
-        MavfiError: as `run_campaign`; a world or vehicle that does not exist.
+        MavfiError: as `run_campaign`; or a world or vehicle does not exist.
     """
     for world in plan.worlds:
         check_names(MissionConfig(world=world, seed=plan.first_seed, stack=plan.stack))

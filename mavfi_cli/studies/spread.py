@@ -80,7 +80,7 @@ def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -
     """Fly the golden mission several times, one after the other, and compare the flights.
 
     Raises:
-        Interrupted: The user ended it.
+        Interrupted: The user interrupted it.
         MavfiError: As for `fly_mission`.
     """
     runs = []
@@ -91,7 +91,7 @@ def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -
 
 
 def _at(values: Sequence[float], share: float) -> float:
-    """Return the value at a share of sorted values; the upper one of two in the middle."""
+    """Return a quantile of sorted values; between two values, the upper one."""
     return values[min(int(share * len(values)), len(values) - 1)] if values else math.nan
 
 

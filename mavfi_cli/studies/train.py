@@ -41,7 +41,7 @@ class TrainingPlan:
         flights: number per world.
         first_seed: seed of the first flight; each further flight of any world adds 1.
         seed: seed of the split and of the initial weights.
-        n_sigma: threshold of the Gaussian model; None takes the default.
+        n_sigma: threshold of the Gaussian model; None means the default.
         flown: folder of run folders to fit to; None flies the missions.
         logs: .tlog files of fault-free flights of a user's companion to fit to instead.
     """
@@ -57,7 +57,7 @@ class TrainingPlan:
     logs: tuple[Path, ...] = ()
 
     def missions(self) -> list[PlannedMission]:
-        """The flights, world by world."""
+        """List the flights, world by world."""
         return [
             PlannedMission(
                 config=replace(
@@ -76,14 +76,14 @@ def train(
     """Fly or collect flights, fit the detectors, and write the models with their provenance.
 
     Returns:
-        The data set; model and file of each detector; and the number of flights outside the data
-        set, because they did not reach the goal.
+        The data set; model and file of each detector; and the number of flights left out because
+        they did not reach the goal.
 
     Raises:
-        ModelError: too few flights, an unknown kind, or torch is missing, raised before anything
-            is flown; or too many flights fail, or none is error-free.
-        ConfigError: n sigma is out of range, the folder has the flights of another plan, or nothing
-            names the binary of a real autopilot.
+        ModelError: there are too few flights, a kind is unknown, or torch is missing, raised before
+            anything is flown; or too many flights fail, or none is error-free.
+        ConfigError: n sigma is out of range, the folder has the flights of another plan, or the
+            binary of a real autopilot is not named.
         MavfiError: no mission can be flown in a world.
         RecordError: a file cannot be written.
     """
