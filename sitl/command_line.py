@@ -1,4 +1,4 @@
-"""Types of options, options and signals that the programs of the vehicle's side share."""
+"""Option types, options and signal handling shared by the programs on the vehicle's side."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def _options(*options: Decorator) -> Decorator:
-    """Return one decorator for several options, in their order."""
+    """Return one decorator that adds several options in the given order."""
     return lambda command: functools.reduce(lambda f, option: option(f), options[::-1], command)
 
 
 def complete_world(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return the named worlds that begin as typed, for the shell."""
+    """Return the world names that start with `incomplete`, for shell completion."""
     from sitl.world.world import named_worlds
 
     return [name for name in named_worlds() if name.startswith(incomplete)]
@@ -85,7 +85,7 @@ world_and_vehicle = _options(
 
 
 def camera_options(prefix: str = "") -> Decorator:
-    """Return the options of the depth camera; some names begin with a prefix."""
+    """Return the depth camera's options. `prefix` goes before the names `size` and `rate`."""
     return _options(
         click.option(
             f"--{prefix}size", "camera_size", type=_Size(), default="64x48",

@@ -21,7 +21,7 @@ def standard_pressure_pa(altitude_m: float) -> float:
 
 
 def pressure_altitude_m(pressure_pa: float) -> float:
-    """Return the altitude above sea level, m, of an air pressure, Pa; below 0 counts as 0."""
+    """Return the altitude above sea level, m, for an air pressure, Pa; below 0 Pa counts as 0."""
     share = max(pressure_pa, 0.0) / _SEA_LEVEL_PA
     return float((1.0 - share ** (1.0 / _EXPONENT)) / _LAPSE_PER_M)
 
@@ -39,7 +39,7 @@ class Origin:
     altitude_amsl_m: float = 489.4
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Return latitude and longitude, degrees, of a point of the local frame."""
+        """Return latitude and longitude, degrees, of a point in the local frame."""
         distance = math.hypot(north_m, east_m)
         if distance < 1e-9:
             return self.latitude_deg, self.longitude_deg
@@ -54,7 +54,7 @@ class Origin:
         return math.degrees(latitude), math.degrees(longitude)
 
     def local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Return north and east, m, of a point given in degrees."""
+        """Return local north and east, m, of a point given by latitude and longitude, degrees."""
         delta = math.radians(longitude_deg - self.longitude_deg)
         sin_latitude, cos_latitude = _sine_cosine(latitude_deg)
         origin_sine, origin_cosine = _sine_cosine(self.latitude_deg)

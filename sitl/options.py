@@ -13,8 +13,8 @@ from mavfi_cli.core.option_types import OutFolder
 from sitl.autopilot.telemetry import Preset
 from sitl.command_line import CONTEXT, POSITIVE, Triple, camera_options, signing, world_and_vehicle
 
-_FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where a firmware that somebody else starts sends
-# As a PX4 SITL: to the ports of companion and ground station, and a TCP server for any client.
+_FIRMWARE_LINK = "udpin:127.0.0.1:14540"  # where externally started firmware sends
+# Like PX4 SITL: UDP to the companion's and ground station's ports, a TCP server for any client.
 _DEFAULT_LINKS = (
     "onboard=udpout:127.0.0.1:14540",
     "gcs=udpout:127.0.0.1:14550",
@@ -46,10 +46,10 @@ class VehicleSetup:
 
     Attributes:
         camera_size: Columns and rows.
-        depth: Socket for depth frames as arrays; None for no such frames.
-        firmware_kind: Real firmware that flies; None for our own autopilot.
+        depth: Unix domain socket that serves depth frames as arrays; None for no stream.
+        firmware_kind: Real firmware that flies the vehicle; None for our own autopilot.
         firmware: Its SITL binary; None if the user starts it and has it send to `firmware_link`.
-        trusted: MAVLink systems that may command; empty for all.
+        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
     """
 
     world: str = "dense"

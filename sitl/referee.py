@@ -24,8 +24,8 @@ _COLUMNS = (
     "clearance_m", "power_regression_w", "power_propeller_w", "armed", "on_ground",
 )  # fmt: skip
 
-# Limits of a landing. PX4 lands at 0.7 m/s (MPC_LAND_SPEED). They allow a hard landing on level
-# legs, but neither a fall nor a touchdown at cruise speed.
+# Limits of a landing. They allow a hard landing on level legs, but neither a fall nor a touchdown
+# at cruise speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED).
 _SINK_MPS = 2.0
 _HORIZONTAL_MPS = 1.5
 _TILT_RAD = math.radians(35.0)
@@ -117,7 +117,7 @@ class Referee:
             stamp_s: Simulated time.
             position_enu_m, velocity_enu_mps: (3,)
             quaternion_flu_enu: Unit quaternion (4,) w x y z, body forward-left-up to ENU.
-            armed, on_ground: The motors may turn; the physics reports ground contact.
+            armed, on_ground: Whether the motors may turn, and whether the physics reports contact.
             may_land: The flight controller is landing or taking off, so a gentle ground contact is
                 not a crash. A disarmed vehicle may always land.
             power_regression_w, power_propeller_w: Powers for the log.
@@ -146,16 +146,16 @@ class Referee:
     def _crashes(
         self, velocity_before: Vector, pose: _Pose, *, on_ground: bool, may_land: bool
     ) -> bool:
-        """Return True if the newest pose is a crash on the ground.
+        """Return True if the newest pose is a crash into the ground.
 
-        A vehicle in contact before its first take-off stands on the ground. A later contact is a
-        crash unless the flight controller was landing, taking off or disarmed, and the contact is
-        within the limits of a landing. The limits apply to the speed just before the contact.
+        Contact before the first take-off is never a crash. A later contact is a crash unless the
+        flight controller was landing, taking off or disarmed, and the contact is within the limits
+        of a landing. The limits apply to the speed just before the contact.
         """
         w, x, y, z = pose.quaternion.tolist()
         up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
         parts = [abs(u) * half for u, half in zip(up, self._half.tolist(), strict=True)]
-        reach = parts[0] + parts[1] + parts[2]  # `sum` rounds otherwise from Python 3.12 on
+        reach = parts[0] + parts[1] + parts[2]  # `sum` rounds differently since Python 3.12
         lowest_m = float(pose.position[2]) - reach
         if lowest_m > _AIRBORNE_M and not on_ground:
             self._airborne = True
@@ -209,7 +209,7 @@ class Referee:
     def save(self, folder: Path, energies_j: Mapping[str, float] | None = None) -> None:
         """Write `truth.npz` and then `truth.json` into `folder`, each atomically.
 
-        Raises RecordError if it cannot be created or written (no space, no permission).
+        Raises RecordError if one cannot be written (no space, no permission).
         """
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The server: a simulation in lockstep with one companion, or in real time for any clients.
+"""Serves a simulation in lockstep to one companion, or in real time to any number of clients.
 
 In lockstep, simulated time stands still while the companion computes. At every control tick, all
 due messages are sent at once, LOCAL_POSITION_NED last. The next tick begins when the companion has
@@ -47,18 +47,18 @@ _FRAMES = frozenset(
     }
 )
 _ON_REQUEST = _FRAMES.union(SENSORS)
-_MOST_TEXTS = 10  # newest texts of a client that wait for the others
+_MOST_TEXTS = 10  # newest texts of one client, queued for the others
 
 
 class Client(Peer):
-    """Turns bytes of one connection into calls of the simulation, and messages into bytes.
+    """Translates the bytes of one connection into simulation calls, and messages into bytes.
 
     Depth frames go to the clients that started the capture, and ranges to those that requested
     them. All clients get the camera's heartbeat.
 
     Attributes:
-        texts: Frames of received STATUSTEXTs for the other clients, unchanged, as an autopilot
-            forwards its companion's texts to the ground station.
+        texts: Frames of received STATUSTEXTs, to be forwarded unchanged to the other clients, as
+            an autopilot forwards its companion's texts to the ground station.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Client(Peer):
             for component in (COMPONENT, CAMERA)
         )
         self._camera_answers: list[Any] = []
-        self._unwanted = _ON_REQUEST  # ids of the camera's messages
+        self._unwanted = _ON_REQUEST  # ids of camera messages that the client has not requested
         self.texts: deque[bytes] = deque(maxlen=_MOST_TEXTS)
 
     def rejoin(self) -> None:
@@ -86,7 +86,7 @@ class Client(Peer):
         self.link = self._simulation.autopilot.open_link(self._preset)
 
     def close(self) -> None:
-        """Leave the autopilot and release the connection."""
+        """Close the autopilot's link and release the connection."""
         self._simulation.autopilot.close_link(self.link)
         super().close()
 
@@ -125,7 +125,7 @@ class Client(Peer):
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> bool:
-        """Send the streams that are faster than ticks, at a stamp between two ticks."""
+        """Send the streams faster than the tick rate, at a stamp between two ticks."""
         autopilot = self._simulation.autopilot
         if not (self.link.is_fast and isinstance(autopilot, Autopilot)):
             return False
@@ -136,7 +136,7 @@ class Client(Peer):
         return self._send([], self.link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
-        """Send messages of both components; the camera's answers are the first."""
+        """Send messages of both components, the camera's answers first."""
         answers, self._camera_answers = self._camera_answers, []
         frames = [self._camera_codec.encode(message) for message in answers + of_camera]
         frames += [self._codec.encode(message) for message in of_autopilot]
@@ -161,15 +161,15 @@ class Client(Peer):
 
 _PATIENCE_S = 0.5
 _SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
-_LOOK_UP_S = 0.2  # interval at which a wait checks for a stop
-_LATE_S = 0.25  # delay of a tick beyond which fast streams have the rate of ticks
+_LOOK_UP_S = 0.2  # interval at which a wait checks `stopped`
+_LATE_S = 0.25  # delay of a tick beyond which fast streams drop to the tick rate
 _SHARE = 0.25  # share of a tick's time that clients get when the tick is overdue
 
 
 class _Pace:
     """Computes the wait before the next tick.
 
-    A slow machine does not accumulate delay: time lost beyond half a second of delay is dropped.
+    Delay does not accumulate on a slow machine: anything beyond half a second is dropped.
     """
 
     def __init__(self, speed: float) -> None:
@@ -207,7 +207,7 @@ def _lockstep(options: ServerOptions, simulation: Simulation, stopped: Callable[
 def _await_answer(
     stamp_ms: int, client: Client, limit_s: float, stopped: Callable[[], bool]
 ) -> bool:
-    """Handle messages of the companion until it answers. Return False if stopped before."""
+    """Handle the companion's messages until it answers. Return False if stopped first."""
     received_s = time.monotonic()
     while not stopped():
         messages = client.receive(_LOOK_UP_S)
@@ -228,13 +228,13 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
 
 
 class EmbeddedVehicle:
-    """The vehicle in the process of its companion, which waits while the vehicle flies.
+    """The vehicle inside its companion's process, which waits while the vehicle is simulated.
 
-    When the companion has answered a tick and waits for more, the vehicle flies the next one.
+    Once the companion has answered a tick and waits for messages, the next tick is simulated.
 
     Attributes:
         link: The companion's end of the link.
-        briefing: The companion's data before the first message.
+        briefing: Data that the companion gets before the first message.
         error: The error that ended the vehicle before its companion, if any.
 
     Raises:
@@ -252,7 +252,7 @@ class EmbeddedVehicle:
         self.link.on_wait = self._fly_on
 
     def _fly_on(self) -> None:
-        """Fly a tick if the companion has answered the last one, and send its messages."""
+        """Simulate a tick if the companion has answered the last one, and send the messages due."""
         try:
             if not self._begun:
                 self._simulation.begin()
@@ -272,7 +272,7 @@ class EmbeddedVehicle:
         return True
 
     def end(self) -> None:
-        """Fly the tick of the companion's last answer, and close. May be called repeatedly."""
+        """Simulate the tick that was answered last, and close. May be called repeatedly."""
         if self._ended:
             return
         self._ended = True
@@ -285,12 +285,12 @@ class EmbeddedVehicle:
         self._simulation.close()
 
     def truth(self) -> FlightTruth:
-        """Return the truth up to now."""
+        """Return the truth recorded so far."""
         return self._simulation.truth()
 
 
 class _Realtime:
-    """The clients of a simulation that is paced by the wall clock, any number of them."""
+    """Any number of clients of a simulation that is paced by the wall clock."""
 
     def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
         self._options = options
@@ -298,7 +298,7 @@ class _Realtime:
         self._pace = _Pace(options.speed or 1.0)
         signing = signing_from_file(options.key_file)
         self._clients: Peers[Client] = Peers(signing=signing, allow_unsigned=options.allow_unsigned)
-        for preset, url in options.links:  # one signing for all, so that no frame counts twice
+        for preset, url in options.links:  # all share one signing, so no frame is accepted twice
             signs = None if parse_endpoint(url).scheme == "fd" else signing
             make = partial(Client, simulation, preset=preset, signing=signs)
             self._clients.open(url, make)
@@ -339,8 +339,8 @@ class _Realtime:
     ) -> None:
         """Send due messages, then answer clients until the next tick, or once if it is overdue.
 
-        The time for all clients is bounded, so that a flood cannot stop the clock. Half of it is
-        for the due messages.
+        The time for all clients is bounded, so that a flood of messages cannot stop the clock. Up
+        to half of it goes to sending the due messages.
         """
         self._pace.next_tick(duration_us * 1e-6)
         share_s = _SHARE * duration_us * 1e-6 / self._pace.speed
@@ -394,7 +394,7 @@ def _serve(options: ServerOptions) -> None:
 
 
 def warm_up() -> None:
-    """Load and compile the code of a flight, which is the same for every world."""
+    """Load and compile the code that a flight runs, which is the same for every world."""
     simulation = Simulation(load_world("dense", seed=1), load_profile("solo"))
     for _ in range(2):
         simulation.advance()
@@ -430,7 +430,7 @@ def _simulation(
     )  # fmt: skip
 
 
-# Schemes of MAVSDK and MAVProxy for the client of an endpoint.
+# URL schemes with which MAVSDK and MAVProxy connect to an endpoint, by the endpoint's scheme.
 _CALLERS = {
     "udpout": ("udpin", "udpin"), "udpin": ("udpout", "udpout"), "tcpin": ("tcpout", "tcp"),
 }  # fmt: skip
@@ -455,7 +455,7 @@ def _announce(options: ServerOptions, simulation: Simulation) -> None:
 
 
 def _firmware_settings(options: ServerOptions) -> list[str]:
-    """Return the settings of a firmware that somebody else starts, in lines."""
+    """Return lines with the settings that externally started firmware needs; none otherwise."""
     kind = options.setup.firmware_kind
     if kind is None or options.setup.firmware is not None:
         return []

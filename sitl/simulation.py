@@ -24,22 +24,22 @@ from sitl.vehicle.truth import Truth
 from sitl.vehicle.vehicle import Quadrotor
 from sitl.world import World
 
-HOST_FILE = "host.json"  # time and memory of this machine; beside the truth, and no part of it
+HOST_FILE = "host.json"  # wall time and memory, stored next to the truth but not part of it
 _FARTHEST_M = 1e6
 _FASTEST_RADPS = 1e4
-_GROUND_M = 0.3  # highest centre of a fallen vehicle
+_GROUND_M = 0.3  # maximum height of a fallen vehicle's centre
 _STEP_S = STEP_US * 1e-6
 
 
 class Simulation:
-    """One vehicle in one world; deterministic in its arguments and the messages handled.
+    """One vehicle in one world; the same arguments and messages give the same flight.
 
     The flight begins at the world's start, facing the goal.
 
     Args:
         camera: Its depth camera; None for one with default settings.
-        autopilot: Real firmware in the place of the autopilot; None for our own.
-        trusted: MAVLink systems that may command; empty for all.
+        autopilot: Real firmware in place of our own autopilot; None for our own.
+        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
         logs: Keep the truth of every tick for `truth` and `save_truth`.
     """
 
@@ -63,8 +63,8 @@ class Simulation:
         self.camera = camera or Camera(
             world.boxes_enu_m, mount_offset_flu_m=profile.camera_mount_flu_m, system=system_id
         )
-        self.wall = WallClock()  # times of this machine by part
-        self.camera_due: list[Any] = []  # messages of the camera at the newest tick
+        self.wall = WallClock()  # host time spent in each part
+        self.camera_due: list[Any] = []  # camera messages due at the newest tick
         self._set_up()
 
     def _set_up(self) -> None:
@@ -99,7 +99,7 @@ class Simulation:
         services.handle(self.autopilot, message, link)
 
     def advance(self, between: Callable[[int], None] | None = None) -> None:
-        """Fly one control tick with the autopilot's command, then judge the result.
+        """Simulate one control tick under the autopilot's command, then have the referee judge it.
 
         Args:
             between: Called with the stamp of every physics step within the tick, us.
@@ -162,7 +162,7 @@ class Simulation:
         return self.camera.poll(self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu)
 
     def _judge(self, truth: Truth, position_enu_m: Vector, quaternion_flu_enu: Vector) -> None:
-        """Have the referee judge a pose. After a collision the vehicle falls and stays there."""
+        """Have the referee judge a pose. After a collision the vehicle falls and stays down."""
         commander, velocity = self.autopilot.commander, enu_from_ned(truth.velocity_ned_mps)
         collision = self.referee.observe(
             self.stamp_us * 1e-6, position_enu_m, quaternion_flu_enu, velocity,

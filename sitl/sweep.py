@@ -2,7 +2,7 @@
 
 Distance: the shortest distance of two separate convex boxes is between a corner of one and the
 other box, or between an edge of each. A separating-axis test with six face normals and nine cross
-products of edges decides if they overlap (S. Gottschalk, M. Lin, D. Manocha, "OBBTree", 1996).
+products of edges decides whether they overlap (S. Gottschalk, M. Lin, D. Manocha, "OBBTree", 1996).
 
 Motion: between two poses the body's centre moves in a straight line, and its attitude turns about
 one axis at a constant rate. No point of the body then moves further than
@@ -139,12 +139,12 @@ def _edges_squared(
     half: Vector,
     box: Vector,
 ) -> float:
-    """Return the squared distance of one body edge (along body `axis`) to one box edge.
+    """Return the squared distance from one body edge (along body `axis`) to one box edge.
 
     With r the offset of the edges' midpoints, u and v their directions and h, k their half
-    lengths, |r + s u - t v| is minimal where both derivatives vanish. The solution is clamped to
-    the segments one after the other. The ends of edges are corners, which are handled separately,
-    so only an interior minimum must be exact.
+    lengths, |r + s u - t v| is minimal where both derivatives vanish. A solution beyond the end of
+    an edge, or for parallel edges, counts as infinity: the ends of edges are corners, which are
+    handled separately.
     """
     one, two = (axis + 1) % 3, (axis + 2) % 3
     sign_one = half[one] if edge & 1 else -half[one]
@@ -206,7 +206,7 @@ def _pose_at(share: float, ends: _Ends, centre: Vector, rotation: Vector) -> Non
 def clearance(
     position: Vector, quaternion: Vector, half: Vector, boxes: Vector
 ) -> tuple[float, int]:
-    """Return distance, m, from the body to the nearest box, and its index (-1: no box)."""
+    """Return the distance, m, from the body to the nearest box, and its index (-1: no box)."""
     centre, rotation = np.empty(3), np.empty((3, 3))
     _pose_at(0.0, (position, quaternion, position, quaternion), centre, rotation)
     reach = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
@@ -282,7 +282,7 @@ def _approach(ends: _Ends, half: Vector, box: Vector, travel: float, least_m: fl
     _pose_at(1.0, ends, centre, rotation)
     last_m = _body_distance(centre, rotation, half, box)
     least_m = min(least_m, first_m, last_m)
-    intervals = np.empty((64, 4))  # a stack; shares of the motion at both ends, distances there
+    intervals = np.empty((64, 4))  # a stack: both ends as shares of the motion, and the gaps there
     intervals[0] = 0.0, 1.0, first_m, last_m
     waiting = 1
     while waiting > 0:

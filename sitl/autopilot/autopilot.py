@@ -40,7 +40,7 @@ class Autopilot(Links):
 
     Args:
         truth: Vehicle state before the first `observe`.
-        trusted: MAVLink systems that may command; empty for all.
+        trusted: Ids of the MAVLink systems that may send commands; empty allows all.
 
     Attributes:
         restart_requested: True once a client has requested a reboot, which the owner performs.
@@ -89,9 +89,9 @@ class Autopilot(Links):
         takeoff_down_m: float = math.nan,
         hold: tuple[Vector, float] | None = None,
     ) -> Result:
-        """Change the mode on a user's request. Entering the present mode restarts it.
+        """Change the mode on a user's request. Entering the current mode restarts it.
 
-        Height and hold are those of `Snapshot`. A disarmed vehicle takes off after arming.
+        Height and hold are as in `Snapshot`. A disarmed vehicle takes off once it is armed.
         """
         result = self.commander.request_mode(mode)
         if result is Result.ACCEPTED:
@@ -160,15 +160,15 @@ class Autopilot(Links):
         for severity, text in texts[: self._texts_left]:
             self._texts_left -= 1
             self._text_id = self._text_id % 0xFFFF + 1
-            # The TAB tells clients of the events interface that the text arrives there, too.
+            # The TAB marks a text that clients of the events interface also receive there.
             data = text.encode("ascii", "replace") + b"\t"
             for message in text_messages(severity, data, self._text_id):
                 self.broadcast(message)
 
 
-# Who commands -------------------------------------------------------------------------------------
+# Command authority --------------------------------------------------------------------------------
 
-_MOST_WARNED = 64  # senders that are remembered as warned
+_MOST_WARNED = 64  # maximum number of senders remembered as warned
 
 # Commands that anybody may send, because they change nothing but the sender's own streams.
 _HARMLESS = (
@@ -192,9 +192,9 @@ _Sender = tuple[Link, int, int]  # link, system, component
 class _Authority:
     """Decides whose commands and whose setpoints count.
 
-    Commands of every trusted system count, or of all systems if none is named. Setpoints of only
-    one sender count at a time: the first that sends them, until it has been silent for as long as
-    OFFBOARD tolerates. `queue_text` takes the warnings.
+    Commands count from trusted systems, or from all systems if none is listed. Setpoints count from
+    one sender at a time: the first keeps control until it has been silent for longer than OFFBOARD
+    tolerates. Warnings go to `queue_text`.
     """
 
     def __init__(self, trusted: Sequence[int], queue_text: Callable[[Severity, str], None]) -> None:
@@ -219,7 +219,7 @@ class _Authority:
     def follows(self, message: Any, link: Link, stamp_us: int, silence_us: float) -> bool:
         """Return True if a valid setpoint counts, and remember its sender.
 
-        After `silence_us` another sender may take over.
+        Once that sender has been silent for `silence_us`, another may take over.
         """
         sender = (link, message.get_srcSystem(), message.get_srcComponent())
         holder = self._holder

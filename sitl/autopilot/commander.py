@@ -22,7 +22,7 @@ from sitl.vehicle.truth import Truth
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused
 READY_US = 4_000_000  # pre-arm checks pass
-_CONTROL_BACK_US = 1_000_000  # time for which a lost setpoint source must be back
+_CONTROL_BACK_US = 1_000_000  # time a lost setpoint source must be back to end the failsafe
 _STILL_MPS = 0.5
 
 _STABILIZE: int = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -51,7 +51,7 @@ class FlightMode(Enum):
 
     @classmethod
     def from_numbers(cls, main: int, sub: int) -> FlightMode | None:
-        """Return the mode of param2 and param3 of a DO_SET_MODE; None if there is none.
+        """Return the mode for param2 and param3 of a DO_SET_MODE; None if there is no such mode.
 
         The sub mode is used only for AUTO. AUTO without a sub mode is LOITER.
         """
@@ -96,7 +96,7 @@ _RETRIED_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RTL)  # ended 
 _UNARMABLE = (FlightMode.LAND, FlightMode.RTL)
 _OBL_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.LOITER}  # COM_OBL_RC_ACT; RTL for other values
 _OBL_TERMINATE = 6
-# Modes with an input from outside, and the parameter of the time for which it may be missing.
+# Modes that need an external input, and the parameter that limits how long it may be missing.
 _INPUT_LIMITS = {FlightMode.OFFBOARD: "COM_OF_LOSS_T", FlightMode.POSCTL: "COM_RC_LOSS_T"}
 _LANDED_STATES: dict[FlightMode, int] = {
     FlightMode.TAKEOFF: dialect.MAV_LANDED_STATE_TAKEOFF,
@@ -111,11 +111,11 @@ class Commander:
         self._parameters = parameters
         self.stamp_us = 0
         self.user_mode = FlightMode.LOITER
-        self.failsafe: FlightMode | None = None  # the mode of a failsafe, instead of the user's
+        self.failsafe: FlightMode | None = None  # failsafe mode that overrides the user's
         self.armed = False
-        self.landed = True  # it stands on the ground
-        self._settled_us: int | None = None  # since when it has stood still on the ground
-        self.terminated = False  # True once flight termination has stopped the motors for good
+        self.landed = True  # on the ground
+        self._settled_us: int | None = None  # when it came to rest on the ground
+        self.terminated = False  # True after flight termination: the motors stay off
         self.texts: list[tuple[Severity, str]] = []  # pending; the owner removes them
         self._armed_us = self._landed_us = 0
         self._flown_since_arming = False
@@ -177,7 +177,7 @@ class Commander:
             stamp_us = self._input_us.get(mode, -math.inf)
             limit_s = self._parameters.effective(_INPUT_LIMITS[mode])
             return self.stamp_us - stamp_us <= limit_s * 1e6
-        return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which does not exist
+        return mode is not FlightMode.MANUAL  # MANUAL needs radio control, which is not simulated
 
     def input_arrived(self, mode: FlightMode) -> None:
         """Reset the watchdog of OFFBOARD or POSCTL."""
@@ -327,7 +327,7 @@ def no_setpoint() -> Setpoint:
 
 @dataclass(slots=True, kw_only=True)
 class Snapshot:
-    """State behind guidance and telemetry. The autopilot updates it at every tick."""
+    """State that guidance and telemetry read. The autopilot updates it at every tick."""
 
     commander: Commander
     parameters: Parameters
@@ -339,9 +339,9 @@ class Snapshot:
     motors_on: bool = False
     offboard: Setpoint = field(default_factory=no_setpoint)  # newest one of the companion
     sticks: tuple[int, int, int, int] = (0, 0, 500, 0)  # newest x, y, z, r of MANUAL_CONTROL
-    takeoff_down_m: float = math.nan  # of the next TAKEOFF; NaN is MIS_TAKEOFF_ALT above home
+    takeoff_down_m: float = math.nan  # of the next TAKEOFF; NaN: MIS_TAKEOFF_ALT above home
     hold: tuple[Vector, float] | None = None  # NED position (3,) and yaw of the next LOITER
-    elapsed_s: float = 0.0  # since the tick before
+    elapsed_s: float = 0.0  # since the previous tick
     consumed_mah: float = 0.0
 
     @property
@@ -365,11 +365,11 @@ class Snapshot:
         return round(latitude * 1e7), round(longitude * 1e7)
 
     def amsl_m(self, down_m: float) -> float:
-        """Return the altitude above sea level of a local height, m."""
+        """Return the altitude above sea level, m, at a local down coordinate, m."""
         return self.origin.altitude_amsl_m - down_m
 
     @property
     def thrust(self) -> float:
-        """Mean motor command; added one by one, as `sum` rounds otherwise from Python 3.12 on."""
+        """Mean motor command; added one by one, as `sum` rounds differently since Python 3.12."""
         commands = self.truth.motor_commands.tolist()
         return float(functools.reduce(operator.add, commands)) / len(commands)

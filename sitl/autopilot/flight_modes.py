@@ -30,8 +30,8 @@ _ARRIVED_M = 0.5
 _STICK_INVALID = 32767
 
 
-# Guidance of a flight mode from one entry to its end. It writes the setpoint of this tick into an
-# array of NaN.
+# Guidance of a flight mode, from entering the mode to leaving it. At every tick it writes its
+# setpoint into an array of NaN.
 Guidance = Callable[[Snapshot, Setpoint], None]
 
 
@@ -42,9 +42,9 @@ def climbs(out: Setpoint, truth: Truth) -> bool:
 
 
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
-    """Return a velocity (n,) towards a point at an offset `delta` (n,) that allows a stop there.
+    """Return a velocity (n,) towards a point at offset `delta` (n,), slow enough to stop there.
 
-    It is the minimum of the limit, sqrt(2 a d) with half the acceleration, and the position loop.
+    Its norm is the least of limit, position loop and sqrt(2 a d) with half the acceleration as a.
     """
     distance = norm(delta)
     if distance < 1e-6:
@@ -64,7 +64,7 @@ def _limit_velocity(out: Setpoint, parameters: Parameters) -> None:
 
 
 class _Anchor:
-    """A position hold that brakes first, then keeps the point of rest."""
+    """A position hold that brakes first, then holds the point where the vehicle stopped."""
 
     def __init__(self, axes: slice, place: Vector | None = None) -> None:
         self._axes = axes
@@ -101,7 +101,7 @@ def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guid
 def _take_off(target_down_m: float) -> Guidance:
     """AUTO.TAKEOFF: climbs straight to a height; its speed ramps up over MPC_TKO_RAMP_T.
 
-    A LOITER follows, at most 0.5 m below the height at the end.
+    LOITER follows at that height, or 0.5 m below the height reached if that is higher.
     """
     anchor, climbing_s = _Anchor(_HORIZONTAL), 0.0
 
@@ -176,7 +176,7 @@ def _return() -> Guidance:
 
 
 def _return_height_m(now: Snapshot) -> float:
-    """Return the height above home, m: within a cone around it if near, else RTL_RETURN_ALT."""
+    """Return RTL's height above home, m: inside a cone if home is near, else RTL_RETURN_ALT."""
     value = now.parameters.effective
     away = now.truth.position_ned_m - now.home_ned_m
     distance, above = math.hypot(away[0], away[1]), -float(away[2])

@@ -1,8 +1,8 @@
 """Parameters of the autopilot with PX4's names, types and defaults, and their wire format.
 
 `parameters.toml` lists them. Some act on the flight. The others exist because ground stations
-request them. Limits apply to the values that the flight code uses, not to stored values, as PX4
-stores any value. On the wire a value is a REAL32, or an INT32 bytewise in the float field.
+request them. Limits apply to the values that the flight code uses, not to stored values, because
+PX4 stores any value. On the wire a value is a REAL32, or an INT32 whose bytes fill the float field.
 """
 
 from __future__ import annotations
@@ -72,10 +72,10 @@ class Parameters:
         self._table = _parameter_table(system_id)
         self._index = {row.name: number for number, row in enumerate(self._table)}
         self._values: list[float | int] = [row.stored(row.default) for row in self._table]
-        self._effective: dict[str, float] = {}  # as computed since the last change
+        self._effective: dict[str, float] = {}  # cache, cleared at every change
 
     def restore(self, other: Parameters) -> None:
-        """Take all values of the same system's parameters."""
+        """Copy all values from another set with the same system id."""
         self._values = list(other._values)
         self._effective.clear()
 
@@ -103,9 +103,9 @@ class Parameters:
     def write(self, name: str, wire_value: float, wire_type: int) -> bool | None:
         """Store the value of a PARAM_SET, decoded by its type. Return True if it has changed.
 
-        An unknown name or a wrong type is ignored, as in PX4, and gives None.
-        A value that is not finite is rejected (a real PX4 stores it and then hangs). A change of a
-        read-only parameter is rejected, too.
+        An unknown name or a wrong type is ignored, as in PX4, and returns None. A value that is not
+        finite is rejected (a real PX4 stores it and then hangs), and so is a change to a read-only
+        parameter.
         """
         number = self._index.get(name)
         if number is None or wire_type != self._table[number].wire_type:
@@ -121,12 +121,12 @@ class Parameters:
         return True
 
     def message(self, index: int) -> Any:
-        """Return the PARAM_VALUE of a valid index."""
+        """Return the PARAM_VALUE for a valid index."""
         row = self._table[index]
         return self._message(row.name, row.packed(self._values[index]), row.wire_type, index)
 
     def hash_message(self) -> Any:
-        """Return the PARAM_VALUE of the hash, with which a client validates its cache."""
+        """Return the PARAM_VALUE with the hash that a client uses to validate its cache."""
         digest = 0
         for row, value in zip(self._table, self._values, strict=True):
             digest = zlib.crc32(row.name.encode() + row.packed(value), digest)

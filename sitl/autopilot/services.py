@@ -1,4 +1,4 @@
-"""The autopilot's handlers of messages: commands, setpoints, parameters and small services."""
+"""The autopilot's message handlers: commands, setpoints, parameters and small services."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from sitl.geodesy import Origin
 
 _FORCE_MAGIC = 21196
 _INT_UNSET = 0x7FFFFFFF
-_FARTHEST_M = 1e6  # a setpoint's larger value counts as not controlled
-_NOT_REQUESTABLE = dialect.MAVLINK_MSG_ID_MISSION_CURRENT  # as in PX4, though streamed
+_FARTHEST_M = 1e6  # larger values in a setpoint count as not controlled
+_NOT_REQUESTABLE = dialect.MAVLINK_MSG_ID_MISSION_CURRENT  # streamed all the same, as in PX4
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
-# Coordinate frames and bits of the type mask of a setpoint.
+# Coordinate frames and type mask bits of a setpoint.
 _LOCAL_NED, _BODY_NED = 1, 8
 _ABSOLUTE_ALTITUDE = (0, 5)
-_ABOVE_HOME = (3, 6, 10, 11)  # includes above terrain, because the ground is flat
+_ABOVE_HOME = (3, 6, 10, 11)  # includes the frames above terrain, as the ground is flat
 _IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_ACCELERATION = 0x0007, 0x0038, 0x01C0
 _FORCE, _IGNORE_YAW, _IGNORE_YAW_RATE = 0x0200, 0x0400, 0x0800
 _STEEPEST = 100.0  # m/s^2 or rad/s
@@ -63,7 +63,7 @@ def _acknowledge(message: Any, number: int, result: Result) -> Any:
 
 
 def _refuse(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer a sender that is not trusted: deny a command, send a parameter's present value."""
+    """Answer an untrusted sender: deny a command, or send a parameter's current value."""
     name = message.get_type()
     if name == "SET_MODE" or name.startswith("COMMAND_"):
         number = getattr(message, "command", dialect.MAV_CMD_DO_SET_MODE)
@@ -211,7 +211,7 @@ def _get_interval(_autopilot: Autopilot, message: Any, link: Link) -> Result:
 
 
 def _reboot(autopilot: Autopilot, message: Any, link: Link) -> Result:
-    """Restart the simulation at its start, from the ground or as a wreck."""
+    """Restart the simulation at its start, if the vehicle is disarmed or terminated."""
     if _whole(message.param1) != 1 or link.in_lockstep:
         return Result.UNSUPPORTED
     if autopilot.snapshot.stamp_us < GPS_FIX_US:
@@ -270,8 +270,8 @@ def _position_target(autopilot: Autopilot, message: Any, link: Link) -> None:
 def setpoint_of(message: Any, heading_rad: float, origin: Origin, home_down_m: float) -> Setpoint:
     """Return the setpoint of a SET_POSITION_TARGET message.
 
-    A BODY_NED setpoint is rotated by the heading (rad, from north). The altitude of a global one is
-    above sea or home. Raises ValueError if frame or type mask are not supported.
+    A BODY_NED setpoint is rotated by the heading (rad, from north). A global setpoint's altitude is
+    above sea level or home. Raises ValueError if frame or type mask is not supported.
     """
     frame, mask = message.coordinate_frame, message.type_mask
     is_local = message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
@@ -302,7 +302,7 @@ def setpoint_of(message: Any, heading_rad: float, origin: Origin, home_down_m: f
 def _check_mask(mask: int) -> None:
     """Raise ValueError if a type mask is not supported."""
     accelerates = mask & _IGNORE_ACCELERATION != _IGNORE_ACCELERATION
-    if accelerates and mask & _FORCE:  # the bit gives the acceleration fields' meaning
+    if accelerates and mask & _FORCE:  # the bit turns the acceleration fields into forces
         raise ValueError("force not supported")
     if not ~mask & (_IGNORE_POSITION | _IGNORE_VELOCITY):
         problem = "acceleration without velocity not supported" if accelerates else "invalid"
@@ -349,7 +349,7 @@ def _manual_control(autopilot: Autopilot, message: Any, _link: Link) -> None:
 
 
 def _param_request_list(autopilot: Autopilot, _message: Any, link: Link) -> None:
-    """Start to list all parameters: the hash first, then a few per tick."""
+    """Start listing all parameters: the hash first, then a few per tick."""
     link.send(autopilot.parameters.hash_message())
     link.parameters_left = deque(range(len(autopilot.parameters)))
 
@@ -381,7 +381,7 @@ def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Accept a clearing of the mission, also by an empty upload. Refuse anything else."""
+    """Accept a request to clear the mission or to upload an empty one. Refuse anything else."""
     result = dialect.MAV_MISSION_ACCEPTED
     if message.get_type().startswith("MISSION_REQUEST"):
         result = dialect.MAV_MISSION_INVALID_SEQUENCE
@@ -391,7 +391,7 @@ def _mission_ack(_autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _file_transfer(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer with a NAK, as there are no files, to stop the client's retries."""
+    """Answer with a NAK, because there are no files and the client would retry."""
     sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
     head = (sequence + 1) & 0xFFFF, session, _FTP_NAK, 1, opcode, 0, 0, _FTP_FILE_NOT_FOUND
     reply = struct.pack("<HBBBBBxIB", *head).ljust(251, b"\0")
@@ -406,7 +406,7 @@ def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Echo a broadcast ping with the sender's ids."""
+    """Echo a broadcast ping back to its sender's ids."""
     if message.target_system == 0 and message.target_component == 0:
         link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, *_sender(message)))
 
@@ -446,11 +446,11 @@ ANY_TARGET: Mapping[int, _Service] = {
     dialect.MAVLINK_MSG_ID_SET_MODE: _set_mode_message,
     dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
 }
-"""Services by message id, for messages whatever their target is."""
+"""Services by message id, for messages with any target."""
 
 
 def handle(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Handle a message of a client. Messages for other systems are ignored."""
+    """Handle a message from a client. Messages for other systems are ignored."""
     number = message.get_msgId()
     is_addressed = _is_addressed(message, autopilot.system_id)
     if not autopilot.authority.may_command(message, link):
@@ -464,7 +464,7 @@ def handle(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _is_addressed(message: Any, system: int) -> bool:
-    """Return True if a message names the autopilot of a system as its target, or all of them."""
+    """Return True if a message is addressed to the autopilot of `system`, or to all."""
     if not hasattr(message, "target_component"):  # SET_MODE, MANUAL_CONTROL
         return getattr(message, "target_system", None) == system
     return message.target_system in (system, 0) and message.target_component in (COMPONENT, 0)

@@ -1,6 +1,6 @@
-"""Telemetry: the state behind it, the builders of its messages, and the streams of a client.
+"""Telemetry: the builders of its messages, and the streams of each client.
 
-Most messages can be streamed. Those of DESCRIPTIONS, which describe the autopilot, are sent only on
+Most messages can be streamed. Those in DESCRIPTIONS, which describe the autopilot, are sent only on
 request.
 """
 
@@ -25,7 +25,7 @@ from sitl.vehicle.profile import GRAVITY_MPS2
 TICK_US = 20_000  # period of the control loop
 STEPS_A_TICK = 5
 STEP_US = TICK_US // STEPS_A_TICK  # step of the physics, the shortest interval of any stream
-_OUTBOX = 500  # messages that wait for a client; the oldest are dropped first
+_OUTBOX = 500  # maximum messages queued for a client; the oldest are dropped first
 _UNIX_EPOCH_S = 1_750_000_000  # Unix time of boot; fixed, so that runs are repeatable
 
 
@@ -222,7 +222,7 @@ def _odometry(s: Snapshot) -> Any:
 
 _Builder = Callable[[Snapshot], Any]
 
-# LOCAL_POSITION_NED is the last, because it ends the tick's batch on a lockstep link.
+# LOCAL_POSITION_NED comes last, because it ends the tick's batch on a lockstep link.
 BUILDERS: Mapping[int, _Builder] = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     dialect.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
@@ -274,7 +274,7 @@ BUILDERS: Mapping[int, _Builder] = {
         )
     ),
 }
-"""Builders by message id, of every message that can be streamed or requested, in sending order.
+"""Builders of all messages that can be streamed or requested, by message id, in sending order.
 
 A builder returns None while its message has no contents.
 """
@@ -289,7 +289,7 @@ _STANDARD_MODES = {
 
 
 def _flight_information(now: Snapshot, _index: int) -> list[Any]:
-    """Return FLIGHT_INFORMATION, with 0 as the time of arming while disarmed."""
+    """Return FLIGHT_INFORMATION; the time of arming is 0 while disarmed."""
     armed_us = 0
     if now.commander.armed:
         armed_us = _UNIX_EPOCH_S * 1_000_000 + now.stamp_us - round(now.commander.armed_for_s * 1e6)
@@ -297,7 +297,7 @@ def _flight_information(now: Snapshot, _index: int) -> list[Any]:
 
 
 def _available_modes(_now: Snapshot, index: int) -> list[Any]:
-    """Return AVAILABLE_MODES of one mode, counted from 1, or of all for 0."""
+    """Return AVAILABLE_MODES for one mode, counted from 1, or for all if the index is 0."""
     modes = list(FlightMode)
     return [
         AvailableModes(
@@ -346,7 +346,7 @@ class Link:
     def __init__(self, preset: Preset) -> None:
         self.in_lockstep = preset is Preset.LOCKSTEP  # time stands still while the client computes
         self.outbox: list[Any] = []  # pending messages, oldest first
-        self.parameters_left: deque[int] = deque()  # indices of those still to be listed
+        self.parameters_left: deque[int] = deque()  # indices of parameters still to send
         self._rates_hz: Mapping[str, float] = _RATES_HZ[preset.value]
         self._streams = {
             number: _Stream(build, self._default_us(number)) for number, build in BUILDERS.items()
@@ -362,7 +362,7 @@ class Link:
         self.outbox.append(message)
 
     def take(self) -> list[Any]:
-        """Return the pending messages, which are then sent."""
+        """Return the pending messages and clear the queue."""
         messages, self.outbox = self.outbox, []
         return messages
 
@@ -391,11 +391,11 @@ class Link:
 
     @property
     def is_fast(self) -> bool:
-        """True if a stream has an interval below a tick."""
+        """True if a stream's interval is shorter than a tick."""
         return bool(self._fast)
 
     def due(self, snapshot: Snapshot, *, between_ticks: bool = False) -> list[Any]:
-        """Return the messages due now; between two ticks only those of the fast streams.
+        """Return the messages due now, or only those of the fast streams between two ticks.
 
         A late stream skips missed messages.
         """

@@ -1,6 +1,6 @@
 """The depth camera as a MAVLink camera component that takes commands and sends frames.
 
-It has no clock, and no socket but that of its depth stream. `handle` answers a message, and `poll`
+It has no clock, and no socket except its depth stream's. `handle` answers a message, and `poll`
 returns the messages due at a stamp. The same stamps and messages give the same bytes.
 """
 
@@ -82,7 +82,7 @@ class Camera:
         rate_hz: Default frame rate, at most 50 Hz.
         heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
-        depth: Gets frames at the default rate while it has readers; None for no stream.
+        depth: Stream that gets frames at the default rate while it has readers; None for none.
 
     Raises ConfigError if the size, field of view or rate is invalid.
     """
@@ -116,7 +116,7 @@ class Camera:
         self.images = 0  # images since boot, which is also the next index
         self._boxes = np.array(world_boxes, dtype=np.float64).reshape(-1, 6)
         self._origin = Origin()
-        self.local_origin_enu_m = np.zeros(3)  # of LOCAL_POSITION_NED in the world, m
+        self.local_origin_enu_m = np.zeros(3)  # origin of LOCAL_POSITION_NED in the world, m
         self._default_interval_s = 1.0 / rate_hz
         # Load the compiled renderer now, so that the first frame does not stall a real-time flight.
         render_depth(self._boxes, np.zeros(3), _LEVEL, 1, 1, 1.0)
@@ -125,7 +125,7 @@ class Camera:
         self._frames: _Schedule | None = None
         self._frames_left = 0  # 0: unlimited
         self._depth, self._streamed = depth, _Schedule(self._default_interval_s)
-        self._sensors: dict[int, _Schedule] = {}  # that a client has requested, by message id
+        self._sensors: dict[int, _Schedule] = {}  # those requested by a client, by message id
 
     def handle(self, message: Message) -> list[Message]:
         """Return the answer to a message, or nothing if it is not for a camera."""
@@ -135,17 +135,17 @@ class Camera:
         if message.target_component not in (COMPONENT_ID, dialect.MAV_COMP_ID_ALL):
             return []
         answers = self._command(message)
-        # The autopilot gets a command for all, too. A refusal here would confuse the sender.
+        # The autopilot also gets a broadcast command, so a refusal here would confuse the sender.
         is_ours = message.target_component == COMPONENT_ID
         return answers if is_ours or answers[-1].result == dialect.MAV_RESULT_ACCEPTED else []
 
     def poll(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """Return the messages due at a stamp: a heartbeat, and a frame and ranges from the pose.
+        """Return the messages due at a stamp: a heartbeat, a frame and ranges for the pose.
 
         Args:
-            stamp_s: Boot clock of the vehicle, s. A step back by 1 s counts as a reboot.
+            stamp_s: Boot clock of the vehicle, s. A step back by more than 1 s is a reboot.
             position_enu_m: Position of the vehicle (3,).
             quaternion_flu_enu: Attitude of the vehicle (4,).
         """
@@ -184,7 +184,7 @@ class Camera:
     def _frame(
         self, image: Image, position_enu_m: Vector, quaternion_flu_enu: Vector
     ) -> list[Message]:
-        """Return the messages of one frame in the order of sending.
+        """Return the messages of one frame in sending order.
 
         CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
         (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
@@ -236,7 +236,7 @@ class Camera:
         return [*answers, ack]
 
     def _information(self) -> Message:
-        """Focal length and sensor size give the field of view."""
+        """Return CAMERA_INFORMATION, whose focal length and sensor size give the field of view."""
         sensor_mm = (self._columns * _PIXEL_PITCH_MM, self._rows * _PIXEL_PITCH_MM)
         focal_px = self._columns / 2.0 / math.tan(self._hfov_rad / 2.0)
         return dialect.MAVLink_camera_information_message(
@@ -288,7 +288,7 @@ class Camera:
         return True
 
     def _start_capture(self, message: Message) -> bool:
-        """Start by param2, the interval in s (0: default), and param3, the number of frames."""
+        """Start to capture param3 frames (0: unlimited) every param2 seconds (0: default)."""
         interval_s, count = float(message.param2), _whole(message.param3)
         if count is None or count < 0 or interval_s < 0.0 or math.isinf(interval_s):
             return False
@@ -312,7 +312,7 @@ _BUILDERS: dict[int | None, Callable[[Camera], Message]] = {
     dialect.MAVLINK_MSG_ID_CAMERA_SETTINGS: lambda camera: dialect.MAVLink_camera_settings_message(
         camera._boot_ms, dialect.CAMERA_MODE_IMAGE, math.nan, math.nan
     ),
-    # There is no storage, as frames are sent at once.
+    # There is no storage, because frames are sent at once.
     dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: (
         lambda camera: dialect.MAVLink_storage_information_message(
             camera._boot_ms, 1, 0, dialect.STORAGE_STATUS_NOT_SUPPORTED, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -321,4 +321,4 @@ _BUILDERS: dict[int | None, Callable[[Camera], Message]] = {
     dialect.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: Camera._capture_status,
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET: Camera._local_origin,
 }
-"""Messages that can be requested, by their ids."""
+"""Builders of the messages that can be requested, by message id."""

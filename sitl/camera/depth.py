@@ -1,6 +1,6 @@
 """Renders the planar depth of a world of boxes as an 8-bit image.
 
-The model is a pinhole camera with square pixels that looks along its forward axis, as AirSim's
+The model is a pinhole camera with square pixels that looks along its forward axis, like AirSim's
 DepthPlanner in MAVBench. Depth is measured along the optical axis and rounded down to 0.1 m per
 grey level. The level 255 (25.5 m) means that nothing is in range.
 
@@ -51,8 +51,8 @@ def render_depth(
 
     Args:
         boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax. The ground z = 0 always exists.
-        position_enu_m: Optical centre (3,). The depth is zero everywhere if it is inside a box, or
-            below the ground and looking down. A pose that is not finite sees nothing.
+        position_enu_m: Optical centre (3,). Inside a box, the depth is zero everywhere; below the
+            ground, along every ray that points down. If the pose is not finite, all pixels are 255.
         quaternion_flu_enu: Unit quaternion (4,) w x y z, camera forward-left-up to ENU.
         columns, rows: Size of the image, at least 1.
         hfov_rad: Horizontal field of view, between 0 and pi.
@@ -124,7 +124,7 @@ def _corners_in_camera(box: Vector, position: Vector, rotation: Vector, corners:
 
 @compiled
 def _touches(box: Vector, position: Vector) -> bool:
-    """Return True if the optical centre is in the box or too near for its projection."""
+    """Return True if the optical centre is inside the box or too close to it for a projection."""
     for axis in range(3):
         if position[axis] < box[axis] - _TOUCHING_M or position[axis] > box[axis + 3] + _TOUCHING_M:
             return False
@@ -135,10 +135,10 @@ def _touches(box: Vector, position: Vector) -> bool:
 def _window(
     corners: Vector, focal_px: float, shape: tuple[int, int], window: NDArray[np.int64]
 ) -> None:
-    """Write the rows and columns (first, end, first, end) that can see the box, plus a pixel.
+    """Write the rows and columns (first, end, first, end) that can see the box, plus 1 px around.
 
-    The part of the box beyond the near plane is convex. Its vertices are the corners in front and
-    the cut edges, so their projections bound it.
+    The part of the box beyond the near plane is convex. Its vertices are the corners beyond that
+    plane and the points where edges cross it, so their projections bound it.
     """
     rows, columns = shape
     top, bottom, first, last = math.inf, -math.inf, math.inf, -math.inf

@@ -1,6 +1,6 @@
-"""Range finders beside the depth camera: a ring of 72 sectors, and one beam forward and one down.
+"""Range finders at the depth camera: a ring of 72 sectors, one beam forward and one beam down.
 
-They are at the optical centre on a levelled mount, which turns with the vehicle's yaw only. Ranges
+They sit at the optical centre on a levelled mount that turns only with the vehicle's yaw. Ranges
 come from the depth renderer, so they have its resolution of 0.1 m.
 """
 
@@ -16,8 +16,8 @@ from sitl.camera.depth import LEVELS_PER_M, NOTHING, render_depth
 _LEAST_CM, _MOST_CM = 10, 2500
 _CM_PER_LEVEL = round(100 / LEVELS_PER_M)
 _QUADRANTS = 4
-_SECTORS = 72  # of OBSTACLE_DISTANCE
-_COLUMNS = 180  # of the image of a quadrant: at most 0.64 degrees apart
+_SECTORS = 72  # in OBSTACLE_DISTANCE
+_COLUMNS = 180  # in a quadrant's image, at most 0.64 degrees apart
 _SIDEWAYS = [(2 * column + 1 - _COLUMNS) / _COLUMNS for column in range(_COLUMNS)]  # to the right
 _STRETCH = [math.hypot(1.0, side) for side in _SIDEWAYS]  # range per planar depth
 _SECTOR_OF = [
@@ -70,7 +70,7 @@ def _ring(
 def _beams(
     boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
 ) -> list[Message]:
-    """Return two DISTANCE_SENSOR, forward (id 0) and down (id 1), as `_ring` does."""
+    """Return two DISTANCE_SENSOR, forward (id 0) and down (id 1); see `_ring` for the arguments."""
     yaw_rad = yaw_from_quaternion(quaternion)
     messages = []
     for number, (orientation, pitch_rad) in enumerate(((_FORWARD, 0.0), (_DOWN, _RIGHT_ANGLE))):
@@ -90,4 +90,4 @@ SENSORS: dict[int, Callable[[Vector, float, Vector, Vector], list[Message]]] = {
     dialect.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: _ring,
     dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR: _beams,
 }
-"""The messages of each sensor from boxes, stamp, position and attitude, by message id."""
+"""Builders of sensor messages from boxes, stamp, position and attitude, by message id."""

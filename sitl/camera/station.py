@@ -34,14 +34,14 @@ from sitl.vehicle.vehicle import regression_power
 from sitl.world import World
 
 _TURN_S = 0.02  # time for the messages of all peers, after which the camera acts
-_TEXT_ID = 2  # of the texts about two autopilots; the referee's have another
+_TEXT_ID = 2  # of texts about two autopilots; the referee's texts have another id
 
 
 class _Linked(Peer):
     """An autopilot, companion or ground station on one of the links.
 
     Args:
-        slots: Place of the autopilot of each system at the peer's endpoint.
+        slots: Slots of the autopilots at the peer's endpoint, by system id.
         awaits_frames: False for a companion that has started the camera, until it sends a message.
     """
 
@@ -81,7 +81,7 @@ _REQUEST_AGAIN_S = 2.0
 _POSE_INTERVAL_US = 20_000.0
 _ANNOUNCE_S = 1.0
 _PLACE_S = 1.0
-_MOST_HELD = 64  # commands that wait for the camera's origin
+_MOST_HELD = 64  # maximum commands held until the camera has its origin
 _POSE = "the autopilot's own pose"
 _ACCELERATION_S = 0.2  # time over which velocities are differentiated
 _GROUND = dialect.MAV_LANDED_STATE_ON_GROUND
@@ -99,8 +99,8 @@ _REQUESTS = (  # component, command, confirmation and message id
 class PoseTracker:
     """Combines attitude and local position, which have different stamps.
 
-    Every new attitude gives a pose. The newest position is extrapolated to its stamp with the
-    velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
+    Every new attitude gives a pose. The newest position is extrapolated to the attitude's stamp
+    with the velocity, for 0.5 s at most, so that a slow position stream does not blur frames.
     """
 
     def __init__(self, origin_enu_m: Vector) -> None:
@@ -169,7 +169,7 @@ class Witness:
     """Derives collision, clearance and energy of a foreign vehicle from its pose.
 
     The record begins when the vehicle arms. The energy comes from the regression; the power of the
-    propellers is not known. The profile's body box and regression stand for the vehicle's.
+    propellers is unknown. Body box and regression are the profile's, in place of the vehicle's.
     """
 
     def __init__(self, world: World, profile: VehicleProfile, *, logs: bool) -> None:
@@ -205,7 +205,7 @@ class Witness:
         if self._stamp_s is not None and stamp_s <= self._stamp_s:
             if stamp_s > self._stamp_s - 1.0:
                 return None
-            self._begin()  # the autopilot has booted anew
+            self._begin()  # the autopilot has rebooted
         power_w = self._power_w(stamp_s, velocity)
         if self._stamp_s is not None:
             self._energy_j += power_w * (stamp_s - self._stamp_s)
@@ -236,9 +236,10 @@ class Witness:
 class Station:
     """Camera, referee and links of one autopilot.
 
-    It joins the peers of several endpoints, and is the camera component among them. Two autopilots
-    of the same system id at one endpoint would look like one vehicle that jumps. The frames of the
-    second are dropped, and a STATUSTEXT names both senders. Frames of others keep their signatures.
+    It connects the peers of several endpoints, and is the camera component among them. Two
+    autopilots with the same system id at one endpoint would look like one vehicle that jumps, so
+    the second one's frames are dropped and a STATUSTEXT names both senders. Forwarded frames keep
+    their signatures.
 
     Args:
         urls: Endpoints to open. One that cannot be opened raises LinkError.
@@ -298,7 +299,7 @@ class Station:
         self._request()
 
     def receive(self, message: Any, source: _Linked) -> None:
-        """Handle a message of a peer, and pass it on."""
+        """Handle a message from a peer, and forward it."""
         if self._is_of_holder(message, source) and self.take(message):
             frame = bytes(message.get_msgbuf())
             self.peers.send_in_turn(partial(_Linked.forward, frame=frame, sender=source))
@@ -321,9 +322,9 @@ class Station:
         return True
 
     def take(self, message: Any) -> bool:
-        """Handle a message. Return True if the other peers get it, too.
+        """Handle a message. Return True if it is to be forwarded to the other peers.
 
-        Messages to the camera or from another camera stay here, so that there is one camera.
+        Messages to the camera or from another camera are not, so that peers see one camera only.
         """
         component = message.get_srcComponent()
         if component == COMPONENT_ID and message.get_srcSystem() == self._autopilot:
@@ -361,7 +362,7 @@ class Station:
             self._send_text(collision.text, 1)
 
     def _is_autopilot(self, message: Any) -> bool:
-        """Return True for a message of the autopilot, which its first heartbeat identifies."""
+        """Return True for a message from the autopilot, which its first heartbeat identifies."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return False
         if self._autopilot is None:
@@ -382,7 +383,7 @@ class Station:
     def _place(self) -> None:
         """Use the given origin if no camera has sent a better one within a second.
 
-        It is a second of the autopilot's clock, which may run much faster than the wall clock.
+        The autopilot's clock counts, because it may run much faster than the wall clock.
         """
         stamp_s = self._tracker.attitude_stamp_s
         if self._placed or stamp_s is None:

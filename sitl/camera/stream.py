@@ -1,6 +1,6 @@
 """Depth frames as arrays of metres over a Unix domain socket.
 
-For programs of this machine that do not want to assemble MAVLink images. A frame is a header and
+Programs on this machine can read it instead of assembling MAVLink images. A frame is a header and
 the depth of every pixel, row by row from the top left, as float32; infinity means that nothing is
 in range. All numbers are little-endian. Readers send nothing.
 """
@@ -29,17 +29,17 @@ _DEPTH_M = np.array([*(level / LEVELS_PER_M for level in range(NOTHING)), math.i
 
 
 class DepthStream:
-    """Sends depth frames to every reader of a socket, which sends nothing.
+    """Sends depth frames to every reader of a socket. Readers send nothing.
 
-    It never waits. A slow reader misses whole frames, because only a few of them wait for it. There
+    It never blocks. A slow reader misses whole frames, because only a few are queued for it. There
     are at most `MAX_PEERS` readers.
 
     Args:
-        path: Socket to make. Closing removes it.
+        path: Socket to create. Closing removes it.
         size: Columns and rows of the frames.
 
     Raises:
-        LinkError: The socket cannot be made, for example because the file exists.
+        LinkError: The socket cannot be created, for example because the file exists.
     """
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
@@ -61,13 +61,13 @@ class DepthStream:
     def opened(
         path: Path | None, size: tuple[int, int]
     ) -> contextlib.AbstractContextManager[DepthStream | None]:
-        """Return a context with an open stream; with None if there is no path."""
+        """Return a context manager with an open stream, or with None if there is no path."""
         if path is None:
             return contextlib.nullcontext()
         return contextlib.closing(DepthStream(path, size))
 
     def serve(self) -> bool:
-        """Accept readers, and send what is left of their frames. Return True if there are any."""
+        """Accept readers, and send the rest of queued frames. Return True if there are readers."""
         self._readers += self._listener.accept_ready()
         self._send(b"")
         return bool(self._readers)
@@ -80,7 +80,7 @@ class DepthStream:
         quaternion_flu_enu: Vector,
         hfov_rad: float,
     ) -> None:
-        """Send a frame to the readers that have read the one before.
+        """Send a frame to every reader. It replaces one that still waits for a slow reader.
 
         Args:
             pixels: Image (rows, columns) of `render_depth`.
@@ -99,7 +99,7 @@ class DepthStream:
     def _send(self, data: bytes) -> None:
         for reader in list(self._readers):
             try:
-                reader.receive(0.0)  # a reader that has left is lost here
+                reader.receive(0.0)  # raises LinkLost if the reader has left
                 reader.send(data)
             except LinkLost:
                 reader.close()

@@ -1,1 +1,1 @@
-"""Real firmware on the simulated vehicle: PX4 and ArduPilot fly it by their own simulator links."""
+"""Real firmware flies the simulated vehicle: PX4 or ArduPilot, over its own simulator link."""

@@ -1,4 +1,4 @@
-"""ArduPilot: starts it, and serves its JSON backend (servo outputs in, state out, over UDP).
+"""Starts ArduPilot and serves its JSON backend (servo outputs in, state out, over UDP).
 
 ArduPilot sends its outputs and waits for the state, whose timestamp is its clock. It simulates
 barometer, magnetometer and GPS itself.
@@ -36,7 +36,7 @@ _FULL_SHARE = 0.5  # share of the rotors' torque that its mixer gives at full co
 
 
 class ArduPilotLink:
-    """One ArduPilot, which sends to our UDP port by its JSON backend; port 0 selects any free one.
+    """One ArduPilot whose JSON backend sends to our UDP port; port 0 selects any free one.
 
     Raises LinkError if the port cannot be opened.
     """
@@ -74,7 +74,7 @@ class ArduPilotLink:
         }
 
     def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
-        """Start ArduCopter's SITL binary, which calls this link. See `Px4Link.start`."""
+        """Start ArduCopter's SITL binary, which connects to this link. See `Px4Link.start`."""
         program, origin = FirmwareProcess.program(binary), Origin()
         scratch = ScratchFolder("ardupilot")
         lines = [f"{name} {value:.6g}\n" for name, value in self.parameters(boot.profile).items()]
@@ -115,13 +115,13 @@ class ArduPilotLink:
         self._socket.close()
 
     def _await_servos(self, limit_s: float) -> bool:
-        """Take the outputs of the next frame. ArduPilot repeats a frame that has no answer."""
+        """Receive the outputs of the next frame. ArduPilot repeats an unanswered frame."""
         deadline_s = time.monotonic() + limit_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:
             self._socket.settimeout(remaining_s)
             try:
                 data, peer = self._socket.recvfrom(_SERVOS.size + 1)
-            except OSError:  # the time is over, or ArduPilot has ended
+            except OSError:  # a timeout, or ArduPilot has ended
                 continue
             if len(data) != _SERVOS.size:
                 continue
@@ -144,5 +144,5 @@ class ArduPilotLink:
             "velocity": truth.velocity_ned_mps.tolist(),
             "no_time_sync": 1,
         }
-        # ArduPilot finds values by their distance from the key: no space after a colon.
+        # ArduPilot locates a value by its offset from the key, so no space may follow a colon.
         return b"\n" + json.dumps(state, separators=(",", ":")).encode() + b"\n"

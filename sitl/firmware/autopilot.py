@@ -34,7 +34,7 @@ from sitl.vehicle.profile import VehicleProfile
 from sitl.vehicle.truth import Truth
 
 _STREAMS_US = {**dict.fromkeys(STATE_STREAMS, 20_000.0), **SLOW_STREAMS_US}
-_FOLLOWING = {  # the mode in which a firmware follows a companion
+_FOLLOWING = {  # mode in which each firmware follows a companion
     dialect.MAV_AUTOPILOT_PX4: 6 << 16,  # OFFBOARD
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: 4,  # GUIDED
 }
@@ -49,22 +49,23 @@ def follows_companion(heartbeat: Any) -> bool:
 
 
 class FirmwareAutopilot(Links):
-    """A firmware at the other end of a MAVLink link, as the autopilot of a simulation.
+    """Firmware at the other end of a MAVLink link, as the autopilot of a simulation.
 
-    It requests the streams of a flight, and sets the firmware's local origin to the world's, so
-    that its positions are world coordinates. Clients of any preset get all its `common` messages.
+    It requests the streams that a flight needs, and sets the firmware's local origin to the
+    world's, so that the firmware reports world coordinates. Clients of any preset get all of the
+    firmware's `common` messages.
 
     Args:
-        echoes: The firmware answers TIMESYNC while its clock stands still. The firmware then reads
-            a client's frame before simulated time continues.
+        echoes: Whether the firmware answers TIMESYNC while its clock stands still. If so, simulated
+            time waits for the firmware to read the clients' frames.
     """
 
-    restart_requested = False  # a reboot is the firmware's own
+    restart_requested = False  # the firmware handles reboots itself
 
     def __init__(self, transport: Transport, *, system_id: int = 1, echoes: bool = True) -> None:
         super().__init__()
         self.system_id = system_id
-        self.state_stamp_us = -1  # of the newest LOCAL_POSITION_NED; -1 without one
+        self.state_stamp_us = -1  # of the newest LOCAL_POSITION_NED; -1 before the first
         self.armed = False  # the motors may turn; the owner sets it
         self.terminated = False  # after a collision
         self._transport = transport
@@ -79,7 +80,7 @@ class FirmwareAutopilot(Links):
     # Clients.
 
     def handle(self, message: Any, _link: Link) -> None:
-        """Keep a client's message for the next `deliver`, under the client's own ids."""
+        """Queue a client's message for the next `deliver`, with the client's own ids."""
         codec = self._codec
         codec.system, codec.component = message.get_srcSystem(), message.get_srcComponent()
         self._to_firmware.append(codec.encode(message))
@@ -95,7 +96,7 @@ class FirmwareAutopilot(Links):
             link.outbox.clear()
 
     def terminate(self, text: str) -> None:
-        """Stop the motors for good, and send the clients the reason."""
+        """Stop the motors permanently, and send the clients the reason."""
         if not self.terminated:
             self.terminated = True
             for message in text_messages(dialect.MAV_SEVERITY_CRITICAL, text.encode(), 1):
@@ -103,7 +104,7 @@ class FirmwareAutopilot(Links):
 
     @property
     def commander(self) -> FirmwareAutopilot:
-        """The part with the state of the motors, `armed` and `terminated`."""
+        """The object with the motors' state, `armed` and `terminated`."""
         return self
 
     @property
@@ -208,10 +209,10 @@ class Boot:
     heading_deg: float
 
 
-_TAIL_LINES, _TAIL_BYTES = 5, 8192  # of its output that an error shows
+_TAIL_LINES, _TAIL_BYTES = 5, 8192  # of output: lines in an error, bytes kept
 _CHUNK = 65_536
 _DEATH_S = 1.0
-_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # of a terminal
+_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # a terminal's colour code
 
 
 def _plain(line: str) -> str:
@@ -220,9 +221,9 @@ def _plain(line: str) -> str:
 
 
 class FirmwareProcess:
-    """A running firmware. Its folder and its child processes end with it.
+    """A running firmware. `end` also kills its children and removes its folder.
 
-    It works in the folder, with additions to the environment. Raises VehicleProcessError if it
+    It runs in that folder, with `environment` added to ours. Raises VehicleProcessError if it
     cannot be started.
     """
 
@@ -253,7 +254,7 @@ class FirmwareProcess:
     def program(path: Path) -> Path:
         """Return the absolute path of a program.
 
-        Raises VehicleProcessError if it does not exist or must not be executed.
+        Raises VehicleProcessError if it does not exist or is not executable.
         """
         if not path.is_file():
             raise VehicleProcessError(f"no firmware at {path}")
@@ -262,21 +263,21 @@ class FirmwareProcess:
         return path.resolve()
 
     def require_running(self) -> None:
-        """Raise VehicleProcessError if it has ended, with its last lines."""
+        """Raise VehicleProcessError, with its last lines of output, if it has ended."""
         if self._process.poll() is not None:
             raise VehicleProcessError(self._state())
 
     def explain(self, problem: str) -> VehicleProcessError:
-        """Return an error about the firmware with its state and its last lines."""
+        """Return an error about the firmware with its state and its last lines of output."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_DEATH_S)  # a link may close before its process has ended
         return VehicleProcessError(f"{problem}; {self._state()}")
 
     def _state(self) -> str:
-        """Describe in a line whether it runs or how it ended, with the last lines of its output."""
+        """Describe in one line whether it runs or how it ended, with its last lines of output."""
         code = self._process.poll()
         if code is not None:
-            self._reader.join(_DEATH_S)  # not for ever, because a child may hold the pipe
+            self._reader.join(_DEATH_S)  # with a limit, because a child may hold the pipe
         how = "is running" if code is None else f"ended with code {code}"
         if code is not None and code < 0:
             how = f"was killed by signal {-code}"

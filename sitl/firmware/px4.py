@@ -1,8 +1,8 @@
-"""PX4: starts it, and serves its lockstep link (sensors out, motor outputs back, over TCP).
+"""Starts PX4 and serves its lockstep link (sensors out, motor outputs back, over TCP).
 
 PX4 is the client. HIL_SENSOR sets its clock, and HIL_ACTUATOR_CONTROLS answers it once the
-controllers have run. PX4 sends no answer while no controller runs, so a missing one must not stop
-the simulation.
+controllers have run. PX4 sends no answer while no controller runs, so a missing answer must not
+stop the simulation.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ _FIX_3D, _SATELLITES = 3, 10
 _EPH_CM, _EPV_CM = 90, 178
 _ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
 
-ANSWER_LIMIT_S = 1.0  # wait for an answer after an answered step
-SILENT_WAIT_S = 0.004  # wait after an unanswered one
+ANSWER_LIMIT_S = 1.0  # wait for an answer if the step before was answered
+SILENT_WAIT_S = 0.004  # wait if it was not
 _GONE = "PX4 closed the simulator link"
 
-_INSTANCES = 100  # of PX4 on one machine
-_SOCKET = "/tmp/px4-sock-{}"  # on which a running instance serves its commands
-_LOCAL_PORT = 14_580  # of the first instance's MAVLink
+_INSTANCES = 100  # maximum number of PX4 instances on a machine
+_SOCKET = "/tmp/px4-sock-{}"  # where a running instance accepts commands
+_LOCAL_PORT = 14_580  # MAVLink port of the first instance
 _TILT_SHARE = math.sqrt(0.5)  # share of each rotor's thrust at full roll or pitch
 _ROTORS = ((1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1))  # forward, right, sense
 
-# PX4 sources these scripts instead of its own: the parameters of the vehicle before its modules
-# start, and one link to a companion without others.
+# PX4 sources these scripts instead of its own. They set the vehicle's parameters before its modules
+# start, and open a link to a companion but no other links.
 _SIMULATOR_SCRIPT = """#!/bin/sh
 {settings}
 simulator_mavlink start -c {port}
@@ -65,7 +65,7 @@ class Px4Link:
     """One PX4 on the simulator link. The TCP port determines the number of the PX4 instance."""
 
     step_s = 0.004  # PX4's SITL takes inertial samples at 250 Hz
-    settle_s = 12.0  # its boot ends at another time in every flight, its estimator settles by then
+    settle_s = 12.0  # its boot time varies between flights; its estimator has settled by then
     echoes = True
 
     def __init__(self, transport: Transport, sensors: Sensors, port: int = PORT) -> None:
@@ -79,7 +79,7 @@ class Px4Link:
 
     @classmethod
     def open(cls, sensors: Sensors, *, ours: bool) -> Px4Link:
-        """Open the first free port of PX4's instances; only the first port unless we start PX4.
+        """Open the first free port of PX4's instances, or only the first port unless we start PX4.
 
         Raises LinkError if all of them are in use.
         """
@@ -112,7 +112,7 @@ class Px4Link:
         }
 
     def start(self, binary: Path, boot: Boot) -> FirmwareProcess:
-        """Start PX4's SITL binary, which lies in `bin/` beside its startup files in `etc/`.
+        """Start PX4's SITL binary, which is in `bin/` next to `etc/` with its startup files.
 
         PX4 derives its heading from the magnetometer. Raises VehicleProcessError if it cannot be
         started.
@@ -218,6 +218,6 @@ def _throttles(message: Message) -> Vector:
 
 
 def _is_running(instance: int) -> bool:
-    """Return True if a PX4 of this number runs on this machine, where a second cannot start."""
+    """Return True if a PX4 with this number already runs here, so that a second cannot start."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         return probe.connect_ex(_SOCKET.format(instance)) == 0

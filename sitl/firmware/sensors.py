@@ -1,4 +1,4 @@
-"""Sensors of a vehicle: they measure its true state, with noise from a seed."""
+"""Sensors of a vehicle, which measure its true state with seeded noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sitl.geodesy import Origin, pressure_altitude_m, standard_pressure_pa
 from sitl.vehicle.profile import GRAVITY_MPS2
 from sitl.vehicle.truth import Truth
 
-# Standard deviations of white noise, of the size that PX4's own simulated sensors have.
+# Standard deviations of white noise, about as large as in PX4's own simulated sensors.
 GYRO_RADPS = 0.003
 ACCELEROMETER_MPS2 = 0.03
 MAGNETOMETER_GAUSS = 0.0004
@@ -20,7 +20,7 @@ FIX_HORIZONTAL_M = 0.2
 FIX_VERTICAL_M = 0.5
 FIX_SPEED_MPS = 0.06
 
-# The magnetic field near Zurich by the World Magnetic Model: declination, inclination, strength.
+# The magnetic field near Zurich from the World Magnetic Model: declination, inclination, strength.
 _DECLINATION_RAD = math.radians(3.19)
 _INCLINATION_RAD = math.radians(63.1)
 _STRENGTH_GAUSS = 0.4816
@@ -53,14 +53,14 @@ class Sensors:
         return field + MAGNETOMETER_GAUSS * self._noise.standard_normal(3)
 
     def barometer(self, truth: Truth) -> tuple[float, float]:
-        """Return the air pressure, Pa, and its altitude above sea level, m."""
+        """Return the air pressure, Pa, and the corresponding altitude above sea level, m."""
         altitude_m = self._origin.altitude_amsl_m - float(truth.position_ned_m[2])
         noise_pa = BAROMETER_PA * float(self._noise.standard_normal())
         pressure_pa = standard_pressure_pa(altitude_m) + noise_pa
         return pressure_pa, pressure_altitude_m(pressure_pa)
 
     def fix(self, truth: Truth) -> tuple[float, float, float, Vector]:
-        """Return latitude, longitude (deg), altitude (m) and velocity (3,), NED, of a GPS."""
+        """Return a GPS fix: latitude, longitude (deg), altitude (m) and NED velocity (3,), m/s."""
         noise = self._noise.standard_normal(6)
         north, east, down = truth.position_ned_m.tolist()
         latitude, longitude = self._origin.geodetic(

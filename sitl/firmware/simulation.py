@@ -1,4 +1,4 @@
-"""Vehicle, camera and referee of a flight that real firmware flies (`--hil`, `--json`)."""
+"""Vehicle, camera and referee of a flight under real firmware (`--hil`, `--json`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sitl.simulation import Simulation
 from sitl.vehicle.profile import VehicleProfile
 from sitl.world import World
 
-# The simulator links of the firmware that can fly.
+# The simulator link of each supported firmware.
 LINKS: Mapping[str, type[Px4Link | ArduPilotLink]] = {"px4": Px4Link, "ardupilot": ArduPilotLink}
 
 _REMEMBERED_S = 1.0
@@ -34,16 +34,16 @@ _START_LIMIT_S, _LOOK_S = 60.0, 0.2
 
 
 class FirmwareSimulation(Simulation):
-    """A simulation whose rotors a firmware commands, one exchange for each physics step.
+    """A simulation whose rotors are commanded by firmware, with one exchange per physics step.
 
     The firmware's state at a stamp arrives a step or two after the stamp. The camera takes its
     frame from the vehicle's true pose at the stamp of the newest state.
 
     Args:
         kind: Firmware, one of LINKS.
-        binary: Its SITL program, which `close` ends; None if somebody else starts it.
+        binary: Its SITL program, which `close` ends; None if it is started externally.
         seed: Seed of the sensors' noise.
-        url: Link on which a firmware that somebody else starts sends its MAVLink.
+        url: Link to which externally started firmware sends its MAVLink.
         system_id, camera, logs: See `Simulation`.
 
     Raises:
@@ -51,7 +51,7 @@ class FirmwareSimulation(Simulation):
         VehicleProcessError: The binary cannot be started.
     """
 
-    awaits_setpoints = False  # ArduPilot takes none before it follows the companion
+    awaits_setpoints = False  # ArduPilot accepts none before it follows the companion
 
     def __init__(
         self,
@@ -96,10 +96,10 @@ class FirmwareSimulation(Simulation):
             undo.pop_all()
 
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the firmware calls and sends a position, or until stopped.
+        """Wait until the firmware connects and sends a position, or until stopped.
 
-        Raises VehicleProcessError if it ended, or has not called within a minute, or has sent no
-        position within two.
+        Raises VehicleProcessError if it has ended, has not connected within a minute, or has sent
+        no position within two minutes.
         """
         self._await_call(stopped)
         autopilot = self._firmware
@@ -112,11 +112,11 @@ class FirmwareSimulation(Simulation):
         autopilot.forget()
 
     def handle(self, message: Any, link: Link) -> None:
-        """Keep a client's message for the firmware."""
+        """Queue a client's message for the firmware."""
         self._firmware.handle(message, link)
 
     def advance(self, between: Callable[[int], None] | None = None) -> None:
-        """See `Simulation`. An error about a firmware that we started shows its last lines."""
+        """See `Simulation`. If we started the firmware, an error shows its last lines of output."""
         with self._explained():
             super().advance(between)
 
@@ -137,7 +137,7 @@ class FirmwareSimulation(Simulation):
         self._link.close()
 
     def _await_call(self, stopped: Callable[[], bool]) -> None:
-        """Wait until the firmware calls, or until stopped; for a minute if we started it."""
+        """Wait until the firmware connects or until stopped, at most a minute if we started it."""
         deadline_s = time.monotonic() + _START_LIMIT_S
         while not stopped():
             with self._explained():
@@ -147,7 +147,7 @@ class FirmwareSimulation(Simulation):
                 continue
             self._process.require_running()
             if time.monotonic() > deadline_s:
-                raise VehicleProcessError(f"no firmware called within {_START_LIMIT_S:g} s")
+                raise VehicleProcessError(f"no firmware connected within {_START_LIMIT_S:g} s")
 
     def _fly(self, _between: Callable[[int], None] | None) -> None:
         autopilot = self._firmware

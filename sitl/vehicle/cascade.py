@@ -151,8 +151,8 @@ def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
 def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector:
     """Return the target velocity (3,), NED m/s: gain times position error plus velocity setpoint.
 
-    An axis with neither position nor velocity has target zero. If it has an acceleration, the
-    target is NaN, which means that the acceleration alone controls it.
+    For an axis with neither position nor velocity, the target is NaN if there is an acceleration,
+    which then controls the axis alone, and zero otherwise.
     """
     target = np.empty(3)
     for axis in range(3):
@@ -177,7 +177,7 @@ def velocity_target(clean: Vector, measurement: Vector, gains: Vector) -> Vector
 
 @compiled
 def _model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vector) -> Vector:
-    """Return the limited acceleration (3,) of the reference model to its target, NED m/s^2.
+    """Return the limited acceleration (3,) of the reference model towards its target, NED m/s^2.
 
     The velocity error excludes the part of the feed-forward that is delayed by the lag. A
     trajectory with its own acceleration is therefore followed one lag late, without overshoot.
@@ -202,7 +202,7 @@ def _model_acceleration(target: Vector, clean: Vector, state: Vector, gains: Vec
 
 @compiled
 def _drag(velocity_mps: Vector, axis: int, gains: Vector) -> float:
-    """Return the deceleration by drag and inflow along a NED axis at a velocity (3,), m/s^2."""
+    """Return the deceleration due to drag and inflow along a NED axis at a velocity (3,), m/s^2."""
     v: float = velocity_mps[axis]
     slowing: float = gains[G_DRAG_LINEAR + axis] + gains[G_DRAG_QUADRATIC + axis] * abs(v)
     return v * slowing
@@ -293,7 +293,7 @@ def _unwind(acceleration: Vector, force: Vector, state: Vector, gains: Vector) -
 
 @compiled
 def tilt_rates(force: Vector, matrix: Vector, gains: Vector) -> Vector:
-    """Return the body rates (3,), rad/s, without yaw, that turn the thrust axis to the force."""
+    """Return the body rates (3,), rad/s, without yaw, that align the thrust axis with the force."""
     norm = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     # target down axis in body coordinates
     x = -(matrix[0, 0] * force[0] + matrix[1, 0] * force[1] + matrix[2, 0] * force[2]) / norm

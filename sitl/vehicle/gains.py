@@ -119,7 +119,7 @@ class RateLoops:
     p: Vector  # (3,) N m of torque per rad/s
     i: Vector  # (3,) N m per rad
     d: Vector  # (3,) N m per rad/s^2
-    tilt_nm: float  # torque of all rotors at full differential thrust, round a level axis
+    tilt_nm: float  # torque of all rotors at full differential thrust, about a level axis
     yaw_nm: float
     tilt_p: float  # 1/s
     hover_share: float  # thrust in hover / maximum thrust
@@ -148,9 +148,9 @@ class RateLoops:
     def parameters(
         self, pattern: str, axes: Sequence[str], shares: Sequence[float]
     ) -> dict[str, float]:
-        """Return the gains by names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
+        """Return the gains under names like "MC_{axis}RATE_{term}", for roll, pitch and yaw.
 
-        A share is the part of `tilt_nm` or `yaw_nm` that full command gives around its axis.
+        A share is the fraction of `tilt_nm` or `yaw_nm` that full command produces about its axis.
         """
         full = (self.tilt_nm, self.tilt_nm, self.yaw_nm)
         return {

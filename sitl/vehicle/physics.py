@@ -16,7 +16,7 @@ from sitl.vehicle.profile import GRAVITY_MPS2, VehicleProfile
 
 # The ground falls below the tangent plane at its (latitude, longitude) origin by 0.05 mm at 100 m.
 PLANET_RADIUS_M = 1.0e8
-_MODEL = Path(__file__).parent / "model"  # JSBSim's files, with `$name` for what a profile gives
+_MODEL = Path(__file__).parent / "model"  # JSBSim's files, with `$name` for a profile's values
 AIRCRAFT = "quadrotor"
 ROTORS = 4
 
@@ -69,7 +69,7 @@ def _values(profile: VehicleProfile) -> dict[str, float | str]:
 
 
 def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
-    """Return the rows of a coefficient over the advance ratio, up to 1.5 times `ratio`."""
+    """Return table rows of a coefficient against advance ratio, up to 1.5 times `ratio`."""
     advances = [step / 20.0 for step in range(-20, 31)]
     return "\n".join(f"{j * ratio:.6f} {static * share(j):.9f}" for j in advances)
 
@@ -109,7 +109,7 @@ RAW_SIZE = len(RAW_PROPERTIES)
 
 
 class Physics:
-    """A JSBSim instance that flies a profile over flat, fixed ground."""
+    """A JSBSim instance that simulates a profile over flat, fixed ground."""
 
     def __init__(
         self, profile: VehicleProfile, *, position_ned_m: Vector, heading_rad: float, dt_s: float

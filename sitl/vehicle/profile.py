@@ -28,7 +28,7 @@ Triple = tuple[float, float, float]
 # ordinary 4.2 V cell.
 _MIDDLE = 0.3
 
-_LARGEST = 1e12  # of all values, in their units
+_LARGEST = 1e12  # largest magnitude of any value, in its unit
 _ANY_SIGN = ("camera_mount_flu_m", "rotor.height_m", "energy.")
 _MAY_BE_ZERO = (
     "extra_payload_kg", "drag.linear_nspm", "drag.quadratic_ns2pm2", "gear.friction",
@@ -69,7 +69,7 @@ class _Rotor:
         return 60.0 / (2.0 * math.pi * self.motor_kv_rpmpv)
 
     def hover_power_w(self, mass_kg: float) -> float:
-        """Return the shaft power of all four rotors in hover, W: static C_P at the speed of C_T."""
+        """Return the shaft power of all four rotors in hover, W, from static C_T and C_P."""
         thrust_n = mass_kg * GRAVITY_MPS2 / 4.0
         speed_hz = math.sqrt(thrust_n / self.max_thrust_n) * self.max_rpm / 60.0
         power = self.power_coefficient * AIR_DENSITY_KGPM3 * speed_hz**3 * self.diameter_m**5
@@ -126,7 +126,7 @@ class _Battery:
     avionics_w: float
 
     def parameters(self) -> Vector:
-        """Return four open-circuit voltages, resistance, capacity C, efficiency and W (8,)."""
+        """Return (8,): 4 open-circuit voltages, resistance, capacity C, efficiency, avionics W."""
         middle = self.cell_nominal_v + _MIDDLE * (self.cell_full_v - self.cell_nominal_v)
         cells = (self.cell_empty_v, self.cell_nominal_v, middle, self.cell_full_v)
         volts = [self.cells * voltage for voltage in cells]
@@ -166,7 +166,7 @@ class _EnergyRegression:
     b9: float
 
     def coefficients(self, payload_kg: float) -> Vector:
-        """Return b1..b6 and the constant with a payload (7,)."""
+        """Return b1..b6 and the constant term for a payload (7,)."""
         constant = self.b9 + self.b7 * payload_kg * 1000.0
         return np.array([self.b1, self.b2, self.b3, self.b4, self.b5, self.b6, constant])
 
@@ -258,7 +258,7 @@ def _numbers(record: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def _check_number(key: str, value: float) -> None:
-    if value and not 1.0 / _LARGEST <= abs(value) <= _LARGEST:  # else sums and quotients overflow
+    if value and not 1.0 / _LARGEST <= abs(value) <= _LARGEST:  # or sums and quotients overflow
         limits = f"{1.0 / _LARGEST:g} and {_LARGEST:g} in size"
         raise ConfigError(f"must be between {limits}, got {value:g}", key=key)
     may_be_zero = key in _MAY_BE_ZERO
@@ -323,8 +323,8 @@ class _StandIn:
             share = shaft_w / self.hover_power_w
             if share > 1.0:
                 raise ValueError(
-                    f"hover_power_w: must be at least the {shaft_w:.1f} W with which the "
-                    f"propellers of {self.base!r} hover {mass_kg:g} kg, got {self.hover_power_w:g}"
+                    f"hover_power_w: must be at least the {shaft_w:.1f} W that the propellers of "
+                    f"{self.base!r} need to hover with {mass_kg:g} kg, got {self.hover_power_w:g}"
                 )
             battery = dataclasses.replace(battery, drive_efficiency=share)
         grown = mass_kg / base.mass_kg

@@ -1,4 +1,4 @@
-"""The state of the vehicle at a moment, as one array that physics, controller and referee share."""
+"""The state of the vehicle at one instant, as one array for physics, controller and referee."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRUTH_SIZE = 33
 
 
 class _Scalar:
-    """An attribute of `Truth` that is one number of its array."""
+    """An attribute of `Truth` that reads one number of its array."""
 
     def __init__(self, index: int) -> None:
         self._index = index
@@ -74,7 +74,7 @@ class Truth:
         )
 
     def in_body(self, vector_ned: Vector) -> Vector:
-        """Turn a vector (3,) from NED into the body's FRD."""
+        """Rotate a vector (3,) from NED to body FRD."""
         return rotate(rotation_matrix(self.quaternion_frd_ned).T, vector_ned)
 
     def wreck(self) -> Truth:

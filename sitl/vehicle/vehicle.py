@@ -74,7 +74,7 @@ def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
 def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
     """Return the current, A, at which the loaded pack delivers a power, or its maximum power.
 
-    It is the smaller root of P = I (V - I R), in the form without cancellation.
+    It is the smaller root of P = I (V - I R), in a form without cancellation.
     """
     if 4.0 * resistance_ohm * power_w > open_circuit_v * open_circuit_v:
         return open_circuit_v / (2.0 * resistance_ohm)
@@ -159,7 +159,7 @@ def _refresh(
 def _control(
     state: Vector, truth: Vector, setpoint: Vector, gains: Vector, armed: bool, commands: Vector
 ) -> None:
-    """Run the flight controller; change its state and the commands in place."""
+    """Run the flight controller, and update its state and the commands in place."""
     new, chosen = cascade.control_step(state, truth, setpoint, gains, armed)
     state[:] = new
     commands[:] = chosen
@@ -188,8 +188,8 @@ def _refresh_and_control(
 class Quadrotor:
     """Deterministic physics and flight controller of one quadrotor.
 
-    It begins at rest, with a yaw counter-clockwise from east. A position (3,) below the standing
-    height is raised to it: the centre of mass is then `profile.rest_height_m` above the ground.
+    It starts at rest, with the yaw counter-clockwise from east. A position (3,) below the standing
+    height, at which the centre of mass is `profile.rest_height_m` above ground, is raised to it.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class Quadrotor:
         self._refresh(np.zeros(4), 0.0, armed=False)
 
     def step(self, setpoint: Vector, armed: bool, count: int = 1) -> None:
-        """Advance flight controller and physics by steps; the motors stop unless `armed`.
+        """Advance flight controller and physics by `count` steps; the motors stop unless `armed`.
 
         The setpoint (11,) is x y z, vx vy vz, ax ay az, yaw, yaw rate in NED; m, m/s, m/s^2, rad,
         rad/s. Values that are not finite are not controlled.

@@ -1,8 +1,8 @@
 """Checks that a world can be flown, and draws it from above as SVG.
 
 The path is searched on an 8-connected flat grid at the goal's height. A cell is free if its centre
-keeps the clearance from every box that reaches into the slab of that height. The result has the
-grid's resolution and ignores paths over or under an obstacle.
+keeps the clearance from every box, including those above and below. The result has the grid's
+resolution and ignores paths over or under an obstacle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Cell = tuple[int, int]
 # Half-width of the planner's drone box in the released code (MAVBench/MAV_apps, branch mavfi).
 DEFAULT_CLEARANCE_M = 2.0
 _CELL_M = 0.5
-_MOST_CELLS = 1e8  # of the grid, 5 km square
+_MOST_CELLS = 1e8  # maximum size of the grid, 5 km square
 _STEPS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
@@ -106,7 +106,7 @@ def _free_grid(world: World, height_m: float, clearance_m: float) -> tuple[Mask,
 
 
 def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell]:
-    """Return the cells of a shortest path, none if there is none, by A* with straight distances."""
+    """Return the cells of a shortest path, empty if none exists, by A* with straight distances."""
     shape = free.shape
     if not (free[start] and free[goal]):
         return []
@@ -135,7 +135,7 @@ def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell]:
 
 
 def _straighten(free: Mask, cells: list[Cell]) -> list[Cell]:
-    """Return the corners of a path of cells: after a cell, the last one in line of sight."""
+    """Return the corners of a path of cells: each is the last cell in sight of the one before."""
     corners, at, last = [cells[0]], 0, len(cells) - 1
     while at < last:
         ahead = (place for place in range(last, at, -1) if _sees(free, cells[at], cells[place]))

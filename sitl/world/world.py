@@ -16,8 +16,8 @@ A world file is a fixed scene, shipped (`factory`, `farm`) or a user's own:
     min_enu_m = [10, 10, 0]
     max_enu_m = [12, 20, 8]
 
-The seed chooses start and goal if they are not given. They have no obstacle within 3 m
-horizontally. The goal is at `flight_height_m` and within `goal_distance_m` of the start. Each seed
+The seed chooses start and goal if they are not given. Both are at least 3 m horizontally from every
+obstacle. The goal is at `flight_height_m` and within `goal_distance_m` of the start. Each seed
 of a fixed scene thus gives a different mission.
 """
 
@@ -40,7 +40,7 @@ from mavfi_cli.core.seeds import Stream
 from mavfi_cli.core.types import Briefing
 
 CLEAR_RADIUS_M = 3.0  # minimum horizontal distance of an obstacle from start and goal
-_START_CLEAR_M = 0.5  # distance of a start from a box, as the vehicle must be able to stand there
+_START_CLEAR_M = 0.5  # minimum distance of a start from a box, so that the vehicle fits there
 _CELL_M = 10.0
 _MARGIN_M = 20.0
 _UNLIMITED_HEIGHT_M = 1000.0  # a 300 s mission can climb 900 m at 3 m/s
@@ -61,7 +61,7 @@ def format_place(place: Vector) -> str:
 def distance_to_boxes(boxes_enu_m: Vector, place_enu_m: Vector, *, plan: bool = False) -> Vector:
     """Return the distances (n,), m, from a point (3,) to boxes (n, 6); zero inside.
 
-    In `plan` only the horizontal distance counts.
+    With `plan`, only the horizontal distance counts.
     """
     apart = np.maximum(boxes_enu_m[:, :3] - place_enu_m, place_enu_m - boxes_enu_m[:, 3:])
     apart = np.maximum(0.0, apart)
@@ -117,7 +117,7 @@ class World:
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def briefing(self, camera_mount_flu_m: Sequence[float]) -> Briefing:
-        """Return the companion's data before the first message."""
+        """Return the data that the companion gets before the first message."""
         places = (self.start_enu_m, self.goal_enu_m, self.bounds_enu_m, camera_mount_flu_m)
         start, goal, bounds, mount = (np.array(place, np.float64) for place in places)
         return Briefing(
@@ -136,7 +136,8 @@ class World:
 def _refuse_bad_place(name: str, boxes: Vector, bounds: Vector, what: str, place: Vector) -> None:
     """Raise PlaceError if a "start" or "goal" (3,) is outside the bounds (6,) or blocked.
 
-    A start is blocked if a box (n, 6) is too near to stand there, a goal if it is inside a box.
+    A start is blocked if a box (n, 6) is too close for the vehicle to stand there, a goal if it is
+    inside a box.
     """
     subject = f"world {name!r}: {what} {format_place(place)}"
     if not _inside(bounds, place):
