@@ -47,7 +47,7 @@ _MODULES = {  # name -> module that defines it
     "campaign": "mavfi_cli.library",
     "fly": "mavfi_cli.library",
     "inject": "mavfi_cli.fi.fault",
-    "load_run": "mavfi_cli.library",  # which shows runs in notebooks
+    "load_run": "mavfi_cli.library",  # also lets notebooks display runs
     "paired_golden": "mavfi_cli.mission.run",
     "run_campaign": "mavfi_cli.campaigns.run",
 }
@@ -63,5 +63,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the library with those of the module."""
+    """Return the module's names and the library's."""
     return sorted({*globals(), *__all__})

@@ -36,12 +36,12 @@ def fly(
 
     Args:
         config: Mission; None selects the defaults of `MissionConfig`.
-        out: Folder in which the run folder is made.
+        out: Folder in which the run folder is created.
         watcher: Receives progress and events.
-        recorder: Keeps what the nodes receive: depth frames, clouds, maps and plan requests.
-        repeat: Record of an instruction-level fault to strike again, instead of drawing one.
+        recorder: Records what the nodes receive: depth frames, clouds, maps and plan requests.
+        repeat: Record of an instruction-level fault to repeat instead of drawing a new one.
         settings: Fields of `MissionConfig` that replace those of `config`. `fault`, `instruction`
-            and `detector` are their dataclasses or mappings with the same keys.
+            and `detector` take their dataclasses, or mappings with the same keys.
 
     Raises:
         ConfigError: `MissionConfig` has no such setting. The message names the nearest.
@@ -85,8 +85,8 @@ class Campaign:
 
     Attributes:
         folder: Folder of the campaign, or its exported file.
-        table: One row per mission that is over, in the order of the campaign's list, with the
-            columns that `mavfi campaign export` writes.
+        table: One row per finished mission, in the order of the campaign's list, with the columns
+            that `mavfi campaign export` writes.
     """
 
     folder: Path
@@ -121,8 +121,8 @@ def campaign(what: str | Path) -> Campaign:
     """Read a campaign, even while it runs.
 
     Args:
-        what: Folder or exported .parquet file of a campaign, or the preset or TOML file whose
-            folder is campaigns/NAME.
+        what: Folder or exported .parquet file of a campaign, or a preset or TOML file whose
+            campaign folder is campaigns/NAME.
 
     Raises:
         UnknownName: There is no such folder or preset.

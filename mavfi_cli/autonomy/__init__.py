@@ -15,7 +15,7 @@ SMOOTHERS = ("ours", "release")
 
 
 def canonical_planner(name: str) -> str:
-    """Return the canonical name of a planner, under which records and groups list it.
+    """Return the canonical name of a planner, which records and groups use.
 
     For our own planners, case, hyphens, underscores and the star of RRT* do not matter. Any other
     name is returned unchanged.

@@ -4,9 +4,10 @@ The vehicle is a sphere. The check places spheres along the reference that the t
 so that they cover the swept capsule: spheres of radius sqrt(r^2 + (s/2)^2) at spacing s contain
 the capsule of radius r. Unknown space is free, as in MAVBench.
 
-If the check refuses far waypoints, it reports a waypoint that is not finite or too far away as a
-collision. Otherwise it looks for obstacles in the known map only, as MAVBench's ray casting does:
-it follows the path to a far waypoint up to `REACH_M` and skips a waypoint that is not finite.
+With `refuses_far_waypoints`, a waypoint that is not finite or is too far away counts as a
+collision. Otherwise the check looks for obstacles in the known map only, as MAVBench's ray casting
+does: it follows the path to a far waypoint for at most `REACH_M`, and skips a waypoint that is not
+finite.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class CollisionInputs:
     stamp_s: float
     snapshot: MapSnapshot
     trajectory: Trajectory | None
-    time_s: float  # present point on the trajectory, from its first waypoint
+    time_s: float  # time on the trajectory, since its first waypoint
     front_enu_m: FloatArray | None = None  # (3,) start of the checked path; None: the path's own
 
 
@@ -105,7 +106,7 @@ def _time_to_collision(
 ) -> float:
     """Return the time from `time_s` along the trajectory to the first contact, s; inf if free.
 
-    The result is never late, and early by one or two spacings at most.
+    The result is never late, and early by at most one or two spacings.
     """
     farthest_m = params.farthest_m
     if not params.refuses_far_waypoints:
@@ -132,14 +133,14 @@ def _time_to_collision(
 
 @np.errstate(over="ignore", invalid="ignore")  # waypoints may be corrupted
 def _shifted(trajectory: Trajectory, time_s: float, front_enu_m: FloatArray) -> Trajectory:
-    """Translate the trajectory so that its reference at `time_s` is at the front (3,)."""
+    """Translate the trajectory so that its reference at `time_s` is `front_enu_m` (3,)."""
     waypoints = trajectory.waypoints.copy()
     waypoints[:, 0:3] += front_enu_m - reference_waypoint(trajectory, time_s)[0:3]
     return replace(trajectory, waypoints=waypoints)
 
 
 def _castable(trajectory: Trajectory) -> Trajectory:
-    """Bound the trajectory to distances that a map can have.
+    """Limit the trajectory to distances and speeds that are possible inside a map.
 
     A far waypoint moves closer along the ray towards it, and a fast one is slowed down. A waypoint
     that is not finite is replaced by the previous position at rest.
@@ -176,7 +177,7 @@ def _within(vector: FloatArray, limit: float) -> FloatArray:
 
 
 class _SphereProbe:
-    """A sphere to test for contact at points of a map."""
+    """A sphere that can be tested for contact with a map at any point."""
 
     def __init__(self, snapshot: MapSnapshot, radius_m: float) -> None:
         tree = fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes())
@@ -264,7 +265,7 @@ def _sample_ahead(
 
 @compiled
 def _pieces(length_m: float, spacing_m: float) -> int:
-    """Return the number of pieces no longer than the spacing, from 1 to MAX_SAMPLES_A_PIECE."""
+    """Return the number of pieces that keeps to the spacing, from 1 to MAX_SAMPLES_A_PIECE."""
     wanted = length_m / spacing_m
     if not wanted < MAX_SAMPLES_A_PIECE:
         return MAX_SAMPLES_A_PIECE
@@ -288,7 +289,7 @@ def _bridge(
     at_s: float,
     spacing_m: float,
 ) -> int:
-    """Append a point, and points between it and the last one if that is far away."""
+    """Append a point, and intermediate points if the last one is far away. Return the new count."""
     pieces = 1
     if count > 0:
         last = points[count - 1]

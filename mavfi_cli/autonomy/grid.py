@@ -1,8 +1,8 @@
 """Obstacle grid for fast segment tests: occupied voxels dilated by the planning radius.
 
 A voxel is blocked if any point of it is closer than the radius to any point of an occupied voxel. A
-path through free voxels therefore keeps at least the radius from every mapped obstacle, and at most
-one voxel diagonal more than needed. Unknown space is free, as in MAVBench.
+path through free voxels therefore keeps at least the radius from every mapped obstacle. This margin
+is at most one voxel diagonal larger than needed. Unknown space is free, as in MAVBench.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ObstacleGrid:
         )
 
     def blended(self, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float) -> Self:
-        """Return the grid with the blocked voxels of `inner` within the radius of the centre."""
+        """Return the grid with its voxels within the radius of the centre taken from `inner`."""
         blocked = self.blocked.copy()
         resolution = self.resolution_m
         to_inner = np.rint((self.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
@@ -132,7 +132,7 @@ def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
 
 @compiled
 def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Blocked) -> None:
-    """Mark the voxels inside the grid of every leaf (x, y, z, size)."""
+    """Mark the voxels of every leaf (x, y, z, size) that lie inside the grid."""
     nx, ny, nz = occupied.shape
     for i in range(leaves.shape[0]):
         x, y, z = leaves[i, 0] - low[0], leaves[i, 1] - low[1], leaves[i, 2] - low[2]

@@ -31,7 +31,7 @@ from mavfi_cli.core.types import FloatArray
 
 _TIME_FACTOR = 6.5  # `magic_fabian_constant` of the release
 _CHECK_STEP_S = 0.1  # time between two points of the release's collision test
-_SHORTEST_M = 0.1  # a vertex nearer to its predecessor is left out
+_SHORTEST_M = 0.1  # a vertex closer to its predecessor or to the end is left out
 _TERMS = 8  # coefficients of a polynomial of degree 7
 _REACH = 10  # farthest non-zero entry from the diagonal of the spline's equations
 
@@ -41,7 +41,7 @@ class MinimumSnap:
     """A minimum-snap curve through the vertices of a path."""
 
     durations_s: FloatArray  # (n - 1,) of the segments
-    coefficients: FloatArray  # (n - 1, 8, 3) of u = t / duration, 0..1, in each segment
+    coefficients: FloatArray  # (n - 1, 8, 3) in u = t / duration, 0..1, for each segment
     free: bool  # True if all of the curve lies in free space
 
     @classmethod
@@ -59,7 +59,7 @@ class MinimumSnap:
 
         Args:
             is_free: returns True if a polyline (k, 3) lies in free space.
-            passes_max: largest number of passes; each one solves it again with one more vertex.
+            passes_max: largest number of passes; each further pass adds a vertex and solves again.
         """
         vertices = _distinct(path_enu_m)
         for _ in range(passes_max):
@@ -73,7 +73,7 @@ class MinimumSnap:
         return cls(durations_s=durations_s, coefficients=coefficients, free=blocked is None)
 
     def sampled(self, period_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return position, velocity and acceleration, (k, 3) each, at equal times from 0 on."""
+        """Return position, velocity and acceleration, (k, 3) each, every `period_s` from 0."""
         count = max(1, math.floor(float(self.durations_s.sum()) / period_s))
         times_s = np.arange(count, dtype=np.float64) * period_s
         position, velocity, acceleration = (
@@ -83,7 +83,7 @@ class MinimumSnap:
 
 
 def _distinct(path: FloatArray) -> FloatArray:
-    """Return the path (n, 3) with its ends, without vertices too near to their predecessors."""
+    """Return the path (n, 3) without inner vertices too close to their predecessor or the end."""
     kept = [path[0]]
     for vertex in path[1:-1]:
         if min(norm(vertex - kept[-1]), norm(path[-1] - vertex)) > _SHORTEST_M:
@@ -112,7 +112,7 @@ def _solve(vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray) 
 def _equations(
     vertices: FloatArray, durations_s: FloatArray, velocity: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return matrix (m, m) and right side (m, 3) of the equations for the coefficients."""
+    """Return the matrix (m, m) and right-hand side (m, 3) of the equations for the coefficients."""
     segments = len(durations_s)
     size = _TERMS * segments
     matrix, right = np.zeros((size, size)), np.zeros((size, 3))
@@ -144,10 +144,10 @@ def _equations(
 
 @compiled
 def _eliminate(matrix: FloatArray, right: FloatArray) -> None:
-    """Replace the right side (m, 3) by the solution of the banded equations.
+    """Replace the right-hand side (m, 3) with the solution of the banded equations.
 
-    This is Gaussian elimination with partial pivoting. The last digit of a solver of BLAS depends
-    on the processor.
+    This is Gaussian elimination with partial pivoting, because the last digit of a BLAS
+    solution depends on the processor.
     """
     size = len(matrix)
     for column in range(size):
@@ -174,7 +174,7 @@ def _eliminate(matrix: FloatArray, right: FloatArray) -> None:
 def _evaluate(
     spline: FloatArray, durations_s: FloatArray, times_s: FloatArray, order: int
 ) -> FloatArray:
-    """Return a derivative (k, 3) of the spline at the times (k,); order 0 is the position."""
+    """Return the derivative (k, 3) of that order at the times (k,); order 0 is the position."""
     ends_s = np.cumsum(durations_s)
     index = np.minimum(np.searchsorted(ends_s, times_s, side="right"), len(ends_s) - 1)
     lengths_s = durations_s[index][:, None]
@@ -190,7 +190,7 @@ def _evaluate(
 def _first_blocked(
     spline: FloatArray, durations_s: FloatArray, is_free: Callable[[FloatArray], bool]
 ) -> int | None:
-    """Return the first segment that is not free; None if all are free."""
+    """Return the index of the first segment that is not free; None if all are free."""
     for segment, duration_s in enumerate(durations_s.tolist()):
         within_s = np.append(np.arange(0.0, duration_s, _CHECK_STEP_S), duration_s)
         alone = spline[segment : segment + 1], durations_s[segment : segment + 1]

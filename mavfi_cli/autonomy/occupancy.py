@@ -89,10 +89,10 @@ class OccupancyMap:
         self._tree.setOccupancyThres(params.occupancy_threshold)
 
     def insert(self, cloud: PointCloud) -> None:
-        """Integrate one cloud: rays clear voxels, end points within the range mark them occupied.
+        """Integrate one cloud: rays clear voxels, and end points in range mark theirs as occupied.
 
         Points that are not finite, out of the octree's range or outside the height limits are
-        ignored. A cloud with such an origin is ignored as a whole.
+        ignored. A cloud with such an origin is ignored entirely.
         """
         self._stamp_s = cloud.stamp_s
         points = self._usable(cloud.points_enu_m)
@@ -128,7 +128,7 @@ class OccupancyMap:
         return np.ascontiguousarray(points if kept.all() else points[kept])
 
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
-        """Return True for coordinates in the octree's range less a ray's length; False for NaN."""
+        """Return True for coordinates over two ray lengths inside the octree; False for NaN."""
         limit = HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
         return np.abs(coordinates) < limit
 
@@ -151,14 +151,14 @@ class OccupancyMap:
 
 
 def _codes_of(points: FloatArray, resolution_m: float) -> Codes:
-    """Return the codes of the voxels of points (n, 3), without points that have none."""
+    """Return the voxel codes of points (n, 3), leaving out points that have none."""
     codes = np.empty(len(points), np.int64)
     return codes[: _morton_codes(np.asarray(points, np.float64), resolution_m, codes)]
 
 
 @compiled
 def _morton_codes(points: FloatArray, resolution: float, codes: Codes) -> int:
-    """Write the codes of the voxels of points (n, 3) and return their number.
+    """Write the voxel codes of points (n, 3) and return how many were written.
 
     Points that are not finite or outside the octree's range have no code. Coordinates are rounded
     to single precision first, as in OctoMap.

@@ -106,7 +106,7 @@ class PilotParams:
 
 
 class _ActivePlan:
-    """The active trajectory, its clock, and the present point on it.
+    """The active trajectory, its clock, and the current point on it.
 
     The clock may run slower than time, so that the vehicle slows down on the checked path. Its rate
     is ramped within the braking limit: along a path of planned speed v, a rate r gives the velocity
@@ -114,7 +114,7 @@ class _ActivePlan:
 
     Attributes:
         trajectory: Active trajectory; None while hovering.
-        time_s: Present point on the trajectory, from its first waypoint.
+        time_s: Time on the trajectory, since its first waypoint.
         rate: Trajectory seconds per second, 0..1.
         rate_change_per_s: Time derivative of the rate.
         pace: Factor on the clock's rate from the current command, 0..1.
@@ -132,7 +132,7 @@ class _ActivePlan:
         self.begin(None, time_s=0.0, rate=0.0)
 
     def begin(self, trajectory: Trajectory | None, *, time_s: float, rate: float) -> None:
-        """Fly a trajectory from `time_s` on with its clock at `rate`."""
+        """Follow a trajectory from `time_s`, with its clock at `rate`."""
         self.trajectory, self.time_s, self.rate = trajectory, time_s, rate
         self.rate_change_per_s, self.pace = 0.0, 1.0
 
@@ -147,7 +147,7 @@ class _ActivePlan:
         self.time_s += 0.5 * (before + self.rate) * step_s * self.pace
 
     def exchange(self, flown: Trajectory, changed: Trajectory) -> None:
-        """Replace a trajectory by a changed version, without a new collision check."""
+        """Replace a trajectory with a changed version, without a new collision check."""
         if self.trajectory is flown:
             self.trajectory = changed
         if self.checked is flown:
@@ -170,7 +170,7 @@ class _ActivePlan:
         return 0 if self.trajectory is None else self.waypoint_at(self.trajectory, self.time_s)
 
     def waypoint_at(self, trajectory: Trajectory, time_s: float) -> int:
-        """Return the index of a trajectory's waypoint at a time. The newest result is cached."""
+        """Return the index of a trajectory's waypoint at a time. The latest result is cached."""
         known, known_s, index = self._located
         if trajectory is not known or time_s != known_s:
             index = waypoint_index(trajectory, time_s)
@@ -186,12 +186,12 @@ class _ActivePlan:
         return reference_waypoint(self.trajectory, self.time_s + self.rate * ahead_s)
 
     def _planned_speed_mps(self) -> float:
-        """Return the planned speed at the present point at rate 1, limited to v_max."""
+        """Return the planned speed at the current point at rate 1, limited to v_max."""
         speed, limit = norm(self.reference()[4:7]), self._params.v_max_mps
         return min(speed, limit) if math.isfinite(speed) else limit
 
     def stopping_s(self) -> float:
-        """Return the time to brake from the present speed to rest, s."""
+        """Return the time to brake from the current speed to rest, s."""
         return self.rate * self._planned_speed_mps() / self._params.brake_mps2
 
 
@@ -199,7 +199,7 @@ class Pilot:
     """The mission state machine. Pass it every message, then call `update` once per control tick.
 
     Attributes:
-        active: Active trajectory and the present point on it.
+        active: Active trajectory and the current point on it.
     """
 
     def __init__(self, params: PilotParams, goal_enu_m: FloatArray) -> None:
@@ -319,7 +319,7 @@ class Pilot:
         self._next = result
 
     def _is_new(self, plan: Trajectory) -> bool:
-        """Return True if a plan's numbers are new and include the newest predicted collision.
+        """Return True if a plan is new and accounts for the newest predicted collision.
 
         A pilot that owns its numbers stores a plan's trajectory_seq before it checks the other
         number, as the released follow_trajectory.cpp does.
@@ -340,7 +340,7 @@ class Pilot:
         self.plan_lost()
 
     def plan_lost(self) -> None:
-        """Request another plan after the planner died with the pending request."""
+        """Request another plan after the planner died before it answered the pending request."""
         if self._awaiting_plan:
             self._awaiting_plan = False
             self._wanted = True

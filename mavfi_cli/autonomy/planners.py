@@ -5,8 +5,8 @@ and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
 
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
 search resets that sequence first and creates its generators afterwards, so its result depends only
-on problem and seed. OMPL warns that earlier generators keep their seeds; none of them is used. The
-search stops after a number of iterations; it has no time limit.
+on the problem and the seed. OMPL warns that earlier generators keep their seeds; none of them is
+used. The search stops after a number of iterations; it has no time limit.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class PlanningProblem:
     ) -> Self:
         """Build the problem of flying from start to goal, each (3,), inside the bounds (6,).
 
-        The bounds are widened to hold the start, as in MAVBench. If the start is too close to an
+        The bounds are widened to include the start, as in MAVBench. If the start is too close to an
         obstacle, the planning radius within `escape_radius_m` of it shrinks stepwise (3/4, 1/2,
         1/4, 0) until the start is free, so that the vehicle can leave. A goal too close to an
         obstacle stays blocked.
@@ -115,7 +115,7 @@ class PlanResult:
 
 
 class Planner(Protocol):
-    """A path planner whose result depends only on problem and seed."""
+    """A path planner whose result depends only on the problem and the seed."""
 
     @property
     def name(self) -> str:
@@ -140,8 +140,8 @@ def plan(
 ) -> Trajectory | PlanFailure:
     """Plan from the request's position to its goal.
 
-    If the vehicle departs in motion and cannot stop in free space, there is no trajectory. It must
-    brake first.
+    If the vehicle is moving and cannot stop in free space, the result is a failure: it must brake
+    first.
 
     Args:
         request: Start, goal, and the numbers of the trajectory.
@@ -201,12 +201,12 @@ class _Search:
 class _OmplPlanner:
     """One of OMPL's planners. It runs its searches in order until one returns a path.
 
-    A straight line from start to goal is the path if it is free.
+    If the straight line from start to goal is free, it is the path.
     """
 
     name: str
     kind: Any  # class of `ompl.geometric`
-    settings: Mapping[str, float]  # argument of each of its setters
+    settings: Mapping[str, float]  # name of a setter -> its argument
     searches: tuple[_Search, ...]
 
     def plan(self, problem: PlanningProblem, seed: int) -> PlanResult:
@@ -292,7 +292,7 @@ def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanR
 
 
 _GOAL_BIAS = {"setGoalBias": 0.05}  # OMPL's default
-_FIRST_SOLUTION = (_Search(iterations=5000, range_m=10.0),)  # shorter steps than OMPL's: dense maps
+_FIRST_SOLUTION = (_Search(iterations=5000, range_m=10.0),)  # for dense maps, shorter than OMPL's
 _OURS = {
     planner.name: planner
     for planner in (
@@ -324,7 +324,7 @@ def find(name: str) -> Planner:
 
     Raises:
         UnknownName: No planner has this name. The message suggests the nearest.
-        MavfiError: Its package does not load.
+        MavfiError: The package of the planner cannot be loaded.
     """
     plain = canonical_planner(name)
     if plain in _OURS:

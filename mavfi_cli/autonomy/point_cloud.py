@@ -1,7 +1,7 @@
 """Point cloud generation: back-projects a depth image into the world.
 
 The camera is a pinhole with square pixels and the principal point in the middle of the image, as in
-ROS's depth_image_proc. A pixel (row, column) of depth d along the optical axis lies at
+ROS's depth_image_proc. A pixel (row, column) with depth d along the optical axis lies at
 (d, -(column + 1/2 - columns/2) d / f, -(row + 1/2 - rows/2) d / f) in camera FLU, with
 f = columns / (2 tan(hfov / 2)).
 """
@@ -38,8 +38,8 @@ class PointCloudParams:
 def generate(frame: DepthFrame, params: PointCloudParams) -> PointCloud:
     """Compute the world points of a depth image.
 
-    Pixels that are NaN, negative, zero or -inf are dropped. Pixels of +inf (nothing in range) and
-    beyond the range become clearing rays that end outside `max_range_m`.
+    Pixels that are NaN, negative, zero or -inf are dropped. Pixels that are +inf (nothing in range)
+    or beyond the range become clearing rays that end outside `max_range_m`.
     """
     rows, columns = frame.depth_m.shape
     focal_px = columns / (2.0 * math.tan(frame.hfov_rad / 2.0))

@@ -3,22 +3,23 @@
 On each straight segment of the path the vehicle accelerates constantly, cruises, and brakes
 constantly. One blend of constant acceleration cuts each corner, from velocity c u_1 to c u_2 (c the
 corner speed, u the directions). It lasts |c u_2 - c u_1| / a, starts and ends
-h = c^2 sin(theta / 2) / a from the corner, and passes the corner at c^2 sin(theta / 2)^2 / (2 a).
-The velocity is continuous. The norms of velocity and acceleration keep their limits exactly,
-because the velocity inside a blend is a convex combination of the velocities at its ends.
+h = c^2 sin(theta / 2) / a from the corner, and passes it at a distance of
+c^2 sin(theta / 2)^2 / (2 a). The velocity is continuous. The norms of velocity and acceleration
+never exceed their limits, because the velocity inside a blend is a convex combination of the
+velocities at its ends.
 
-The samples of this motion at equal times are the control points of a uniform quadratic B-spline,
-and the knots of the spline are the waypoints. Interpolated as in `tracking` (p + v t + a t^2 / 2),
-the waypoints are exactly that spline. Between the waypoints, the following holds as well:
+The samples of this motion at equal intervals are the control points of a uniform quadratic
+B-spline, and the knots of the spline are the waypoints. Interpolated as in `tracking`
+(p + v t + a t^2 / 2), the waypoints are exactly that spline. Between them, the following holds:
 
-- speed and acceleration never exceed those of the motion that was sampled: each is an average
-  of it;
+- speed and acceleration never exceed those of the sampled motion, because each is an average
+  over that motion;
 - position and velocity are continuous, and each piece lies in the triangle of three control
   points, within a T^2 / 8 (9 cm) of the motion;
-- it starts at exactly the given position and velocity and ends at rest on the last point.
+- the spline starts at exactly the given position and velocity and ends at rest on the last point.
 
-If a piece is not free, the corners that it rounds are slowed down, in the limit to a stop on the
-corner itself, which lies on the free path.
+If a piece is not free, the vehicle slows down at the corners that it rounds, in the limit to a stop
+on the corner itself, which lies on the free path.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ SLOWEST_SQUARED = 0.1  # a corner slower than this (squared, m^2/s^2) becomes a 
 class SmoothingParams:
     """Limits and sampling of trajectories.
 
-    v_max, a_max, the yaw rate and the 0.5 s of the samples are those of the released code
+    v_max, a_max, the yaw rate and the sample period of 0.5 s are those of the released code
     (MAVBench/MAV_apps, branch mavfi). The shares leave the tracker room to catch up. The vertical
     limits are those of common autopilots.
     """
@@ -86,7 +87,7 @@ def smooth(
     line, period, a = _Polyline(vertices, params), params.sample_period_s, params.acceleration_mps2
     speed = norm(velocity)
     before = path[0] - 0.5 * period * velocity
-    # squared speeds that cut each corner by `corner_cut_m` at most
+    # squared speeds at which each corner is cut by at most `corner_cut_m`
     caps = 2.0 * a * params.corner_cut_m / np.maximum(line.half_sines, 1e-6) ** 2
     for _ in range(params.passes_max):
         q = _squared_corner_speeds(line, speed, caps, a)
@@ -107,7 +108,7 @@ def smooth_as_released(
 ) -> tuple[Trajectory, bool]:
     """Compute the released planner's trajectory along a free path (n, 3), as `smooth` does.
 
-    One point differs. The release gives a waypoint the position of the next sample, and ours has
+    One point differs. The release gives a waypoint the position of the next sample. Ours has the
     position, velocity and acceleration of one moment, because our reference moves between waypoints
     (see `tracking`).
     """
@@ -262,7 +263,7 @@ class _Motion:
         self.add((end - begin) / rate, begin * direction, rate * direction)
 
     def position(self, times_s: FloatArray) -> FloatArray:
-        """Return positions (k, 3) at the times (k,). After its end the motion rests there."""
+        """Return positions (k, 3) at the times (k,). After its end the motion stays at rest."""
         starts_s, positions, velocities, accelerations, _ = map(
             np.array, zip(*self._rows, strict=True)
         )
@@ -275,7 +276,7 @@ class _Motion:
         return position
 
     def corners_during(self, begin_s: float, end_s: float) -> set[int]:
-        """Return the vertices of the phases in an interval of time."""
+        """Return the vertices of the phases that overlap a time interval."""
         starts_s = [row[0] for row in self._rows]
         ends_s = [*starts_s[1:], self.duration_s]
         return {
@@ -357,7 +358,7 @@ def _sampled(
     request: PlanRequest,
     params: SmoothingParams,
 ) -> Trajectory:
-    """Return the trajectory of samples (n, 3) that are one sample period apart, for a request."""
+    """Build the trajectory for a request from samples (n, 3) one sample period apart."""
     period = params.sample_period_s
     yaws = _headings(positions_enu_m, request.yaw_rad, params.yaw_rate_max_radps * period)
     states = [positions_enu_m, yaws, velocities_enu_mps, accelerations_enu_mps2]
@@ -373,8 +374,8 @@ def _sampled(
 def _headings(positions: FloatArray, start_yaw_rad: float, turn_max_rad: float) -> FloatArray:
     """Return the yaw (n,) of waypoints at positions (n, 3), continuous from `start_yaw_rad`.
 
-    Each yaw points to the position two waypoints later, or to the first later position that is far
-    enough if that one is too near. The yaw stays constant at the end. It turns by at most
+    Each yaw points to the position two waypoints later or, if that is too near, to the first later
+    position that is far enough. The yaw stays constant at the end. It turns by at most
     `turn_max_rad` from one waypoint to the next.
     """
     yaws = np.empty(len(positions))

@@ -17,17 +17,17 @@ Control acts on the position error e:
 The clock of the trajectory runs at `rate`. At a rate r that changes by dr/dt, the reference has the
 velocity r v and the acceleration r^2 a + dr/dt v.
 
-With `stretches_clock`, a command that the speed limit clips has the ratio of clipped to demanded
-speed as its `pace`. The trajectory's clock runs slower by this factor while the command holds, so
-that a waypoint lasts until its distance is flown, as in the released common.cpp. That code flies a
-waypoint in slices of 10 ms and sleeps through a stretched slice. Its C++ library (ROS Kinetic, GCC
-5) passes a slice of 2^63 s or more to nanosleep as a negative number of seconds. nanosleep rejects
-it, so the slice and the waypoint end at once.
+With `stretches_clock`, the `pace` of a command clipped by the speed limit is the ratio of clipped
+to demanded speed. The trajectory's clock runs slower by this factor while the command holds, so
+that a waypoint lasts until its distance is covered, as in the released common.cpp. That code flies
+a waypoint in slices of 10 ms and sleeps through a stretched slice. Its C++ library (ROS Kinetic,
+GCC 5) passes a slice of 2^63 s or more to nanosleep as a negative number of seconds. nanosleep
+rejects it, so the slice and the waypoint end at once.
 
 A slice of 10 ms of the trajectory can take longer than 10 ms, because the released follower calls
-the simulator in every slice. `slice_period_s` is the time that it takes. The clock then runs at the
-ratio 0.01 / slice_period_s, but the commanded velocity is that of the waypoint, so the vehicle runs
-ahead of the reference until the position error balances the difference.
+the simulator in every slice. `slice_period_s` is the time that a slice takes. The clock then runs
+at the ratio 0.01 / slice_period_s, but the commanded velocity is that of the waypoint, so the
+vehicle runs ahead of the reference until the position error balances the difference.
 
 A term of a corrupted reference that is not finite is left out: the position error, the velocity or
 the acceleration of that axis counts as zero, and the last yaw is kept. Position and velocity
@@ -54,8 +54,8 @@ ENDLESS_S = 2.0**63  # a slice of this length overflows a signed 64-bit number o
 def reference_waypoint(trajectory: Trajectory, time_s: float) -> FloatArray:
     """Return the reference (10,), in the order of WAYPOINT_FIELDS, `time_s` after the start.
 
-    Before the start it is the first waypoint, after the end the last point at rest. Corrupted
-    waypoints are used unchanged.
+    Before the start this is the first waypoint, and after the end it is the last point, at rest.
+    Corrupted waypoints are used unchanged.
     """
     out = np.empty(10)
     _reference(trajectory.waypoints, trajectory.durations_s, time_s, out)
@@ -175,7 +175,7 @@ class TrackingInputs:
     position_enu_m: FloatArray  # (3,)
     velocity_enu_mps: FloatArray  # (3,)
     trajectory: Trajectory | None  # None: hold
-    time_s: float = 0.0  # point on the trajectory, from its first waypoint
+    time_s: float = 0.0  # time on the trajectory, since its first waypoint
     rate: float = 1.0  # trajectory seconds per second
     rate_change_per_s: float = 0.0
     hold_enu_m: FloatArray  # (3,) position to hold without a trajectory
@@ -284,7 +284,7 @@ def _demanded_mps(law: tuple[Any, ...], limits: tuple[float, float, float]) -> f
     `law` and `limits` are the arguments of `track` before and after the speed limit.
     """
     out = np.empty(10)
-    track(*law, math.inf, *limits, out)  # type: ignore[call-arg]  # `law` has twelve
+    track(*law, math.inf, *limits, out)  # type: ignore[call-arg]  # `law` has twelve arguments
     largest = max(abs(out[0]), abs(out[1]), abs(out[2]))
     if largest == 0.0:
         return 0.0

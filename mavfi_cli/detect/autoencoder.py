@@ -39,7 +39,7 @@ _WORK = _B3 + COUNT
 
 @compiled
 def _reconstruction_error(memory: FloatArray, deltas: Codes) -> float:
-    """Return the mean squared reconstruction error. Memory from `_WORK` on is scratch space."""
+    """Return the mean squared reconstruction error. `memory[_WORK:]` is scratch space."""
     work = memory[_WORK:]
     for place in range(COUNT):
         work[place] = deltas[place] / memory[_SCALE + place]
@@ -98,7 +98,7 @@ def _judge_plan(
 class AutoencoderDetector(FittedDetector):
     """Autoencoder-based anomaly detection.
 
-    Weights are (outputs, inputs).
+    Weight matrices have shape (outputs, inputs).
     """
 
     name: ClassVar[str] = "aad"

@@ -3,8 +3,8 @@
 A model file is a fitted detector with its provenance in JSON. Reading is strict.
 
 Our detectors keep their state in one flat array. A cheap one scores a whole tick, or a whole plan,
-in one compiled call. The call overhead is larger than the arithmetic, and several times larger in
-flight, where caches hold other data.
+in one compiled call, because the call overhead exceeds the arithmetic. In flight, where caches hold
+other data, the overhead is several times larger.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SCHEMA = 2
 SHIPPED = Path(__file__).parent / "models"  # one folder per stack
 DEFAULT_STACK = "mavbench"  # stack of the default models
 # An entry point names a function that creates a detector. It takes the arguments of
-# `find_detector` but the name.
+# `find_detector` except the name.
 PLUG_INS = PlugIns("mavfi.detectors", "detector")
 
 
@@ -84,7 +84,7 @@ def find_detector(
 
     Raises:
         UnknownName: No detector has this name. The message suggests the nearest.
-        MavfiError: Its package does not load.
+        MavfiError: The package of the detector cannot be loaded.
         ModelError: The model file cannot be used.
         ConfigError: The threshold is out of range.
     """
@@ -93,7 +93,7 @@ def find_detector(
 
 
 def checked_threshold(value: float, key: str = "threshold") -> float:
-    """Return a threshold that is a finite number above 0.
+    """Check that a threshold is a finite number above 0, and return it.
 
     Raises:
         ConfigError: The threshold is not finite or not above 0.
@@ -110,7 +110,7 @@ class Model:
     schema: int = SCHEMA
     mavfi: str = field(default_factory=lambda: version("mavfi"))
     detector: str  # kind: gad, aad, range or l2
-    arrays: dict[str, Any]  # arrays of float64, which a file holds as lists
+    arrays: dict[str, Any]  # arrays of float64, stored in a file as lists
     stack: StackMark  # stack of the flights it was fitted to
     extended: Ranges  # ranges of the extended states in these flights
     states: str = STATES_DIGEST
@@ -124,7 +124,7 @@ class Model:
 
     @property
     def training_flights(self) -> list[str]:
-        """Flights `world/seed` from which the model was made, over all parts of its split."""
+        """Flights (`world/seed`) that the model was made from, over all parts of its split."""
         parts = self.provenance.get("split", {})
         if not isinstance(parts, Mapping):
             return []
@@ -143,7 +143,7 @@ class Model:
 
     @classmethod
     def read(cls, path: Path) -> Model:
-        """Read a model file of any kind, made by any version with this schema.
+        """Read the model file of any detector, written by any version with this schema.
 
         Raises:
             ModelError: The file cannot be read, is corrupt, or has another schema.
@@ -155,7 +155,7 @@ class Model:
         except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
             raise ModelError("corrupt model file: not JSON", path=path) from None
         if not isinstance(data, dict):
-            raise ModelError("corrupt model file: no JSON object", path=path)
+            raise ModelError("corrupt model file: not a JSON object", path=path)
         if (schema := data.get("schema", SCHEMA)) != SCHEMA:
             raise ModelError(f"model schema must be {SCHEMA!r}, got {schema!r}", path=path)
         if odd := set(data) ^ {key.name for key in fields(cls)}:
@@ -238,7 +238,7 @@ def _listed(name: str, path: Path | None) -> DetectorListing:
         if path is None:
             return row
         model = Model.read(path)
-    except MavfiError as error:  # of the model, or of a plug-in that does not load
+    except MavfiError as error:  # from the model, or from a plug-in that cannot be loaded
         return replace(row, description=f"cannot be used: {error}")
     provenance, flights = model.provenance, model.training_flights
     seeds = sorted({int(end) for f in flights if (end := f.rpartition("/")[2]).isdigit()})
@@ -267,8 +267,8 @@ class FittedDetector:
     """A detector with its state in one flat array, which compiled code takes as one argument.
 
     Attributes:
-        flat: All of the memory as one array, the argument of compiled code.
-        shapes: Names and shapes of the parts of the memory, in their order. The first part is the
+        flat: The whole memory as one array, which is passed to compiled code.
+        shapes: Names and shapes of the parts of the memory, in order. The first part is the
             threshold, a single number.
         divisors: Parts, besides the threshold, whose numbers must all be above 0.
         scratch: Number of scratch elements for compiled code after the parts.
@@ -309,9 +309,9 @@ class FittedDetector:
 
     @classmethod
     def build(cls, *, model: Path | None = None, threshold: float | None = None) -> Self:
-        """Create the detector of a model file; see `find_detector`.
+        """Create the detector from a model file; see `find_detector`.
 
-        Without a file it uses the model that is shipped for the default stack.
+        Without a file it uses the model shipped for the default stack.
         """
         path = shipped(cls.name) if model is None else model
         loaded = Model.read(path)

@@ -4,10 +4,10 @@ Flights are split by seed into three disjoint parts: `train` fits weights, means
 `validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds.
 
 Only the autoencoder needs torch: `pip install mavfi[train]`. Adam minimises the mean squared
-reconstruction error of all distinct error-free vectors in one batch, from several initial weights.
-The threshold will be the largest error, so the training keeps the weights, over all epochs and
-starts, with the lowest largest error on the validation vectors. It runs on one thread in double
-precision with a fixed seed, so the same data and the same version of torch give the same weights.
+reconstruction error of all distinct error-free vectors in one batch, starting from several sets of
+random weights. The threshold will be the largest error, so training keeps the weights whose largest
+error on the validation vectors is lowest over all epochs and starts. It runs on one thread in
+double precision with a fixed seed, so the same data and version of torch give the same weights.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FLIGHTS_MIN = 10
 KINDS = ("gad", "aad", "range", "l2")
 # Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
-# The Gaussian model goes on learning in flight, which moves the distance of the same step.
+# The Gaussian model keeps learning in flight, so the distance of the same step changes.
 _LEARNING = 1.02
 # Two reports can arrive between two ticks, so a sequence number may increase by two.
 _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
@@ -66,11 +66,11 @@ def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) ->
 
 
 def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = None) -> Model:
-    """Fit one kind of detector. Raises as `check`.
+    """Fit one kind of detector. Raises the same errors as `check`.
 
     Args:
-        n_sigma: Threshold of the Gaussian model. None selects the smallest integer that the
-            flights of the third part stay 2 % below, and at least `gaussian.N_SIGMA`.
+        n_sigma: Threshold of the Gaussian model. None selects the smallest integer at least 2 %
+            above all scores of the third part, but no less than `gaussian.N_SIGMA`.
     """
     check([kind], len(dataset), n_sigma)
     flights, parts = dataset.flights, _split(dataset, seed)
@@ -113,7 +113,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
 
 def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
-    """Split by flight, in the same way for each world. Return the indices by their use."""
+    """Split by flight, in similar proportions for each world. Return the indices by use."""
     drawn = Stream.MISSION.generator(seed, "detector-split").permutation(len(dataset))
     worlds = [dataset.flights[place].world for place in drawn]
     ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
@@ -124,7 +124,7 @@ def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
 
 
 def _scale_of(flights: Sequence[FlightSamples]) -> FloatArray:
-    """Return the largest |delta| in each state's group (COUNT,), at least 1.
+    """Return the largest |delta| in each state's group (COUNT,), at least `_LEAST_SCALE`.
 
     The scaled inputs lie within about +-1. The components of a vector share one scale, because each
     component may take the values of the others.
@@ -139,8 +139,8 @@ def _mirrored(flights: Sequence[FlightSamples]) -> NDArray[np.int64]:
 
     The training worlds have their goals north-east of the start, but no direction is special. The
     images mirror east, mirror north, and swap the two. A mirrored velocity or position has the
-    negated code. Yaw is negated with north. Its delta stays unchanged under the other two, which is
-    an approximation.
+    negated code. Mirroring north also negates yaw. The other two leave the yaw delta unchanged,
+    which is an approximation.
     """
     deltas = np.concatenate([flight.deltas for flight in flights])
     rows = np.unique(deltas.astype(np.int64), axis=0)
@@ -158,7 +158,7 @@ def _mirrored(flights: Sequence[FlightSamples]) -> NDArray[np.int64]:
 def _largest(detector: Detector, flights: Sequence[FlightSamples]) -> float:
     """Return the largest score of the flights.
 
-    For a detector with one score over all states it includes the mirror images.
+    For a detector with one score over all states, mirror images are included.
     """
     if detector.per_stage:
         return max(float(flight.scores(detector).max(initial=0.0)) for flight in flights)
@@ -204,7 +204,7 @@ Trained = tuple[dict[str, FloatArray], dict[str, Any]]  # weights by name, and t
 
 
 def _train_autoencoder(inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
-    """Train on scaled vectors (n, 13) and keep the best weights for the validation (m, 13)."""
+    """Train on scaled vectors (n, 13); return the best weights on validation vectors (m, 13)."""
     import torch
 
     threads = torch.get_num_threads()
@@ -227,7 +227,7 @@ def _train_once(torch: Any, inputs: FloatArray, validation: FloatArray, seed: in
         weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
 
     def loss_of(rows: Any) -> Any:
-        """Return the mean squared error (n,) of each of the vectors (n, COUNT)."""
+        """Return the mean squared error (n,) of each vector (n, COUNT)."""
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]

@@ -1,4 +1,4 @@
-"""The gate: every message passes it before it takes effect, and may raise an alarm.
+"""The gate that every message passes before it takes effect, and that may raise an alarm.
 
 A message that raises an alarm does not become the reference, and the detector does not learn it.
 The caller withholds the message and recomputes the stage. If recomputation confirms the message,
@@ -6,12 +6,12 @@ the caller accepts it with `accept_report`, `accept_plan` or `accept_tick`, and 
 the reference.
 
 The alarm of a per-stage detector (`Detector.per_stage`) names the stage with anomalous states. A
-detector over all stages scores one vector: of a report on its arrival, and of each tick together
-with the report that arrived since the last tick. Its alarm always names control (paper, section
-V-D). The gate also checks a plan as a whole. Such an alarm names the waypoint to drop.
+detector over all stages scores one vector when a report arrives, and one at each tick, which
+includes a report received since the last tick. Its alarm always names control (paper, section V-D).
+The gate also checks a plan as a whole. Such an alarm names the waypoint to drop.
 
 An extended watch checks the extended states of reports and plans one by one before the detector
-scores the message. Its alarm names the stage of the message for every detector.
+scores the message. Whatever the detector, its alarm names the stage of the message.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class _ExtendedWatch:
     """Judges each extended state by its range of changes in error-free flights.
 
     The change since the last accepted message must lie between the smallest and the largest change
-    in the training flights. All counters begin at 0 without a predicted collision, so the first
-    message is judged, too. A planner with its own counter also counts plans that never took effect.
-    After n messages that were not accepted, n + 1 changes may therefore add up.
+    in the training flights. All counters begin at 0 and no collision is predicted, so even the
+    first message is judged. A planner that owns its counter also counts plans that never took
+    effect. After n messages that were not accepted, n + 1 changes may therefore add up.
 
     Attributes:
         memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
@@ -69,7 +69,7 @@ class _ExtendedWatch:
         self._accepted: dict[float, Trajectory] = {}  # plans by their stamps
 
     def judge(self, message: CollisionReport | Trajectory) -> Alarm | None:
-        """Judge a message on its arrival. `accept` or `lose` must follow."""
+        """Judge a message on arrival. The caller must then call `accept` or `lose`."""
         return self._judge(message, self.memory[0].tolist(), self._lost[type(message)] + 1)
 
     def accept(self, message: CollisionReport | Trajectory) -> None:
@@ -179,7 +179,7 @@ class Gate:
         return {**own, **self.detector.memory}
 
     def judge_report(self, report: CollisionReport) -> Alarm | None:
-        """Judge a collision report on its arrival."""
+        """Judge a collision report on arrival."""
         preprocess.take_report(report.time_to_collision_s, report.future_collision_seq, self._work)
         self.fresh = (Stage.PERCEPTION,)
         self._pending = False
@@ -213,7 +213,7 @@ class Gate:
         return self._settled(trajectory, alarm)
 
     def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
-        """Pass the extended watch the fate of a judged message. Return the alarm."""
+        """Report to the extended watch whether a judged message passed. Return the alarm."""
         if self._watch is not None:
             self._watch.accept(message) if alarm is None else self._watch.lose(type(message))
         return alarm
@@ -224,15 +224,15 @@ class Gate:
             self._watch.lose(Trajectory)
 
     def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
-        """Judge the steps of the active plan from the present waypoint on.
+        """Judge the steps of the active plan, starting at waypoint `first`.
 
-        The caller does this for every detector each time a node that looks ahead gets the plan,
-        because the collision check uses a corrupted waypoint long before it is flown. The call does
-        not change the gate, and the detector does not learn.
+        Whatever the detector, call this each time a node that looks ahead gets the plan, because
+        the collision check uses a corrupted waypoint long before the vehicle reaches it. The call
+        does not change the gate, and the detector does not learn.
 
         Returns:
             Alarm of the first bad step, which names the waypoint to drop, or alarm about extended
-            states that differ from the accepted plan's.
+            states that differ from those of the accepted plan.
         """
         if Stage.PLANNING not in self.protect:
             return None
@@ -255,7 +255,7 @@ class Gate:
         return self._alarm(stage, scores[number], deltas, waypoint)
 
     def _score_steps(self, trajectory: Trajectory, first: int) -> list[float]:
-        """Return the scores of the steps with a changed code; `_steps` and `_changes` hold them."""
+        """Return the scores of steps with a changed code, which fill `_steps` and `_changes`."""
         waypoints = trajectory.waypoints
         if len(waypoints) > len(self._steps):
             self._steps = np.empty(len(waypoints), np.int64)
@@ -274,7 +274,7 @@ class Gate:
     def judge_tick(
         self, trajectory: Trajectory | None, index: int, command: Command
     ) -> Alarm | None:
-        """Judge the present waypoint and the command before it is sent.
+        """Judge the current waypoint and the command, before the command is sent.
 
         A waypoint is a new sample if its trajectory or index differs from the last accepted one. If
         its stage raises an alarm, the command computed from it is not judged.
@@ -318,18 +318,18 @@ class Gate:
         return 0.0, PASSED
 
     def accept_report(self) -> None:
-        """Accept the last judged report in spite of its alarm. It becomes the reference."""
+        """Accept the last judged report despite its alarm. It becomes the reference."""
         self._refer(Stage.PERCEPTION, preprocess.CODE)
         if self._watch is not None and self._report is not None:
             self._watch.accept(self._report)
 
     def accept_plan(self, trajectory: Trajectory) -> None:
-        """Accept a published plan in spite of its alarm."""
+        """Accept a published plan despite its alarm."""
         if self._watch is not None:
             self._watch.accept(trajectory)
 
     def accept_tick(self) -> None:
-        """Accept the last judged waypoint and command in spite of an alarm."""
+        """Accept the last judged waypoint and command despite an alarm."""
         for stage in self.fresh:
             if stage is not Stage.PERCEPTION:
                 self._refer(stage, preprocess.CODE)
@@ -355,7 +355,7 @@ class Gate:
         )
 
     def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:
-        """Return the states that are anomalous alone, worst first, or else all that changed."""
+        """Return the states that are anomalous alone, or else all that changed; worst first."""
         first, end = SPANS[stage] if self._per_stage else (0, COUNT)
         alone: list[tuple[float, int]] = []
         for place in range(first, end):

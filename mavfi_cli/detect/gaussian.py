@@ -62,7 +62,7 @@ def _farthest(memory: FloatArray, deltas: Codes, first: int, end: int) -> float:
 
 @compiled
 def _welford(memory: FloatArray, deltas: Codes, first: int, end: int) -> None:
-    """Add one sample to the model of each state from `first` up to, not including, `end`."""
+    """Add one sample to the model of each state from `first` up to but not including `end`."""
     for place in range(first, end):
         value = float(deltas[place])
         count = memory[_COUNT + place] + 1.0
@@ -134,7 +134,7 @@ class GaussianDetector(FittedDetector):
 
     @classmethod
     def cold(cls, n_sigma: float = N_SIGMA) -> GaussianDetector:
-        """Create a detector that has not learned any sample."""
+        """Create a detector that has not learned from any sample."""
         arrays = {name: np.zeros(shape) for name, shape in cls.shapes.items()}
         arrays["n_sigma"][0] = n_sigma
         for stage, floor in SIGMA_FLOORS.items():

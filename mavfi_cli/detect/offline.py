@@ -1,4 +1,4 @@
-"""Recorded flights: their traces replayed through the gate, and data sets of their samples.
+"""Replays of recorded flights through the gate, and data sets of their samples.
 
 A replay gives the scores of a detector, and the samples of error-free flights to fit models to. One
 row of a data set is one judged message: a collision report, a control tick, or one step of a
@@ -9,7 +9,7 @@ monitored state by its name (NaN or masked before the first message with the sta
 columns `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s` identify a new message with
 unchanged values. Without them a message counts as new if one of its values changes.
 
-A trace contains only the present waypoint, but the gate also judges the active plan. The replay
+A trace contains only the current waypoint, but the gate also judges the active plan. The replay
 does the same if it gets the published plans and the changes that a fault made to the active one.
 """
 
@@ -69,7 +69,7 @@ class _Judgement:
 
 
 class _Probe:
-    """Wraps a detector, or none, and keeps the highest score since `take_highest`."""
+    """Wraps a detector or None, and keeps the highest score since the last `take_highest`."""
 
     def __init__(self, detector: Detector | None) -> None:
         self._detector = detector
@@ -80,7 +80,7 @@ class _Probe:
         self.highest = -np.inf
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the detector's score, or 0 without one. Keep it if it is the highest or NaN."""
+        """Return the detector's score, or 0 without a detector. Keep it if it is highest or NaN."""
         score = 0.0 if self._detector is None else self._detector.score(deltas, stage)
         if not score <= self.highest:
             self.highest = score
@@ -113,11 +113,11 @@ def replay(
 
     Args:
         detector: New detector; None computes only the deltas.
-        patience: Maximum number of consecutive alarms for one kind of message. The next message is
-            accepted. With 0 every message becomes the reference, so that scores do not depend on
-            the threshold.
+        patience: Maximum number of consecutive alarms for one kind of message. The message that
+            raises one more is accepted. With 0, every message becomes the reference, so that scores
+            do not depend on the threshold.
         plans: Published plans. The active plan is judged when it is new, when a waypoint begins,
-            and when a fault strikes it. The score is part of the tick's.
+            and when a fault strikes it. Its score counts towards the tick's.
         strikes: Changes that a fault made to plans after their publication.
 
     Raises:
@@ -170,7 +170,7 @@ class _FlownPlans:
         self._waypoints = _reals(trace["waypoint_index"])
 
     def ahead(self, row: int, stamp_s: float) -> tuple[Trajectory, int] | None:
-        """Return the plan to judge and its present waypoint; None if the gate does not judge."""
+        """Return the plan to judge and its current waypoint; None if there is none to judge."""
         if not self._plans:
             return None
         while self._strikes and self._strikes[0].stamp_s <= stamp_s + 1e-9:
@@ -231,7 +231,7 @@ class _Messages:
         )
 
     def waypoint(self, row: int) -> Trajectory | None:
-        """Return a trajectory of the present waypoint only, the same object until it changes."""
+        """Return a trajectory of only the current waypoint, the same object until it changes."""
         if self._new_waypoint[row]:
             self._trajectory = Trajectory(
                 stamp_s=self.stamps_s[row],
@@ -265,7 +265,7 @@ def _present(column: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _changes(values: FloatArray, trace: Columns, markers: tuple[str, ...]) -> NDArray[np.bool_]:
-    """Return True for rows (n,) whose values or marker columns differ from the last row."""
+    """Return True for rows (n,) whose values or marker columns differ from the previous row."""
     marked = [_reals(trace[name]) for name in markers if name in trace]
     patterns = np.column_stack([values, *marked]).view(np.int64)  # NaN equals itself
     changed = np.ones(len(patterns), np.bool_)
@@ -470,7 +470,7 @@ class Dataset:
             raise ModelError("not a mavfi data set", path=path)
         if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
             raise ModelError(
-                "was made for another version, table of states or preprocessing; fly it again",
+                "was made for another version, table of states or preprocessing; record it again",
                 path=path,
             )
         stack = StackMark(name=metadata["mavfi_stack"], digest=metadata["mavfi_stack_digest"])

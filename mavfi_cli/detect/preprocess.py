@@ -1,7 +1,7 @@
 """Preprocessing of states: sign and exponent as an integer code, then its change over time.
 
-Paper, section V-B. The code of a float64 with sign s and binary exponent e (of 1.5 it is 0, of 2.0
-it is 1) is its signed log-magnitude above a floor,
+Paper, section V-B. The code of a float64 with sign s and binary exponent e (0 for 1.5, 1 for 2.0)
+is its signed log-magnitude above a floor,
 
     code = (-1)^s max(0, min(e, ceiling) - floor),
 
@@ -71,7 +71,7 @@ _PLANNING, _CONTROL = SPANS[Stage.PLANNING][0], SPANS[Stage.CONTROL][0]
 
 
 def span(stage: Stage) -> tuple[int, int]:
-    """Return the first index of a stage and the index after its last, without the state table."""
+    """Return the first index of a stage and the index after its last, without a lookup in SPANS."""
     if stage is _PLANNING_STAGE:
         return _PLANNING, _CONTROL
     return (0, _PLANNING) if stage is _PERCEPTION_STAGE else (_CONTROL, COUNT)
@@ -112,11 +112,11 @@ class PreprocessParams:
             raise ConfigError(problem, key="time_to_collision_ceiling")
 
     def working_array(self) -> Codes:
-        """Create the working array (ROWS, COUNT) of the functions below, without references.
+        """Create the working array (ROWS, COUNT) for the functions below, without references.
 
-        Row REFERENCE holds the reference codes of the deltas, PREVIOUS the codes before the last
-        sample, CODE and DELTA those of the last sample. FLOOR, CEILING and KIND define the
-        encoding.
+        Row REFERENCE holds the reference codes of the deltas, PREVIOUS the reference codes before
+        the last sample, CODE and DELTA the codes and deltas of the last sample. FLOOR, CEILING and
+        KIND define the encoding.
         """
         columns = []
         for state in DETECTED:
@@ -219,7 +219,7 @@ def take_tick(
 
 @compiled
 def plan_deltas(waypoints: FloatArray, first: int, work: Codes, steps: IntArray, out: Codes) -> int:
-    """Compute the nonzero deltas between consecutive waypoints (n, 10) from `first` on.
+    """Compute the nonzero deltas between consecutive waypoints (n, 10), starting at `first`.
 
     Step k leads from waypoint k to k + 1. Steps with a changed code are written to `steps` (n,) and
     their deltas to `out` (n, COUNT). `work` does not change.

@@ -36,12 +36,12 @@ class ProgramConfig:
     """One program of a companion.
 
     Attributes:
-        command: Command line. Words in braces are filled in.
+        command: Command line. Placeholders in braces are filled in.
         folder: Working folder, relative to the file of the companion.
         environment: Variables added to mavfi's own environment.
-        restart: Rule after its end: never, on-failure or always.
+        restart: When to restart it after it has ended: never, on-failure or always.
         restart_s: Wall-clock time from its end to its restart, s.
-        ready_line: Regular expression of a line on stdout after which it is ready.
+        ready_line: Regular expression for a line on stdout after which it is ready.
         ready_port: TCP port of this machine that it opens when it is ready.
         ready_heartbeat: It is ready when its first MAVLink heartbeat arrives.
         ready_limit_s: Longest wall-clock time until it is ready, s.
@@ -72,13 +72,13 @@ class ProgramConfig:
         try:
             re.compile(self.ready_line or "")
         except re.error as error:
-            raise ConfigError(f"is no regular expression: {error}", key="ready_line") from None
+            raise ConfigError(f"must be a regular expression: {error}", key="ready_line") from None
 
     def argv(self, values: Mapping[str, str]) -> list[str]:
         """Return the words of the command with the placeholders filled in.
 
         Raises:
-            UnknownName: A word in braces is no placeholder. The message suggests the nearest.
+            UnknownName: A word in braces is not a placeholder. The message suggests the nearest.
         """
 
         def filled(match: re.Match[str]) -> str:
@@ -98,7 +98,7 @@ def _words(command: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuccessConfig:
-    """The conditions of success: all given ones must hold, without a collision.
+    """The conditions of success. All that are given must hold, and no collision may occur.
 
     Attributes:
         goal_m: The vehicle is at rest within this distance of the goal, m.
@@ -126,13 +126,13 @@ class GateConfig:
     """The behaviour of the gate between a companion and its autopilot.
 
     Attributes:
-        action: The replacement of a setpoint with an alarm: `hold`, the last accepted
-            setpoint; `brake`, a standstill; `autopilot`, nothing, and the autopilot is switched to
-            its own hold.
+        action: What replaces a setpoint that raises an alarm: `hold`, the last accepted setpoint;
+            `brake`, a standstill; `autopilot`, nothing, and the autopilot is switched to its own
+            hold.
         patience: Number of consecutive alarms after which `hold` becomes `brake`.
-        stale_s: Time without a change after which the setpoints of a companion that is gone are
-            withheld, s.
-        on_error: Whether setpoints pass (`open`) or not (`closed`) after an error of the gate.
+        stale_s: Time without a change after which setpoints are withheld if their companion has
+            ended or is silent, s.
+        on_error: Whether setpoints pass (`open`) or not (`closed`) after an error in the gate.
         watch_only: Report alarms, and withhold nothing.
     """
 
@@ -161,17 +161,17 @@ class CompanionConfig:
         time: Clock of the flight: `wall`, the wall clock, or `lockstep`, in which every tick waits
             for the companion's answer.
         answer_limit_s: Longest wall-clock time until an answer in lockstep, s.
-        link: mavfi's end of the companion's MAVLink link. By default it listens on a free port, of
-            UDP by the wall clock and of TCP in lockstep. `udpout` calls a program that listens on
-            a fixed port, as PX4 does.
+        link: mavfi's end of the companion's MAVLink link. By default it listens on a free
+            port: UDP with the wall clock, TCP in lockstep. `udpout` connects to a program that
+            listens on a fixed port, as PX4 does.
         success: Conditions of success; by default the last program has ended with code 0.
         time_limit_s: Limit of simulated time from arming, s; None for the mission's.
         flight_s: Simulated time from arming over which random faults are drawn, s; None for the
-            straight flight to the goal at the speed limit.
+            duration of a straight flight to the goal at the speed limit.
         key_file: File with the signing passphrase of the link, relative to this file. A message
             that a fault changes is signed again with it.
         gate: Behaviour of the gate with `--detector`.
-        name: Name in the models of its detectors.
+        name: Name that the models of its detectors store.
         own_network: In a campaign, each mission has a network of its own with only a loopback, if
             the operating system allows it, so that fixed ports do not collide.
     """
@@ -210,11 +210,11 @@ class CompanionConfig:
             object.__setattr__(self, "success", last)
 
     def _check_lockstep(self) -> None:
-        """Refuse what the wall clock or a second program would decide."""
+        """Reject settings that depend on the wall clock or on a second program."""
         if not self.url.startswith("tcpin:"):
             raise ConfigError("must be tcpin: in lockstep, because UDP may lose ticks", key="link")
         if len(self.program) > 1:
-            raise ConfigError("must be a single one in lockstep", key="program")
+            raise ConfigError("must be a single program in lockstep", key="program")
         plain = ProgramConfig(command="true")
         for name, program in self.program.items():
             for key in ("restart", "ready_line", "ready_port", "ready_heartbeat", "share"):
@@ -247,7 +247,7 @@ class CompanionConfig:
 
     @classmethod
     def load(cls, given: str) -> CompanionConfig:
-        """Load a companion from a TOML file, or make one of a command line.
+        """Load a companion from a TOML file, or build one from a command line.
 
         Raises:
             ConfigError: The file cannot be used, or a program cannot be started.
@@ -271,7 +271,7 @@ class CompanionConfig:
 
 
 def _require_startable(name: str, program: ProgramConfig) -> None:
-    """Refuse a program that does not exist, or that mavfi could not end."""
+    """Reject a program that does not exist, or that mavfi could not end."""
     word = _words(program.command)[0]
     if not Path(program.folder).is_dir():
         raise ConfigError(f"no such folder: {program.folder}", key=f"program.{name}.folder")

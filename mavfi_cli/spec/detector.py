@@ -21,7 +21,7 @@ STAGES = tuple(stage.value for stage in Stage)
 PAPER, EXTENDED = "paper", "extended"  # sets of watched states
 WATCHES = (PAPER, EXTENDED)
 COMPANION = "companion:"
-"""Prefix of the name under which a model records the user's companion that it was fitted to."""
+"""Prefix of the stack name in a model that was fitted to a user's companion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +68,7 @@ class DetectorConfig:
     def with_model(
         cls, name: str, models: Path | None, protect: tuple[str, ...] = STAGES
     ) -> DetectorConfig:
-        """Return the detector with the model NAME.json of a folder, or the shipped one for None.
+        """Configure a detector with the model NAME.json in `models`, or the shipped one if None.
 
         Raises:
             ModelError: The folder has no such file.
@@ -85,7 +85,7 @@ class DetectorConfig:
         stack. `build` rejects the model of a base stack without `any_stack`.
 
         Args:
-            stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
+            stack: Stack of the mission, as for `load_stack`, whose errors are raised too.
         """
         from mavfi_cli.detect.base import shipped
 
@@ -99,7 +99,7 @@ class DetectorConfig:
         return None
 
     def model_digest(self, stack: str) -> str:
-        """Return the digest of the model file; `none` without one. Raises as `model_path`."""
+        """Return the digest of the model file; `none` without one. Errors as in `model_path`."""
         path = self.model_path(stack)
         return "none" if path is None else file_digest(path)
 
@@ -107,11 +107,11 @@ class DetectorConfig:
         """Create a new detector for a mission with the given stack.
 
         Args:
-            stack: Stack of the mission, as for `load_stack`. Raises as `load_stack`.
+            stack: Stack of the mission, as for `load_stack`, whose errors are raised too.
 
         Raises:
             UnknownName: No detector has this name. The message suggests the nearest.
-            ModelError: The model cannot be used, or is for another stack without `any_stack`.
+            ModelError: The model cannot be used, or is for another stack and `any_stack` is false.
             ConfigError: The threshold is out of range, or the model lacks ranges of extended
                 states.
         """
@@ -139,15 +139,15 @@ class DetectorConfig:
         return detector
 
     def build_for_companion(self, mark: StackMark | None) -> Detector:
-        """Create a new detector for the gate before a user's companion.
+        """Create a new detector for the gate of a user's companion.
 
         Args:
-            mark: The companion; None accepts a model of any companion.
+            mark: Identity of the companion; None accepts a model of any companion.
 
         Raises:
             UnknownName: No detector has this name.
-            ModelError: The model cannot be used, is missing, or is for another companion without
-                `any_stack`.
+            ModelError: The model cannot be used, is missing, or is for another companion and
+                `any_stack` is false.
         """
         from mavfi_cli.detect.base import FittedDetector, find_detector
 
@@ -170,7 +170,7 @@ class DetectorConfig:
         return detector
 
     def extended_ranges(self, detector: Detector) -> Ranges | None:
-        """Return the ranges of the extended states in the model; None if not configured.
+        """Return the ranges of the extended states in the model; None if they are not watched.
 
         Raises:
             ConfigError: The model lacks ranges of the extended states.

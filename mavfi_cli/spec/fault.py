@@ -35,7 +35,7 @@ _UNIT_S = {When.TIME: 1.0, When.TICK: 0.02}  # unit of a trigger's number
 DETECTOR = "detector"  # target: memory of the detector
 PROCESS = "process"  # target prefix: process of a node
 QUEUE = "queue"  # target prefix: control's copy of the plan
-DIRECTIONS = ("output", "input")  # target prefixes: messages of a companion, and to it
+DIRECTIONS = ("output", "input")  # target prefixes: messages from a companion, and to it
 _QUEUED = [name for name in dict.fromkeys((*BY_NAME, *GROUPS)) if name.startswith("waypoint_")]
 
 
@@ -135,7 +135,7 @@ class FaultConfig:
         return ", ".join([what, *held, *when])
 
     def check(self) -> None:
-        """Validate the configuration. Raises as `draw`."""
+        """Validate the configuration. Raises the same errors as `draw`."""
         if self.wire_target is not None:
             self.draw_wire()
         elif self.killed_node is not None:
@@ -163,8 +163,8 @@ class FaultConfig:
         """Validate the fault in a process of a user's companion, given its programs.
 
         Raises:
-            UnknownName: No program has this name, or no effect.
-            FaultSpecError: A process does not have this effect or trigger.
+            UnknownName: No program or effect has this name.
+            FaultSpecError: This effect or trigger is impossible for a process.
         """
         name = self.killed_node
         if name not in programs:
@@ -211,7 +211,7 @@ class FaultConfig:
         return fields, drawn
 
     def check_within(self, time_limit_s: float) -> None:
-        """Reject a trigger beyond the mission's time limit. Also raises as `trigger`.
+        """Reject a trigger beyond the mission's time limit. Also raises the errors of `trigger`.
 
         Raises:
             FaultSpecError: The time or the tick is beyond the limit.
@@ -348,8 +348,8 @@ class InstructionConfig:
         sites, roles: Kinds of operands; empty for the default.
         bits: Number of distinct bits to flip.
         null: Null injection, which does everything except the flip.
-        invocation_seed: Seed by which node and invocation are drawn; None for `seed`. Faults with
-            the same one strike the same invocation.
+        invocation_seed: Seed with which node and invocation are drawn; None for `seed`. Faults with
+            the same seed strike the same invocation.
         at: In a user's companion: the moment from which instructions are counted, as in
             `FaultConfig`.
         objects: In a user's companion: the shared objects and executables that may be struck;
@@ -382,7 +382,7 @@ class InstructionConfig:
 
     @property
     def place_seed(self) -> int:
-        """Seed by which node and invocation are drawn."""
+        """Seed with which node and invocation are drawn."""
         return self.seed if self.invocation_seed is None else self.invocation_seed
 
     @property
@@ -396,7 +396,7 @@ class InstructionConfig:
         return self.target.partition("/")[2] or None
 
     def moment(self) -> FaultConfig:
-        """Return a fault in the program's process at the moment from which is counted."""
+        """Return a fault in the program's process at the moment when counting starts."""
         return FaultConfig(target=f"{PROCESS}.{self.program}", seed=self.seed, at=self.at)
 
     def check_program(self, programs: Collection[str]) -> None:
@@ -404,7 +404,7 @@ class InstructionConfig:
 
         Raises:
             UnknownName: No program has this name.
-            FaultSpecError: A process does not have this trigger.
+            FaultSpecError: This trigger is impossible for a process.
         """
         self.moment().check_program(programs)
 

@@ -45,7 +45,7 @@ NOT_OF_GOLDEN: Mapping[str, Any] = {
 """Settings that a golden mission does not have or need, and their values in it."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
-REMOTE_M = 1.0e7  # beyond, float64 resolves less than a nanometre
+REMOTE_M = 1.0e7  # beyond this, float64 is coarser than a nanometre
 FARTHEST_M = 200.0  # maximum goal distance; limits the memory of the obstacle grid
 MARGIN_M = 30.0  # flight bounds around home and goal without a known world
 _MOUNT_FLU_M = (0.1, 0.0, 0.0)  # default of the stand-alone camera
@@ -92,14 +92,14 @@ class MissionConfig:
         camera_columns, camera_rows, camera_rate_hz: Size and rate of the depth images.
         world_seed: Seed of a generated world, or of start and goal in a scene; None for `seed`.
         link: MAVLink endpoint of a foreign autopilot; None starts the simulated vehicle.
-        eyes: Start depth camera and referee of the world beside a foreign autopilot.
-        origin: Position in the world of the local origin of a foreign autopilot with `eyes`; None
-            for the world's start.
+        eyes: Start the world's depth camera and referee alongside a foreign autopilot.
+        origin: With `eyes`, position of the foreign autopilot's local origin in the world; None for
+            the world's start.
         autopilot: Autopilot of the simulated vehicle: `ours` or real firmware.
         firmware: SITL binary of a real autopilot; None takes it from the environment variable.
         key_file: File with the signing passphrase of the link; None for an unsigned link.
         loss_limit_s: Time without a new state of a foreign autopilot after which the link counts as
-            lost, on its clock and on the wall's, s.
+            lost, on its clock and on the wall clock, s.
         realtime: Run the simulated vehicle at wall-clock speed.
         land: Land and disarm at the goal.
         fault: Source-level fault to inject; None for a golden run.
@@ -109,7 +109,7 @@ class MissionConfig:
         node_watchdog_s: Simulated time after which a busy node counts as hung and is killed, s.
         isolate: Nodes that run in processes of their own; does not change the record.
         companion: TOML file or command line of a user's companion, which flies in place of mavfi's.
-        speed: Pace of the vehicle that a user's companion flies, in times real time.
+        speed: Pace of the simulated vehicle with a user's companion, as a multiple of real time.
     """
 
     world: str = "dense"
@@ -270,9 +270,9 @@ class MissionConfig:
     def shared_flight(self) -> MissionConfig | None:
         """The flight from which the mission can be forked: the mission without its fault.
 
-        What becomes of lost nodes does not matter in it.
+        The settings for lost nodes do not matter in it and have their defaults.
 
-        It is None for a mission whose flight other processes or the wall clock affect.
+        It is None if other processes or the wall clock affect the mission's flight.
         """
         alone = (
             self.isolate
@@ -301,7 +301,7 @@ class MissionConfig:
         return files + tuple(name for name in (model, self.firmware, companion) if name)
 
     def loaded_stack(self) -> Stack:
-        """Load the stack of the mission, with its goal tolerance. Raises as `load_stack`."""
+        """Load the stack of the mission, with its goal tolerance. Errors as in `load_stack`."""
         stack, own_m = load_stack(self.stack), self.goal_tolerance_m
         return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
 
@@ -325,14 +325,14 @@ class MissionConfig:
 
     @property
     def programs(self) -> tuple[str, ...]:
-        """Programs that the mission names and executes: its firmware and its user's companion."""
+        """Programs that the mission names and executes: the firmware and the user's companion."""
         return tuple(name for name in (self.firmware, self.companion) if name is not None)
 
     def require_programs(self, *known: str | None) -> None:
-        """Refuse a recorded mission that names an unknown program.
+        """Reject a recorded mission that names an unknown program.
 
-        Flying a record executes the programs that it names, and a record is untrusted. The firmware
-        of the environment variable counts as known.
+        Flying a record executes the programs that it names, and a record is untrusted. Firmware
+        named by the environment variable counts as known.
 
         Raises:
             ConfigError: The mission names another program.

@@ -96,7 +96,7 @@ class _KernelEntry:
     latency_s: float | None = None  # median latency of one invocation
     scale: float | None = None  # factor on the base's latency, instead of latency_s
     spread: float | None = None  # None: that of the base, or 0
-    source: str = ""  # of the number
+    source: str = ""  # source of the number
 
     def __post_init__(self) -> None:
         if (self.latency_s is None) is (self.scale is None):
@@ -107,18 +107,18 @@ class _KernelEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlatformFile:
-    """A platform's TOML file: the keys of `PlatformProfile`, with `_Entry` for kernels."""
+    """A platform's TOML file: the keys of `PlatformProfile`, with `_KernelEntry` for kernels."""
 
-    name: str  # of the platform
+    name: str  # name of the platform
     cores: int  # number of nodes that compute at the same time
     kernels: dict[str, _KernelEntry] = field(default_factory=dict)  # kernel -> its entry
     base: str = ""  # a shipped platform
     scale: float = 1.0  # factor on the base's latencies of kernels without an entry
-    description: str = ""  # which `mavfi platforms` prints
-    carried: bool = True  # false: it stays on the ground, without mass and power for the vehicle
+    description: str = ""  # text that `mavfi platforms` prints
+    carried: bool = True  # false: it stays on the ground and costs the vehicle no mass or power
     power_w: float | None = None  # thermal design power
-    mass_kg: float | None = None  # of the board, without the heat sink
-    heatsink_kgpw: float | None = None  # mass of the heat sink for each watt
+    mass_kg: float | None = None  # mass of the board without the heat sink
+    heatsink_kgpw: float | None = None  # mass of the heat sink per watt
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its value
 
     def __post_init__(self) -> None:

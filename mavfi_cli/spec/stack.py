@@ -45,7 +45,7 @@ class Stack:
     """Structure, checks and gains of the companion. docs/reference/stacks.md lists the keys.
 
     Attributes:
-        stretches_clock: A waypoint lasts until its distance is flown. If the speed limit clips a
+        stretches_clock: A waypoint lasts until its distance is covered. If the speed limit clips a
             command, the trajectory's clock slows down by the ratio of clipped to demanded speed.
         skips_endless_slices: A waypoint ends at once if its slice of 10 ms is stretched to 2^63 s
             or more.
@@ -80,8 +80,8 @@ class Stack:
         slows_where_blind: The vehicle flies at half speed outside its field of view.
         smoother: Smoothing of planned paths: `ours` (straight flight at 0.9 v_max with blended
             corners) or `release` (minimum snap with the release's segment times).
-        slice_period_s: Time in which the follower flies a slice of 10 ms of the trajectory. The
-            trajectory's clock slows down by the ratio, the commanded velocity does not.
+        slice_period_s: Time that the follower takes for a slice of 10 ms of the trajectory. The
+            trajectory's clock slows down by the ratio; the commanded velocity does not change.
         restores_counters: A supervisor gives a restarted node the sequence numbers of the last
             message that left it. Otherwise the node counts from 0.
         standby: Nodes whose process has a hot standby, which works on the same inputs and takes
@@ -89,7 +89,7 @@ class Stack:
         sources: Sources of the values, by key.
     """
 
-    name: str  # of the stack; by default that of the file
+    name: str  # name of the stack; by default that of the file
     stretches_clock: bool
     skips_endless_slices: bool
     guards_tracking: bool
@@ -121,8 +121,8 @@ class Stack:
     slice_period_s: float = 0.01
     restores_counters: bool = False
     standby: tuple[str, ...] = ()
-    description: str = ""  # which `mavfi stacks` prints
-    base: str = ""  # name of a shipped stack that has the other values
+    description: str = ""  # text that `mavfi stacks` prints
+    base: str = ""  # name of a shipped stack that supplies the other values
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -171,14 +171,14 @@ class Stack:
                 seen.add(node)
 
     def settings_of(self, params: type) -> dict[str, Any]:
-        """Return the values of the keys that a kernel's parameters share by name."""
+        """Return the values of the keys that are also fields of a kernel's parameters."""
         return {key.name: getattr(self, key.name) for key in fields(params) if key.name in KEYS}
 
     @property
     def mark(self) -> StackMark:
         """Return the identity of the stack, which a detector's model stores.
 
-        It excludes keys with their default, so a key that is added later changes no identity.
+        It excludes keys with their default, so adding a key later does not change any identity.
         """
         settings = self.settings_of(Stack)
         same = [key for key, value in _DEFAULTS.items() if settings[key] == value]

@@ -17,9 +17,9 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 RESAMPLES = 9999
-TABLE_RESAMPLES = 1999  # of the many intervals of a table
+TABLE_RESAMPLES = 1999  # for the many intervals of a table
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
-LARGE = 500  # from here on the mean is normal and the bootstrap would only be slow
+LARGE = 500  # with so many values the mean is normal and the bootstrap only slower
 _CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
@@ -44,11 +44,12 @@ def interval(
     seed: int = 1,
     weights: FloatArray | None = None,
 ) -> Interval:
-    """A statistic with its bootstrap interval, or the normal one for the mean of LARGE samples.
+    """Return a statistic with its bootstrap interval, or a normal one for a mean of many values.
 
     The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is the
     percentile interval if BCa is not defined, as for the median of tied values, or if there are
-    more values than resamples, because BCa leaves out each value in turn.
+    more values than resamples, because BCa leaves out each value in turn. The mean of LARGE values
+    or more has the normal interval.
 
     Args:
         values: (n,) one value per mission; the differences for a paired difference.
@@ -77,7 +78,7 @@ def interval(
 def _resampled(
     sample: FloatArray, statistic: Statistic, confidence: float, resamples: int, seed: int
 ) -> tuple[float, float]:
-    """Ends of the bootstrap interval."""
+    """Return the ends of the bootstrap interval."""
     from scipy.stats import DegenerateDataWarning, bootstrap
 
     result, ends = None, (math.nan, math.nan)
@@ -107,7 +108,7 @@ def interval_of_rows(
     resamples: int,
     confidence: float = 0.95,
 ) -> Interval:
-    """A statistic of several columns with its interval, by resampling their rows together.
+    """Return a statistic of several columns with its interval, by resampling whole rows.
 
     Args:
         statistic: takes row indices (..., n) and reduces the last axis.

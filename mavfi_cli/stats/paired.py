@@ -1,9 +1,9 @@
 """Two treatments: tests, the worst case, effects with intervals, and the verdict on a claim.
 
-The worst case and its recovery are those of the paper's section VII-A. It gives, for Factory, a
-worst-case flight time with faults 73.8 % above the golden run's, recovered by 64.2 % in section
-VII-A and by 87.1 % in Fig. 14: 64.2 / 73.8 = 87.0 %. So the first is in points of the golden run
-and the second is a share of the increase. Both are given here.
+The worst case and its recovery follow the paper's section VII-A. For Factory, it gives a worst-case
+flight time with faults 73.8 % above that of the golden run. The recovery is 64.2 % in section VII-A
+and 87.1 % in Fig. 14. As 64.2 / 73.8 = 87.0 %, the first is in percentage points of the golden run
+and the second is a share of the increase. Both are computed here.
 
 An effect is one number of a comparison: a difference of two rates, or the share of a loss that
 protection recovers.
@@ -22,10 +22,10 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
-OWN = (1.0,)  # golden values over their own, for `WorstCase.of` whatever the missions' lengths
-_PATTERNS = 9999  # of signs, in `sign_flips`
+OWN = (1.0,)  # golden values of `WorstCase.of` if each value is relative to its own golden flight
+_PATTERNS = 9999  # patterns of signs in `sign_flips`
 _CHUNK = 1_000_000  # signs drawn at once; larger arrays leave the processor's cache
-_DIGITS = 9  # of a sum over the largest sum; equal sums differ by rounding
+_DIGITS = 9  # of a sum relative to the largest; equal sums differ only by rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +52,10 @@ class McNemar:
         weights: FloatArray | None = None,
         clusters: NDArray[np.int64] | None = None,
     ) -> McNemar:
-        """McNemar's exact test (Psychometrika 12, 1947), in which differing pairs are fair coins.
+        """Run McNemar's exact test (Psychometrika 12, 1947): differing pairs are fair coin tosses.
 
-        With weights, `sign_flips` of the weighted differences gives the p-value. With clusters it
-        is that of the sums of their differences.
+        With weights, the p-value is that of `sign_flips` on the weighted differences. With
+        clusters, it is that of `sign_flips` on the sum of the differences in each cluster.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
@@ -106,18 +106,18 @@ class WeightedMcNemar(McNemar):
 
 
 def sign_flips(differences: Sequence[float]) -> float:
-    """Two-sided p-value of Fisher's randomisation test of paired differences.
+    """Return the two-sided p-value of Fisher's randomisation test of paired differences.
 
     Without an effect both signs of a difference are equally likely. The test assumes no
     distribution, so it is valid if most differences are zero and a bootstrap interval is too
-    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All signs are tried if they
-    have at most _PATTERNS patterns, else _PATTERNS seeded random patterns.
+    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All patterns of signs
+    are tried if there are at most _PATTERNS, otherwise _PATTERNS seeded random ones.
 
     Args:
         differences: one for each independent pair; zeros have no effect.
 
     Returns:
-        1 if at most one differs.
+        The p-value; 1 if at most one difference is not zero.
     """
     from scipy.stats import permutation_test
 
@@ -135,7 +135,7 @@ def sign_flips(differences: Sequence[float]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values corrected for a family of tests (S. Holm, Scand. J. Statistics 6, 1979).
+    """Return p-values corrected for a family of tests (S. Holm, Scand. J. Statistics 6, 1979).
 
     The order is kept. Reject if the corrected value is below the level.
     """
@@ -199,7 +199,7 @@ class WorstCase:
 
 # Effects ------------------------------------------------------------------------------------------
 
-DRAWS = 100_000  # of the three rates in `recovered_share`
+DRAWS = 100_000  # of each rate in `recovered_share` and `net_share`
 Count = tuple[int, int]  # successes, missions
 
 
@@ -208,11 +208,12 @@ def paired_difference(
     second: Sequence[bool] | BoolArray,
     clusters: Sequence[Hashable],
 ) -> Interval:
-    """Rate of the second minus rate of the first, on the same missions; NaN without any.
+    """Return the rate of the second minus that of the first, on the same missions.
 
     The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
-    37, 2012): one pair is added to each kind of pair that differs, so 0 of n differences still has
-    a width. The number of pairs is divided by the design effect of the clusters.
+    37, 2012): one pair is added to each of the two kinds of differing pairs, so the interval has a
+    width even if no pair differs. The number of pairs is divided by the design effect of the
+    clusters. The result is NaN without missions.
 
     Args:
         first, second: whether each mission is a hit under each treatment, (n,).
@@ -239,13 +240,13 @@ def paired_difference(
 def net_share(
     before: BoolArray, after: BoolArray, clusters: Sequence[Hashable], *, seed: int = 1
 ) -> Interval:
-    """Share of the hits that a treatment undoes, minus those that it causes, on the same missions.
+    """Return the hits that a treatment undoes minus those it causes, as a share of the hits before.
 
-    (hits before - hits after) / hits before. It is below 0 if the treatment causes more than it
-    undoes. The interval has the percentiles of draws: the share of missions that are hits before,
-    and the shares of hits and of others that change, are each drawn from their posterior
-    distribution under Jeffreys' prior. The numbers of missions are divided by the design effect of
-    the clusters.
+    It is (hits before - hits after) / hits before on the same missions. It is below 0 if the
+    treatment causes more than it undoes. The ends of the interval are percentiles of random draws:
+    the share of missions that are hits before, and the shares of hits and of others that change,
+    are each drawn from their posterior distribution under Jeffreys' prior. The numbers of missions
+    are divided by the design effect of the clusters.
 
     Args:
         before, after: whether each mission is a hit without and with the treatment, (n,).
@@ -271,7 +272,7 @@ def net_share(
 
 
 def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> float:
-    """Ratio of the variance of a mean to that of as many independent values; at least 1."""
+    """Return the ratio of a mean's variance to that with as many independent values; at least 1."""
     residuals = values - values.mean()
     squares = float((residuals**2).sum())
     sums: dict[Hashable, float] = {}
@@ -286,12 +287,12 @@ def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> 
 def recovered_share(
     golden: Count, faulty: Count, protected: Count, *, draws: int = DRAWS, seed: int = 1
 ) -> Interval:
-    """Share of the lost success that protection recovers, from three independent rates.
+    """Return the share of the lost success that protection recovers, from three independent rates.
 
     It is a ratio of two differences. The three rates are drawn from their posterior distributions
     under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as
-    well. The interval has the percentiles of the ratio. Draws in which the faults cost
-    nothing count as well.
+    well. The ends of the interval are percentiles of the ratio, including draws in which the
+    faults cost nothing.
 
     Args:
         golden, faulty, protected: successes and missions of each.

@@ -2,9 +2,9 @@
 
 A flight's score is the highest score of its messages. A threshold t raises an alarm on flights
 whose score is above t. The area under the ROC curve is the Mann-Whitney statistic, with ties
-halved. Its interval has the variance of Hanley and McNeil (Radiology 143, 1982), taken at the end
-of the interval instead of the estimate, so that an area of 1 has an interval too (R. G. Newcombe,
-Statistics in Medicine 25, 2006). The area under the precision-recall curve is the average
+halved. Its interval uses the variance of Hanley and McNeil (Radiology 143, 1982), evaluated at the
+end of the interval instead of at the estimate, so that an area of 1 has an interval too (R. G.
+Newcombe, Statistics in Medicine 25, 2006). The area under the precision-recall curve is the average
 precision, the sum of precision times the gain in recall.
 """
 
@@ -19,24 +19,24 @@ import numpy as np
 
 from mavfi_cli.stats.shares import z_of
 
-_NEAR = 1e-9  # areas of 0 and 1 have no spread, so their far ends are searched from beside them
+_NEAR = 1e-9  # search offset from the area itself, because areas of 0 and 1 have no spread
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """Curves over the thresholds, which are in units of the detector's own; (m,) each.
+    """Curves over the thresholds, in units of the detector's own threshold; (m,) each.
 
-    Without flights of one kind the curves are empty and the numbers NaN.
+    Without flights of one kind, the curves are empty and the numbers are NaN.
 
     Attributes:
         positives, negatives: number of scores of harmful faults and of error-free flights.
-        thresholds: in descending order, from one without alarms.
+        thresholds: in descending order, beginning with one that raises no alarm.
         false_positive_rate: share of error-free flights with an alarm.
         recall: share of harmful faults with an alarm.
         precision: share of harmful faults among all with an alarm; 1 at the first threshold.
         area, area_low, area_high: under the ROC curve, with its 95 % interval.
-        average_precision: under the precision-recall curve; it depends on the mix of flights,
-            chance is positives / (positives + negatives).
+        average_precision: area under the precision-recall curve; it depends on the mix of flights
+            and is positives / (positives + negatives) by chance.
         operating_point: false positive rate and recall at the detector's own threshold.
     """
 
@@ -93,13 +93,13 @@ class Curves:
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
-    """Ends of the 95 % interval: areas whose own spread just reaches the estimate."""
+    """Return the ends of the 95 % interval: areas whose own spread just reaches the estimate."""
     from scipy.optimize import brentq
 
     z = z_of(0.95)
 
     def spread(of: float) -> float:
-        """Half width of the interval around an area (Hanley and McNeil 1982)."""
+        """Return the half width of the interval around an area (Hanley and McNeil 1982)."""
         q1, q2 = of / (2.0 - of), 2.0 * of**2 / (1.0 + of)
         variance = (
             of * (1.0 - of) + (positives - 1) * (q1 - of**2) + (negatives - 1) * (q2 - of**2)

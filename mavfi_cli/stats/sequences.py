@@ -1,13 +1,13 @@
 """Tests and intervals that hold however often one looks: asymptotic confidence sequences.
 
 I. Waudby-Smith, D. Arbour, R. Sinha, E. H. Kennedy and A. Ramdas, Annals of Statistics 52, 2024,
-theorem 2.2, the normal mixture of H. Robbins. An estimate of n observations that lies z standard
-errors from a value has against that value, with u = n rho^2, the evidence
+theorem 2.2, the normal mixture of H. Robbins. With u = n rho^2, an estimate from n observations
+that lies z standard errors from a value gives the following evidence against that value:
 
     e = exp(z^2 u / (2 (u + 1))) / sqrt(u + 1).
 
 The probability that it ever exceeds 1/a is at most a, if the value is true. So 1/e is a p-value at
-any look, and the values with e < 1/a are an interval at all looks together.
+any look, and the values with e < 1/a form an interval that holds at all looks together.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from dataclasses import replace
 
 from mavfi_cli.stats.shares import Interval, z_of
 
-TUNED = 1000  # observations at which the interval is narrowest, compared with one fixed number
-_LEVEL = 0.05  # for which it is narrowest there
+TUNED = 1000  # observations at which the interval is narrowest relative to a fixed-sample one
+_LEVEL = 0.05  # level for which it is narrowest there
 
 
 def anytime_p(z: float, count: int) -> float:
-    """The p-value at any look of an estimate of `count` observations, z standard errors away."""
+    """Return the p-value at any look of an estimate from `count` values, z standard errors away."""
     u = _u(count)
     exponent = -0.5 * z * z * u / (u + 1.0)
     return min(1.0, math.sqrt(u + 1.0) * math.exp(exponent))
 
 
 def anytime_z(count: float, level: float = _LEVEL) -> float:
-    """The number of standard errors beyond which `anytime_p` is below a level."""
+    """Return the number of standard errors beyond which `anytime_p` is below a level."""
     u = _u(count)
     return math.sqrt(2.0 * (1.0 + 1.0 / u) * math.log(math.sqrt(u + 1.0) / level))
 
 
 def anytime_interval(effect: Interval) -> Interval:
-    """The 95 % interval at all looks together, from the 95 % interval of an effect at one."""
+    """Return an effect's 95 % interval for all looks together, given the one for a single look."""
     if not effect.count:
         return effect
     wider = anytime_z(effect.count) / z_of(1.0 - _LEVEL)
@@ -47,10 +47,10 @@ def anytime_interval(effect: Interval) -> Interval:
 
 
 def anytime_count(z: float, count: int, level: float) -> float:
-    """Observations at which `anytime_p` falls below a level, if the effect stays as it is.
+    """Return the count at which `anytime_p` falls below a level, if the effect stays as it is.
 
     Args:
-        z, count: present distance in standard errors, and observations.
+        z, count: current distance in standard errors, and number of observations.
 
     Returns:
         Infinite if z is 0.
@@ -60,7 +60,7 @@ def anytime_count(z: float, count: int, level: float) -> float:
     from scipy.optimize import brentq
 
     def short(number: float) -> float:
-        """Standard errors that are lacking at this number of observations."""
+        """Return the standard errors still missing at this number of observations."""
         return anytime_z(number, level) - z * math.sqrt(number / count)
 
     enough = float(count)
@@ -70,7 +70,7 @@ def anytime_count(z: float, count: int, level: float) -> float:
 
 
 def _u(count: float) -> float:
-    """The product n rho^2, of the rho whose interval is narrowest at TUNED observations."""
+    """Return n rho^2 for the rho whose interval is narrowest at TUNED observations."""
     from scipy.special import lambertw
 
     narrowest = -float(lambertw(-(_LEVEL**2) / math.e, -1).real) - 1.0

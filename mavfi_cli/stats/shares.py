@@ -1,8 +1,8 @@
-"""Proportions with their intervals, of independent runs and of clusters; sample sizes; the layers.
+"""Proportions of independent runs and of clusters, with intervals; sample sizes; cross-layer rates.
 
 Each run strikes a cluster: a sampled window of executed instructions. Clusters are drawn uniformly
-from a stratum, such as the windows that begin at one function. Both formulas are those of W. G.
-Cochran, Sampling Techniques, 3rd edition, 1977. A few clusters estimate their own spread poorly. So
+from a stratum, such as the windows that begin at one function. The formulas are those of W. G.
+Cochran, Sampling Techniques, 3rd edition, 1977. A few clusters estimate their own spread poorly, so
 the quantiles are Student's, with the degrees of freedom of F. E. Satterthwaite (Biometrics Bulletin
 2, 1946).
 """
@@ -20,7 +20,7 @@ from mavfi_cli.core.errors import ConfigError
 if TYPE_CHECKING:
     from mavfi_cli.core.types import FloatArray  # loads numpy
 
-_LEAST = 1e-6  # margins and differences below take more missions than anybody flies
+_LEAST = 1e-6  # smaller margins and differences need more missions than anyone can fly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +33,7 @@ class Interval:
     count: int
 
     def minus(self, other: Interval) -> Interval:
-        """The difference of two independent effects: distances added in quadrature (MOVER)."""
+        """Return the difference of independent effects: distances add in quadrature (MOVER)."""
         value = self.value - other.value
         below = math.hypot(self.value - self.low, other.high - other.value)
         above = math.hypot(self.high - self.value, other.value - other.low)
@@ -42,7 +42,7 @@ class Interval:
 
     @staticmethod
     def welch(first: FloatArray, second: FloatArray, confidence: float = 0.95) -> Interval:
-        """The mean of the second sample minus that of the first (B. L. Welch, Biometrika 34, 1947).
+        """Return the second mean minus the first (B. L. Welch, Biometrika 34, 1947).
 
         NaN if a sample is empty; the ends are NaN if one has a single value.
 
@@ -58,7 +58,7 @@ class Interval:
         value, low, high = float(second.mean() - first.mean()), math.nan, math.nan
         if count > 1:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # of equal values
+                warnings.simplefilter("ignore", RuntimeWarning)  # for equal values
                 test = ttest_ind(second, first, equal_var=False)
                 low, high = map(float, test.confidence_interval(confidence))
         return Interval(value=value, low=low, high=high, count=count)
@@ -79,7 +79,7 @@ class Share:
 
     @property
     def effective(self) -> int:
-        """Number of uniformly drawn observations with as narrow an interval."""
+        """Number of uniformly drawn observations that give an equally narrow interval."""
         return self.total
 
     @property
@@ -93,7 +93,7 @@ class Share:
         return Interval(value=self.share, low=self.low, high=self.high, count=self.total)
 
     def minus(self, other: Share) -> Interval:
-        """The difference of two independent rates, with the hybrid score interval.
+        """Return the difference of two independent rates, with the hybrid score interval.
 
         R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the
         two Wilson intervals, added in quadrature. NaN if one has no observations.
@@ -104,9 +104,9 @@ class Share:
         return replace(difference, low=max(-1.0, difference.low), high=min(1.0, difference.high))
 
     def fisher(self, other: Share) -> float:
-        """The two-sided p-value of Fisher's exact test of two independent rates; 1 if one is NaN.
+        """Return the two-sided p-value of Fisher's exact test of two rates; 1 if one is NaN.
 
-        A stratified sample counts with its effective number.
+        A stratified sample counts as its effective number of observations.
         """
         from scipy.stats import fisher_exact
 
@@ -117,7 +117,7 @@ class Share:
         return float(fisher_exact([hits, misses]).pvalue)
 
     def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
-        """Failed missions per flight hour, low and high, of a share of missions that fail.
+        """Return failed missions per flight hour, with low and high, for this share of failures.
 
         The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
 
@@ -134,7 +134,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StratifiedShare(Share):
-    """A proportion of a stratified sample, estimated by weight."""
+    """A proportion estimated from a stratified sample with weights."""
 
     effective: int = field()
 
@@ -142,7 +142,7 @@ class StratifiedShare(Share):
 def wilson(
     count: int, total: int, *, design_effect: float = 1.0, confidence: float = 0.95
 ) -> Share:
-    """Wilson score interval (E. B. Wilson, JASA 22, 1927).
+    """Return the Wilson score interval (E. B. Wilson, JASA 22, 1927).
 
     Without observations the interval is [0, 1] and the share is NaN. A design effect divides the
     number of observations, which SciPy's `proportion_ci` does not support.
@@ -154,7 +154,7 @@ def wilson(
 
 
 def score_interval(share: float, number: float, confidence: float) -> tuple[float, float]:
-    """Ends of Wilson's interval of a share of a number of observations, above 0."""
+    """Return the ends of Wilson's interval for a share of `number` (above 0) observations."""
     z = z_of(confidence)
     z2 = z**2
     centre = (share + z2 / (2 * number)) / (1 + z2 / number)
@@ -165,7 +165,7 @@ def score_interval(share: float, number: float, confidence: float) -> tuple[floa
 
 
 def unseen_share(total: int, confidence: float = 0.95) -> float:
-    """The largest share that explains why none of `total` independent runs is a hit.
+    """Return the largest share that is compatible with no hit in `total` independent runs.
 
     It is the one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 if no runs.
     """
@@ -173,7 +173,7 @@ def unseen_share(total: int, confidence: float = 0.95) -> float:
 
 
 def z_of(confidence: float) -> float:
-    """The two-sided normal quantile of a confidence between 0 and 1.
+    """Return the two-sided normal quantile for a confidence between 0 and 1.
 
     Raises:
         ConfigError: the confidence is not between 0 and 1.
@@ -186,7 +186,7 @@ def z_of(confidence: float) -> float:
 
 
 def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
-    """`share`, `low` and `high` of a whole from its parts, each weighted by its true size.
+    """Return `share`, `low` and `high` of a whole from its parts, weighted by their true sizes.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in quadrature (MOVER,
     G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The result is NaN if a
@@ -203,7 +203,7 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
 
 
 def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: float = 0.95) -> int:
-    """The fewest missions whose Wilson interval has a half width of at most `margin`.
+    """Return the fewest missions whose Wilson interval has a half width of at most `margin`.
 
     The condition (z / (1 + z²/n)) sqrt(p (1 - p)/n + z²/(4 n²)) <= m is, with u = z²/n, the
     quadratic u² (1/4 - m²) + u (p (1 - p) - 2 m²) - m² <= 0.
@@ -213,8 +213,8 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
         expected: expected rate; 0.5 is the worst case.
 
     Raises:
-        ConfigError: the margin is below a millionth or not below 0.5, or the rate is not within 0
-            and 1.
+        ConfigError: the margin is below a millionth or not below 0.5, or the rate is not between
+            0 and 1.
     """
     if not _LEAST <= margin < 0.5:
         raise ConfigError(
@@ -231,7 +231,7 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
 def pairs_for_difference(
     difference: float, discordant: float, *, confidence: float = 0.95, power: float = 0.8
 ) -> int:
-    """Pairs of missions that McNemar's test needs to detect a difference of success rates.
+    """Return how many pairs McNemar's test needs to detect a difference of success rates.
 
     (z_a sqrt(q) + z_b sqrt(q - d²))² / d², with q the share of pairs whose outcomes differ and d
     the difference (R. J. Connor, Biometrics 43, 1987).
@@ -257,7 +257,7 @@ def pairs_for_difference(
 
 @dataclass(frozen=True, slots=True)
 class CrossLayer:
-    """Failures of a kernel and of the missions that fly with it.
+    """Failures of a kernel and of the missions that use it.
 
     Attributes:
         corruption: share of faults in the isolated kernel that silently corrupt its output.
@@ -275,13 +275,13 @@ class CrossLayer:
 def cross_layer(
     corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
 ) -> CrossLayer:
-    """The probability that a mission fails, given an SDC of a kernel.
+    """Estimate the probability that a mission fails, given an SDC of a kernel.
 
     Both campaigns must sample the same population: the same kernel, level and sampling rule.
 
     Args:
         corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
-        failed, mission_faults: failures beyond the golden ones and applied faults of missions.
+        failed, mission_faults: mission failures beyond the golden ones, and applied faults.
     """
     corruption = wilson(corrupted, kernel_faults, confidence=confidence)
     failure = wilson(failed, mission_faults, confidence=confidence)
@@ -298,14 +298,14 @@ def cross_layer(
 # Clusters ---------------------------------------------------------------------------------------
 
 Cluster = tuple[Hashable, Hashable]  # a stratum, and a group of similar runs within it
-# Sampled clusters of each stratum, those without a run included.
+# Number of sampled clusters of each stratum, including those without a run.
 Sampled = Mapping[Any, int]
 
 
 def clustered_share(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> Share:
-    """The share of hits with its 95 % interval.
+    """Return the share of hits with its 95 % interval.
 
     Args:
         clusters: stratum and cluster of each run; None for a run that is its own cluster.
@@ -321,7 +321,7 @@ def clustered_share(
 def design_effect(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled | None = None
 ) -> float:
-    """Ratio of the variance of a share to that of as many independent runs; at least 1."""
+    """Return the ratio of a share's variance to that with as many independent runs; at least 1."""
     share = sum(hits) / len(hits) if hits else 0.0
     if not 0.0 < share < 1.0:
         return 1.0
@@ -333,10 +333,10 @@ def design_effect(
 def _spread(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> tuple[float, list[tuple[int, float]]]:
-    """Variance of the number of hits: of runs alone, and by stratum with its number of clusters.
+    """Return the variance of the hit count: of lone runs, and per stratum with its cluster count.
 
-    The share is a ratio of two estimated totals (Cochran, sections 6.4 and 9A). So the residuals of
-    a cluster's runs against the share of the whole are summed. The spread of these sums shows how
+    The share is a ratio of two estimated totals (Cochran, sections 6.4 and 9A), so the residuals of
+    a cluster's runs from the overall share are summed. The spread of these sums shows how
     far the share would move with other clusters. It covers the similarity of a cluster's runs, the
     unequal sizes of clusters, and the error of the estimated weights of strata.
     """
@@ -359,11 +359,11 @@ def _spread(
 
 
 def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
-    """The estimated total over strata, from members drawn uniformly from each stratum.
+    """Estimate the total over strata, from members drawn uniformly from each stratum.
 
     The interval has the correction for a finite population (Cochran, section 5.4). It is that
-    of the logarithm, because window lengths are skewed, and is not below the observed total. One
-    member out of several does not reveal its error, so there is no upper end.
+    of the logarithm, because window lengths are skewed, and is never below the observed total. If
+    a single member of several was drawn, its error is unknown and there is no upper end.
 
     Args:
         strata: the values of the drawn members, all above 0, and the number of all members.
@@ -385,7 +385,7 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
 
 
 def _student(variances: Sequence[float], freedom: Sequence[int]) -> float:
-    """The 97.5 % quantile of Student's t for a sum of variances, each with degrees of freedom."""
+    """Return the 97.5 % quantile of Student's t for a sum of variances with degrees of freedom."""
     from scipy.special import stdtrit
 
     doubt = sum(own**2 / n for own, n in zip(variances, freedom, strict=True))

@@ -1,4 +1,4 @@
-"""Stratified samples: how many missions each stratum gets, which ones, and rates by weight.
+"""Stratified samples: how many missions each stratum gets, which ones, and weighted rates.
 
 A stratum is a part of the population, such as the flips of exponent bits. The weight of a mission
 is the number of uniformly drawn missions that it stands for, so that the weights of a sample add up
@@ -24,7 +24,7 @@ from mavfi_cli.stats.shares import (
 )
 
 DEFENCE = 0.25  # share of the missions that is allocated by size alone, which bounds weights by 4
-_UNIT = 1 << 40  # of a cell in `rounded`, so that sums are exact
+_UNIT = 1 << 40  # integer that stands for 1 in `rounded`, so that sums are exact
 _LEAST_MARGIN = 1e-6  # narrower intervals have no effective number
 
 
@@ -38,7 +38,7 @@ def spread(hits: int, missions: int) -> float:
 
 
 def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) -> list[int]:
-    """Number of missions of each stratum, at least 1.
+    """Return the number of missions for each stratum, at least 1.
 
     It is proportional to size times spread (J. Neyman, J. Royal Statistical Society 97, 1934),
     except for a share DEFENCE that is proportional to size alone, so that a stratum whose spread
@@ -63,12 +63,12 @@ def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) ->
 
 
 def rounded(table: Sequence[Sequence[float]], rng: np.random.Generator) -> list[list[int]]:
-    """Round the cells of a table up or down at random, so that sums of rows and columns hold.
+    """Round the cells of a table up or down at random, keeping the sums of rows and columns.
 
     The expectation of every cell is its value, and the sum of a row or column is rounded up or down
-    as well (L. H. Cox, J. American Statistical Association 82, 1987). Another row and column make
-    all sums whole. While cells are not whole, a cycle of such cells along rows and columns in turn
-    is raised and lowered by the same amount until one of them is whole.
+    as well (L. H. Cox, J. American Statistical Association 82, 1987). An extra row and column make
+    all sums whole. While some cells are not whole, a cycle of such cells, alternately along rows
+    and columns, is raised and lowered in turn by the same amount until one of them is whole.
 
     Args:
         table: values of at least 0, with equally long rows.
@@ -91,7 +91,7 @@ def rounded(table: Sequence[Sequence[float]], rng: np.random.Generator) -> list[
 
 
 def _cycle(cells: Sequence[Sequence[int]], row: int) -> list[tuple[int, int]]:
-    """Cells that are not whole: two in each of some rows and columns, along these in turn."""
+    """Return a cycle of cells that are not whole, along rows and columns in turn, two in each."""
     lines, path = [(0, row)], list[tuple[int, int]]()  # a line is a row (0) or a column (1)
     while True:
         axis, index = lines[-1]
@@ -116,11 +116,11 @@ def weighted_share(
     *,
     confidence: float = 0.95,
 ) -> Share:
-    """The share of hits among the counted missions of a stratified sample, by weight.
+    """Return the weighted share of hits among the counted missions of a stratified sample.
 
     The interval adds the distances to the ends of the strata's Wilson intervals in quadrature
     (MOVER; G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so that a stratum without
-    hits still has a width. A stratum counts with its effective number, `kish`. The stratum's
+    hits still has a width. A stratum counts as its effective number, `kish`. The stratum's
     share of the counted missions is estimated too. This adds the square of (share of hits in the
     stratum - share of hits) times the variance of that share.
 
@@ -129,7 +129,7 @@ def weighted_share(
             in a uniform sample, which gives Wilson's interval.
 
     Returns:
-        The share, with the numbers of missions and hits as counted, and the effective number.
+        The share, with the unweighted numbers of missions and hits, and the effective number.
     """
     number = sum(hit and kept for hit, kept in zip(hits, counted, strict=True))
     plain = wilson(number, sum(counted), confidence=confidence)

@@ -240,7 +240,7 @@ def _closed_box(around: FloatArray, half: float = 3.0) -> MapSnapshot:
 
 
 def _clearance(path: FloatArray, snapshot: MapSnapshot) -> float:
-    """Exact distance between a path and the map, by FCL."""
+    """Return the distance between a path, sampled every 5 cm, and the map, by FCL."""
     tree = fcl.CollisionObject(fcl.OcTree(snapshot.resolution_m, snapshot.signed_bytes()))
     smallest = np.inf
     for start, end in itertools.pairwise(path):
@@ -276,7 +276,7 @@ class PlannerContract:
         goal: FloatArray = GOAL,
         params: PlanningParams = PARAMS,
     ) -> PlanningProblem:
-        """Return the problem between start and goal, (3,), ENU, m, in a map."""
+        """Return the problem of planning from start to goal, (3,), ENU, m, in a map."""
         return PlanningProblem.pose(snapshot, start, goal, BOUNDS, params)
 
     @pytest.fixture
@@ -434,6 +434,6 @@ class StreamTransportContract(TransportContract):
         self.introduce(near, far)
         self.send(far, Codec(2, 2), range(3))
         far.close()
-        assert self.receive(near, 3) == [0, 1, 2]  # data sent before still arrives
+        assert self.receive(near, 3) == [0, 1, 2]  # data sent before the close still arrives
         with pytest.raises(LinkLost):
             near.receive(WAIT_S)

@@ -1,8 +1,8 @@
 """The F-1 model (Krishnan et al., IEEE CAL 19(1), 2020): its vehicles, boards and equations.
 
-A vehicle that sees `range_m` far and takes `response_s` from sensing to acting must fly slowly
+A vehicle that senses up to `range_m` and takes `response_s` from sensing to acting must fly slowly
 enough to stop within that range. A board is the computer that it carries. A protection scheme costs
-copies of the board, or compute time. Vehicles and boards are one TOML file each. All units are SI.
+extra boards or compute time. Vehicles and boards are one TOML file each. All units are SI.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class _Calibration:
 class ModelVehicle:
     """A quadrotor of the model; a number is None until it has been calibrated."""
 
-    name: str  # of the vehicle
+    name: str  # name of the vehicle
     mass_kg: float  # frame, rotors and battery, without the boards
     rotor_pull_n: float | None = None  # thrust of all rotors at full throttle
-    response_s: float | None = None  # from sensing to acting, if no platform is named
+    response_s: float | None = None  # time from sensing to acting, if no platform is named
     range_m: float  # range of the sensor
     sensor_hz: float  # frame rate of the sensor
-    hover_power_w: float  # at mass_kg
+    hover_power_w: float  # power in hover at mass_kg
     battery_wh: float  # energy of the full battery
     tilt_deg: float = 0.0  # tilt of the rotors while braking
     board: str = ""  # a shipped board, if no platform is named
@@ -86,7 +86,7 @@ class ModelVehicle:
 
     @classmethod
     def load(cls, name_or_path: str) -> ModelVehicle:
-        """A shipped vehicle of the model by name, or a user's own by the path of its TOML file.
+        """Load a shipped vehicle by name, or a user's own by the path of its TOML file.
 
         Raises:
             UnknownName: no shipped vehicle has this name, and it is not a path to a TOML file.
@@ -111,8 +111,8 @@ class ModelVehicle:
 class Board:
     """One copy of the computer that the vehicle carries."""
 
-    name: str  # of the board
-    mass_kg: float  # without the heat sink
+    name: str  # name of the board
+    mass_kg: float  # mass without the heat sink
     power_w: float  # thermal design power
     heatsink_kgpw: float  # mass of the heat sink per watt of power_w
     description: str = ""  # for readers of the file
@@ -128,12 +128,12 @@ class Board:
 
     @classmethod
     def load(cls, name_or_path: str) -> Board:
-        """A shipped board by name, or a user's own by path. Raises as `ModelVehicle.load`."""
+        """Load a shipped board by name or a user's by path. Errors as in `ModelVehicle.load`."""
         return load_toml(BOARDS.path(name_or_path), cls)
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
-        """The board of a platform; a platform on the ground has neither mass nor power."""
+        """Return the board of a platform; a platform on the ground has neither mass nor power."""
         name = f"platform {platform.name}"
         sources = {key: f"{name}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:
@@ -156,7 +156,7 @@ class Scheme:
     name: str
     title: str
     copies: int = 1  # boards with their heat sinks
-    overhead: float = 0.0  # additional compute time, as a fraction of it
+    overhead: float = 0.0  # additional compute time, as a fraction of that without protection
     source: str = ""
 
 
@@ -174,7 +174,7 @@ DETECTORS = tuple(scheme.name for scheme in _SCHEMES if scheme.overhead > 0.0)
 
 
 def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme]:
-    """The schemes by name, with measured overheads in place of the paper's.
+    """Return the schemes by name, with measured overheads in place of the paper's.
 
     Args:
         overheads: detector name -> its overhead in per cent of the compute time, and the source
@@ -197,15 +197,15 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme
 
 
 GRAVITY_MPS2 = 9.80665
-KNEE_SHARE = 0.97  # of the roof; CAL20 gives no closed form, its Fig. 4 shows 0.96 to 0.97
+KNEE_SHARE = 0.97  # share of the roof; CAL20 gives no closed form, its Fig. 4 shows 0.96 to 0.97
 
 Number = TypeVar("Number", float, NDArray[np.float64])
 
 
 def acceleration_mps2(pull_n: float, mass_kg: float, tilt_rad: float = 0.0) -> float:
-    """Largest acceleration, CAL20 equation 2: (T cos(tilt) - m g) / m.
+    """Return the largest acceleration, CAL20 equation 2: (T cos(tilt) - m g) / m.
 
-    At zero or less the vehicle cannot lift its mass.
+    If it is zero or less, the vehicle cannot lift its mass.
 
     Args:
         pull_n: thrust of all rotors at full throttle, N.
@@ -216,7 +216,7 @@ def acceleration_mps2(pull_n: float, mass_kg: float, tilt_rad: float = 0.0) -> f
 
 
 def safe_velocity_mps(accel_mps2: float, response_s: Number, range_m: float) -> Number:
-    """Velocity from which the vehicle stops within `range_m`, CAL20 equation 3.
+    """Return the velocity from which the vehicle stops within `range_m`, CAL20 equation 3.
 
     v = a (sqrt(T^2 + 2 d / a) - T), the root of d = v T + v^2 / (2 a), written here without the
     difference of two nearly equal numbers: v = 2 d / (T + sqrt(T^2 + 2 d / a)).
@@ -231,12 +231,12 @@ def safe_velocity_mps(accel_mps2: float, response_s: Number, range_m: float) -> 
 
 
 def roof_mps(accel_mps2: float, range_m: float) -> float:
-    """Velocity that the body's dynamics allow with an instant response, m/s: sqrt(2 d a)."""
+    """Return the velocity that body dynamics allow with an instant response, m/s: sqrt(2 d a)."""
     return math.sqrt(2.0 * range_m * accel_mps2)
 
 
 def knee_hz(accel_mps2: float, range_m: float, share: float = KNEE_SHARE) -> float:
-    """Action throughput, Hz, at which the safe velocity is `share` of the roof.
+    """Return the action throughput, Hz, at which the safe velocity is `share` of the roof.
 
     Equation 3 solved for the throughput: f = sqrt(a / (2 d)) 2 share / (1 - share^2).
     """
@@ -244,9 +244,10 @@ def knee_hz(accel_mps2: float, range_m: float, share: float = KNEE_SHARE) -> flo
 
 
 def hover_power_w(known_w: float, known_kg: float, mass_kg: float) -> float:
-    """Rotor power in hover at another mass, W: momentum theory, P ~ (m g)^1.5 / sqrt(2 rho A).
+    """Return the rotor power in hover at another mass, W, by momentum theory.
 
-    Disc and figure of merit stay the same, so one known pair of power and mass is enough.
+    P ~ (m g)^1.5 / sqrt(2 rho A). Disc and figure of merit stay the same, so one known pair of
+    power and mass is enough.
     """
     return float(known_w * (mass_kg / known_kg) ** 1.5)
 
@@ -256,7 +257,7 @@ _J_PER_WH = 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Performance:
-    """Performance with a scheme, for hovering power and a straight path."""
+    """Performance with a scheme, at hover power on a straight path."""
 
     thrust_to_weight: float
     acceleration_mps2: float
@@ -270,7 +271,7 @@ class Performance:
     flight_time_s: float
     power_w: float  # rotors and boards
     energy_j: float
-    missions: float  # for each battery charge, not rounded
+    missions: float  # missions per battery charge, not rounded
     bound: str  # what limits the velocity
 
 
@@ -286,23 +287,23 @@ class ModelInputs:
     distance_m: float
 
     def carried_kg(self, copies: int) -> float:
-        """Mass of the boards and their heat sinks, kg."""
+        """Return the mass of the boards and their heat sinks, kg."""
         return copies * self.board.total_kg
 
     def mass_kg(self, copies: int) -> float:
-        """Mass of everything that flies, kg."""
+        """Return the mass of everything that flies, kg."""
         return self.vehicle.mass_kg + self.carried_kg(copies)
 
     def acceleration_mps2(self, copies: int) -> float:
-        """Largest acceleration, m/s^2; zero or less if the vehicle cannot lift its computer."""
+        """Return the largest acceleration, m/s^2; zero or less if the boards are too heavy."""
         return acceleration_mps2(self.pull_n, self.mass_kg(copies), self.vehicle.tilt_rad)
 
     def response_s(self, overhead: float = 0.0) -> float:
-        """Time from sensing to acting, s, CAL20 equation 1: the slower of sensor and computer."""
+        """Return the response time, s, CAL20 equation 1: the slower of sensor and computer."""
         return max(1.0 / self.vehicle.sensor_hz, self.compute_s * (1.0 + overhead))
 
     def velocity_mps(self, scheme: Scheme) -> float | None:
-        """Safe velocity with a scheme, m/s; None if the vehicle cannot lift it."""
+        """Return the safe velocity with a scheme, m/s; None if the vehicle cannot lift it."""
         accel = self.acceleration_mps2(scheme.copies)
         if accel <= 0.0:
             return None
@@ -319,10 +320,10 @@ class ModelInputs:
         )
 
     def performance(self, scheme: Scheme) -> Performance:
-        """Performance with a scheme.
+        """Return the performance with a scheme.
 
         Raises:
-            CannotLift: the rotors do not lift this many boards.
+            CannotLift: the rotors cannot lift this many boards.
         """
         vehicle, copies = self.vehicle, scheme.copies
         accel, velocity = self.acceleration_mps2(copies), self.velocity_mps(scheme)

@@ -27,7 +27,7 @@ from mavfi_cli.vpm.model import (
     safe_velocity_mps,
 )
 
-# How the latencies of a platform's kernels add up to one response time, and the words for it.
+# How the latencies of a platform's kernels combine into one response time, and the word for it.
 CHAINS: dict[str, tuple[Callable[[list[float]], float], str]] = {
     "serial": (sum, "sum"),
     "pipelined": (max, "slowest"),
@@ -55,7 +55,7 @@ class Choices:
     distance_m: float = 50.0
 
     def inputs(self, vehicle: ModelVehicle) -> ModelInputs:
-        """The model's inputs for a vehicle with its free number calibrated.
+        """Return the model's inputs for a vehicle with its free number calibrated.
 
         Raises:
             ConfigError: neither the vehicle nor the choices give a needed value.
@@ -102,7 +102,7 @@ class SchemeResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensitivityPoint:
-    """The answers at one value of a parameter; None if the vehicle cannot fly."""
+    """The results at one value of a parameter; None if the vehicle cannot fly."""
 
     value: float
     velocity_mps: float | None  # with the scheme REFERENCE
@@ -111,10 +111,10 @@ class SensitivityPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensitivity:
-    """The answers as one parameter varies.
+    """The results as one parameter varies.
 
-    An elasticity is d ln(answer) / d ln(parameter) at `value`: the change of the answer in per cent
-    for one per cent of the parameter.
+    An elasticity is d ln(result) / d ln(parameter) at `value`: the change of the result in per cent
+    if the parameter changes by one per cent.
     """
 
     parameter: str
@@ -145,7 +145,7 @@ class CalibratedNumber:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Curves:
-    """Safe velocity against action throughput, (n,), by the numbers of boards that can fly."""
+    """Safe velocity against action throughput, (n,), for each number of boards that can fly."""
 
     throughput_hz: list[float]
     velocity_mps: dict[int, list[float]]
@@ -184,7 +184,7 @@ def report(
     """Compute the model's numbers for each vehicle.
 
     Raises:
-        CannotLift: a vehicle does not lift even one board.
+        CannotLift: a vehicle cannot lift even one board.
         ConfigError: neither the vehicle nor the choices give a needed value.
     """
     return ModelReport(
@@ -195,7 +195,7 @@ def report(
 
 
 def _unlike_sources(schemes: Mapping[str, Scheme]) -> tuple[str, ...]:
-    """A note if one detector's overhead is from the paper and another's is not."""
+    """Return a note if one detector's overhead is from the paper and another's is not."""
     detectors = [schemes[name] for name in DETECTORS]
     papers = [scheme.name for scheme in detectors if scheme.source == TABLE_V]
     others = [scheme.name for scheme in detectors if scheme.source != TABLE_V]
@@ -231,7 +231,7 @@ def _vehicle(
 def _inputs(
     vehicle: ModelVehicle, choices: Choices
 ) -> tuple[ModelInputs, tuple[_Parameter, ...], CalibratedNumber | None]:
-    """Return the model's inputs, the same with their sources, and the calibration if there is one.
+    """Return the model's inputs, a table of them with sources, and the calibration if there is one.
 
     The response time is the first of: the command line's, the platform's, the vehicle's own.
     """
@@ -251,7 +251,7 @@ def _inputs(
     elif platform is not None:
         if platform.measured_factor is not None:
             raise ConfigError(
-                f"{platform.name} has latencies only while it flies: mavfi fly --realtime",
+                f"{platform.name} has latencies only in flight: mavfi fly --realtime",
                 key="platform",
             )
         combined, how = CHAINS[choices.chain]
@@ -274,14 +274,14 @@ def _inputs(
 
 
 def _with_number(vehicle: ModelVehicle, parameter: str, value: float) -> ModelVehicle:
-    """The vehicle with a value for the number that is to be calibrated."""
+    """Return the vehicle with a value for the number that is to be calibrated."""
     if parameter == "response_s":
         return replace(vehicle, calibration=None, response_s=value)
     return replace(vehicle, calibration=None, rotor_pull_n=value)
 
 
 def _with_board(vehicle: ModelVehicle, board: Board, distance_m: float) -> ModelInputs:
-    """The inputs for a vehicle that has all numbers."""
+    """Return the inputs for a vehicle whose numbers are all known."""
     assert vehicle.rotor_pull_n is not None
     assert vehicle.response_s is not None
     return ModelInputs(
@@ -296,7 +296,7 @@ def _notes(
     inputs: ModelInputs,
     calibration: CalibratedNumber | None,
 ) -> list[str]:
-    """List the values that did not change with the computer, although a user may expect it."""
+    """List the values that did not change with the computer, although a user may expect them to."""
     notes, board = [], inputs.board
     own_time = choices.platform is None and choices.response_s is None
     calibrated_time = calibration is not None and calibration.parameter == "response_s"
@@ -449,7 +449,7 @@ def _elasticity(below: float | None, above: float | None) -> float | None:
 
 
 def _time_ratio(inputs: ModelInputs, schemes: Mapping[str, Scheme], scheme: str) -> float | None:
-    """Flight time of a scheme divided by that of REFERENCE; None if either cannot fly."""
+    """Return the flight time of a scheme over that of REFERENCE; None if either cannot fly."""
     fast, slow = (inputs.velocity_mps(schemes[name]) for name in (REFERENCE, scheme))
     return None if fast is None or slow is None else fast / slow
 
@@ -478,7 +478,7 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     parameter, wanted = calibration.parameter, calibration.tmr_time_ratio
 
     def time_ratio(value: float, scheme: str = "tmr") -> float:
-        """Flight time of a scheme divided by REFERENCE's; infinite if one of them cannot fly."""
+        """Return the flight time of a scheme over REFERENCE's; infinite if either cannot fly."""
         inputs = _with_board(_with_number(vehicle, parameter, value), board, 1.0)
         ratio = _time_ratio(inputs, SCHEMES, scheme)
         return math.inf if ratio is None else ratio

@@ -107,7 +107,7 @@ def test_a_corridor_around_the_golden_path(fly):
         ("[program.a]\ncomand = 'true'", ConfigError, "did you mean 'command'"),
         ("[program.a]\ncommand = 'true'\nrestart = 'allways'", ConfigError, "always"),
         ("[program.a]\ncommand = 'true'\nfolder = 'none'", ConfigError, "no such folder"),
-        ("[program.a]\ncommand = 'true'\nready_line = '('", ConfigError, "no regular expression"),
+        ("[program.a]\ncommand = 'true'\nready_line = '('", ConfigError, "be a regular expression"),
         ("[program.a]\ncommand = 'true'\n[success]\nexit = 'b'", ConfigError, "unknown program"),
         ("[program.a]\ncommand = 'true'\n[success]\ncorridor_m = 1", ConfigError, "golden"),
         ("link = 'udpin:127.0.0.1:0'\n[program]", ConfigError, "at least one program"),
