@@ -1,4 +1,4 @@
-"""The numbers of the performance model beside those of its flights."""
+"""The numbers of the performance model, compared with those of its flights."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ NOT_SCALED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSetup:
-    """The parameters of a vehicle under a scheme that the comparison with the model needs.
+    """The parameters of a vehicle with a scheme, as needed for the comparison with the model.
 
     Attributes:
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
         rotors_w: electrical hover power with all boards.
         boards_w: power of all boards.
-        cut: values of the model that exceed the limits of a mission, in words.
+        cut: phrases for the model's values that were cut to the limits of a mission.
     """
 
     v_max_mps: float
@@ -54,7 +54,7 @@ class FlightSetup:
     cut: tuple[str, ...] = ()
 
     def energy_j(self, flights: pa.Table) -> FloatArray:
-        """Electrical energy of rotors and boards for each flight, (n,); NaN if it has none.
+        """Return the electrical energy of rotors and boards in each flight, (n,); NaN if unknown.
 
         It is the shaft energy, scaled by the ratio of the model's hover power to the simulated
         vehicle's, plus the boards' power times the flight time. The ratio is the same for any
@@ -69,7 +69,7 @@ class FlightSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelAndFlights:
-    """A number in the model and in its flights, with the difference relative to the model."""
+    """A number from the model and from its flights; their difference is relative to the model."""
 
     model: float
     flights: Interval
@@ -88,8 +88,8 @@ class FlownNumbers:
 
     Attributes:
         outcomes: number of flights by outcome, the most frequent first.
-        errors: reasons of missions that could not begin.
-        path_ratio: distance over the straight distance.
+        errors: reasons why missions could not begin.
+        path_ratio: distance flown / straight-line distance.
         shaft_energy_j, hover_shaft_w, replans, alarms: means.
     """
 
@@ -124,11 +124,11 @@ class _FlownRatios:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownScheme:
-    """A scheme in flight.
+    """The flights of a scheme.
 
     Attributes:
-        problem: the reason why it was not flown; it then has no numbers.
-        over_none, over_aad: None if the other scheme was not flown.
+        problem: why there are no flights, and so no numbers; None if there are.
+        over_none, over_aad: ratios to the scheme `none` or `aad`; None if that was not flown.
     """
 
     scheme: str
@@ -144,7 +144,7 @@ class FlownScheme:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownVehicle:
-    """All schemes of a vehicle in flight."""
+    """The flights of all schemes of a vehicle."""
 
     vehicle: str
     board: str
@@ -153,7 +153,7 @@ class FlownVehicle:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredOverhead:
-    """The overhead of a detector in these flights, beside the paper's."""
+    """The overhead of a detector in these flights, and the paper's."""
 
     detector: str
     flights: int
@@ -165,7 +165,7 @@ class MeasuredOverhead:
 
     @classmethod
     def of(cls, overhead: ComputeOverhead) -> MeasuredOverhead:
-        """Convert an overhead to per cent, beside the paper's."""
+        """Convert an overhead to per cent, and add the paper's."""
         return cls(
             detector=overhead.detector,
             flights=overhead.flights,
@@ -203,7 +203,7 @@ def side_by_side(
     """Compare the flights of each vehicle and scheme with the model.
 
     Args:
-        model: the model's report, with the overheads with which the schemes were flown.
+        model: the model's report, for the overheads that the schemes had in flight.
         setups: setup of each vehicle and scheme, or the reason why it cannot be flown.
         flights: as in `analysis.flights`, with the labels `group` for the vehicle and `arm` for the
             scheme.
@@ -224,13 +224,13 @@ class _Arm:
 
     performance: Performance
     setup: FlightSetup
-    flights: pa.Table  # of all its missions
+    flights: pa.Table  # all its missions
 
     def numbers(self) -> FlownNumbers:
         ended, setup, performance = flown(self.flights), self.setup, self.performance
         won = chosen(ended, succeeded=True)
         straight_m = numbers(won, "straight_m")
-        # The straight distance at the model's velocity.
+        # Mean flight time along a straight line at the model's velocity.
         model_s = _mean(straight_m / performance.velocity_mps).value
 
         def beside(model: float, values: FloatArray | str) -> ModelAndFlights:
@@ -258,7 +258,7 @@ class _Arm:
         )
 
     def over(self, base: _Arm) -> _FlownRatios:
-        """Ratios to another scheme on the same missions."""
+        """Compute the ratios to another scheme on the same missions."""
         own, other = paired(flown(self.flights), flown(base.flights), PLACE)
         both = flags(own, "succeeded") & flags(other, "succeeded")
         own, other = (

@@ -1,10 +1,10 @@
 """Evaluate detectors with and without faults: counts of pairs, each with its interval.
 
-Pairs are flights of one mission: golden, faulty, and faulty with a detector. Faults that were not
-injected or not read are counted separately and enter no other number. The same holds for faults in
-missions whose golden flight fails, because nothing can harm these. Detectors fly all harmful faults
-and the harmless ones of `complete` missions. The effect of a fault is taken from the unprotected
-flight, because a detector may withhold the value before it is read.
+A pair holds the flights of one mission: golden, faulty, and faulty with a detector. Faults that
+were not injected or not read are counted separately and enter no other number. The same holds for
+faults in missions whose golden flight fails, because no fault can harm those. All harmful faults
+are repeated with every detector; harmless ones only in `complete` missions. The effect of a fault
+is taken from the unprotected flight, because a detector may withhold the value before it is read.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from mavfi_cli.stats.paired import OWN, McNemar, WorstCase, holm
 from mavfi_cli.stats.roc import Curves
 from mavfi_cli.stats.shares import Interval, Share, mixture, wilson
 
-NONE = "none"  # no detector: the reference of all others
+NONE = "none"  # no detector: the reference for all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
-KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; a golden flight has two
-# Columns from which pairs are made; the labels are those of KEY, the kind and the detector.
+KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; golden flights have only two
+# Columns used to form pairs, in addition to the labels: KEY, kind and detector.
 WANTED = (
     "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
     "crashed", "alarms", "alarm_count", "episodes", "path",
@@ -53,7 +53,7 @@ SCHEMA = pa.schema(
     | {"faulty_lengthening": _NUMBER, "faulty_struck_s": _NUMBER, "golden_path": _TEXT,
        "faulty_path": _TEXT}
 )  # fmt: skip
-# A flight, as its row in SCHEMA names its own values.
+# A single flight, with the column names that SCHEMA uses for it.
 _FLOWN = pa.schema(
     [(name, CSV[name]) for name in ("kind", "detector", *KEY, "injected", "state", "bits",
                                     "crashed", "outcome", "time_s", "struck_s", "alarms",
@@ -62,14 +62,14 @@ _FLOWN = pa.schema(
 )  # fmt: skip
 # Effects of a fault on an unprotected flight, compared with its golden flight.
 HARMLESS = "none"
-LOST = "lost"  # this one does not reach the goal
-LATE = "longer"  # both do, this one takes more than LONGER times as long
+LOST = "lost"  # the flight does not reach the goal
+LATE = "longer"  # both reach the goal, but the flight takes more than LONGER times as long
 RESAMPLES = 999
 TICKS_PER_S = SessionSettings().state_rate_hz  # one control tick per state message
 ALL = "all"
 GROUPS = (ALL, "world", "stage", "field", "state")  # labels by which faults are grouped
 _NOTHING_SEEN = -math.log(0.025)  # upper 95 % limit of a Poisson count that was 0
-# Harmful faults with their scores, and the scores of error-free flights, for each detector.
+# Maps a detector to its harmful faults with their scores, and to its scores of error-free flights.
 Scored = Callable[[str], tuple[pa.Table, list[float]]]
 
 
@@ -78,17 +78,17 @@ Scored = Callable[[str], tuple[pa.Table, list[float]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorFreeRow:
-    """A detector on flights without faults, compared with the same flights without it.
+    """Results of a detector on error-free flights, compared with the same flights without it.
 
     Attributes:
         by, value: label by which the flights are grouped, and its value.
         hours: flight time with the detector, from take-over to the end of the mission.
-        alarms, episodes: number of alarms; the same with consecutive alarms counted once.
-        alarms_per_hour: bootstrap over flights; with no alarm at all, a Poisson upper limit.
-        with_alarm: flights with at least one.
-        lost, gained: golden successes that fail with the detector; golden failures that succeed.
-        success: golden first.
-        lengthening: median of flight time over golden flight time, minus 1, where both succeed.
+        alarms, episodes: number of alarms, and of runs of consecutive alarms.
+        alarms_per_hour: its interval is a bootstrap over flights, or Poisson without any alarm.
+        with_alarm: share of flights with at least one alarm.
+        lost, gained: golden successes that fail with the detector; failures that succeed with it.
+        success: counts of pairs by success; the golden flight is the first.
+        lengthening: median of flight time / golden flight time - 1, where both succeed.
     """
 
     by: str
@@ -110,16 +110,17 @@ class ErrorFreeRow:
 class _WorstFlight:
     """The worst successful flight time and its recovery, as in the paper's section VII-A.
 
-    The paper flies one world with one seed. Here every mission has its own seed, so every flight is
+    The paper uses one world with one seed. Here every mission has its own seed, so every flight is
     compared with its own golden flight.
 
     Attributes:
-        faulty, protected: the largest flight time over golden flight time, minus 1.
-        recovered: how much lower the second is, relative to the golden flight time. Resampled
-            missions never contain a worse case than the worst observed one, so the interval shows
-            how much it depends on single flights, not how bad it can become.
-        recovered_share: recovered share of the increase; NaN if no flight took more than LONGER
-            times as long.
+        faulty, protected: the largest flight time / golden flight time - 1, without and with
+            the detector.
+        recovered: `faulty` minus `protected`, each at least 0. Resampled missions never contain a
+            worse case than the worst observed one, so the interval shows how much the value depends
+            on single flights, not how bad the worst case can become.
+        recovered_share: recovered share of the increase; NaN if no unprotected flight took more
+            than LONGER times as long.
     """
 
     faulty: float
@@ -130,32 +131,33 @@ class _WorstFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultRow:
-    """A detector on flights with faults. Shares after `active` concern active faults only.
+    """Results on flights with faults. All shares but `detected_inactive` cover active faults only.
 
     Attributes:
         by, value: label by which the faults are grouped, and its value.
         planned: number of faults, divided into `not_injected`, `not_activated` (never read),
-            `golden_failed` (the mission fails without the fault as well) and `active`.
-        crashed: faults that killed a node, which are noticed without any detector.
+            `golden_failed` (the mission fails even without the fault) and `active`.
+        crashed: faults that killed a node, which is noticed even without a detector.
         harmful: `lost` or `longer`.
-        flown: faults flown with this detector: all harmful ones, and the harmless ones of complete
-            missions.
-        not_struck: those that never struck because the protected flight had diverged; they enter
-            no rate of detection.
-        latency_s, latency_s_p95: median and 95th percentile from strike to alarm, harmful faults.
+        flown: number of faults repeated with this detector: all harmful ones, and the harmless
+            ones of complete missions.
+        not_struck: how many of these never struck because the protected flight had diverged; no
+            detection rate includes them.
+        latency_s, latency_s_p95: median and 95th percentile of the time from the strike of a
+            harmful fault to the alarm.
         detected_harmful: harmful faults with an alarm at or after the strike.
         detected_active: the same for all faults of complete missions.
         detected_inactive: the same for faults that struck but were not activated.
-        by_chance: flights of complete missions that have an alarm in that time even without their
-            fault.
+        by_chance: flights of complete missions in which, even without the fault, the detector
+            raises an alarm at or after the time of the strike.
         recovered: lost missions that succeed with the detector.
         undone: harmful faults that do no harm with the detector.
         added: harmless faults that do harm with the detector.
-        unprotected: success rate of all missions with an active fault.
-        protected: the same with the detector: `share`, `low` and `high` of harmful and harmless
-            faults, each with its own rate, weighted by their numbers.
-        success: on complete missions, unprotected first.
-        worst: worst case over the flown faults.
+        unprotected: success rate of all missions with an active fault, without the detector.
+        protected: the same with the detector, as `share`, `low` and `high`: the rates for harmful
+            and for harmless faults, weighted by the numbers of these faults.
+        success: counts of pairs on complete missions by success; the unprotected flight is first.
+        worst: worst case over the faults in `flown`.
     """
 
     by: str
@@ -191,7 +193,7 @@ class FaultRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CorrectedTest:
-    """McNemar's test of two detectors, with its p-value corrected over all of them by Holm."""
+    """McNemar's test of two detectors; Holm's correction covers all comparisons of its kind."""
 
     both: int
     only_first: int
@@ -221,12 +223,12 @@ class DetectorCurves(Curves):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluatedPlan:
-    """The plan that an evaluation flew.
+    """The plan of an evaluation.
 
     Attributes:
-        detectors: threshold and digest of the model, by name.
+        detectors: threshold and model digest of each detector, by name.
         places: stage, target and bit field of each kind of fault.
-        mission: parameters of all missions that are not the defaults.
+        mission: common parameters of all missions that differ from the defaults.
     """
 
     worlds: tuple[str, ...]
@@ -268,18 +270,18 @@ class Evaluation:
 def pairs_of(
     flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
 ) -> tuple[pa.Table, pa.Table]:
-    """Return all pairs whose flights are complete: those without a fault, and those with one.
+    """Return all complete pairs: those without a fault, and those with one.
 
     Args:
         flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
-        complete: whether all faults of the mission with this seed are flown with detectors.
+        complete: whether all faults of the mission with this seed are repeated with detectors.
 
     Returns:
         Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and a
-        node read the value or may have. `judged`: the golden flight succeeds as well. `struck`: the
-        protected flight was struck too; otherwise there was nothing to detect. `seen`: it had an
-        alarm at or after the strike. `by_chance`: the detector also raises one after that time
-        without the fault.
+        node read the value or may have read it. `judged`: also, the golden flight succeeds.
+        `struck`: the protected flight was struck too; otherwise there was nothing to detect.
+        `seen`: it had an alarm at or after the strike. `by_chance`: the detector raises an alarm at
+        or after that time even without the fault.
     """
     rows = [row for table in flights for row in _rows_of(table)]
     alarms = [row.pop("all_alarms") for row in rows]
@@ -335,7 +337,7 @@ def pairs_of(
 
 
 def _rows_of(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """The flights as rows of _FLOWN, with time and stage of each alarm in `all_alarms`."""
+    """Yield flights as rows of _FLOWN, with the time and stage of each alarm in `all_alarms`."""
     labels = [name for name in ("kind", "detector", *KEY) if f"label_{name}" in table.column_names]
     for row in table.select([*(f"label_{name}" for name in labels), *WANTED]).to_pylist():
         yield {
@@ -354,14 +356,14 @@ def _rows_of(table: pa.Table) -> Iterator[dict[str, Any]]:
 def _first_alarm(
     alarms: Iterable[tuple[float, str]], from_s: float | None
 ) -> tuple[float, str] | None:
-    """The first alarm at that time or later; None if there is none."""
+    """Return the first alarm at or after `from_s`; None if there is none."""
     if from_s is None:
         return None
     return next((alarm for alarm in alarms if alarm[0] >= from_s - 1e-9), None)
 
 
 def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
-    """The columns of SCHEMA that follow from a flight and its golden flight, and the `harm`."""
+    """Return the columns of SCHEMA, with `harm`, that follow from flights and their golden ones."""
     lost = pc.invert(flown["won"])
     over, harmed = against_golden(pc.invert(golden["won"]), golden["time_s"], lost, flown["time_s"])
     harm = pc.if_else(harmed, pc.if_else(lost, LOST, LATE), HARMLESS)
@@ -377,7 +379,7 @@ def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
 
 
 def _table_of(columns: dict[str, Any], rows: int) -> pa.Table:
-    """A table of SCHEMA; columns that are missing or None are empty."""
+    """Return a table with SCHEMA; columns that are missing or None are empty."""
     arrays = []
     for field in SCHEMA:
         values = columns.get(field.name)
@@ -390,7 +392,7 @@ def _table_of(columns: dict[str, Any], rows: int) -> pa.Table:
 
 
 def harmful(faults: pa.Table) -> pa.Table:
-    """The pairs without a detector whose fault did harm."""
+    """Return the pairs without a detector whose fault did harm."""
     return chosen(faults, detector=NONE, harm=(LOST, LATE))
 
 
@@ -404,13 +406,13 @@ def results(
     scored: Scored,
     **about: Any,
 ) -> Evaluation:
-    """Results of the pairs.
+    """Compute the results of the pairs.
 
     Args:
         detectors: all of them, `none` first.
         error_free, faults: as `pairs_of` returns them.
-        scored: for each detector its harmful faults with the columns `stage`, `field` and `score`,
-            and the scores of its error-free flights.
+        scored: returns a detector's harmful faults with the columns `stage`, `field` and `score`,
+            and its scores of the error-free flights.
         about: the other fields of the evaluation.
     """
     return Evaluation(
@@ -431,7 +433,7 @@ def results(
 def _grouped(
     detectors: Sequence[str], pairs: pa.Table, groups: Sequence[str]
 ) -> Iterator[tuple[str, str, str, pa.Table]]:
-    """Group, value, detector and pairs, in the order of first occurrence of the values."""
+    """Yield group, value, detector and pairs, in the order in which the values first occur."""
     for by in groups:
         values = pc.unique(pairs[by]).to_pylist() if by != ALL else [ALL] * bool(pairs.num_rows)
         for value, detector in itertools.product(values, detectors):
@@ -443,7 +445,7 @@ def _part(pairs: pa.Table, by: str, value: str, detector: str) -> pa.Table:
 
 
 def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorComparison]:
-    """Compare every two detectors on the same faults, with p-values corrected over all."""
+    """Compare every two detectors on the same faults, correcting p-values over all comparisons."""
     names = [*itertools.combinations(detectors, 2)]
     tests = [_recoveries(*(chosen(faults, detector=name) for name in two)) for two in names]
     recovered, undone = (
@@ -460,7 +462,7 @@ def _comparisons(detectors: Sequence[str], faults: pa.Table) -> list[DetectorCom
 
 
 def _recoveries(first: pa.Table, second: pa.Table) -> tuple[McNemar, McNemar]:
-    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+    """Test two detectors on the same harmful faults: lost missions recovered, and harm undone."""
     here, there = paired(chosen(first, harm=(LOST, LATE)), second, KEY)
     lost = pc.equal(here["harm"], LOST)
     return (
@@ -502,7 +504,7 @@ def _error_free_row(by: str, value: str, detector: str, pairs: pa.Table) -> Erro
 
 
 def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
-    """Alarms per hour of the flights with a flight time; a mission that was cut off has none."""
+    """Return alarms per flight hour, leaving out missions that were cut off without flight time."""
     alarms, hours = alarms[hours > 0.0], hours[hours > 0.0]
     total = float(hours.sum())
     if total > 0.0 and not alarms.any():
@@ -515,7 +517,7 @@ def _rate_per_hour(alarms: FloatArray, hours: FloatArray) -> Interval:
 
 
 def _fault_row(by: str, value: str, detector: str, bare: pa.Table, pairs: pa.Table) -> FaultRow:
-    """A row of the faults without a detector, and of those that were flown with it."""
+    """Return the row of a group: `bare` has its pairs without a detector, `pairs` those with it."""
     injected = bare.filter(pc.not_equal(bare["injected"], Injected.NOT_INJECTED.value))
     active, judged = chosen(injected, active=True), chosen(injected, judged=True)
     counts = {harm: chosen(judged, harm=harm).num_rows for harm in (HARMLESS, LOST, LATE)}
@@ -582,8 +584,8 @@ def _worst(pairs: pa.Table) -> _WorstFlight:
     faulty, protected = faulty[usable], protected[usable]
 
     def recovered(rows: IntArray) -> FloatArray:
-        """Reduction of the worst increase by protection, (k,), for resamples of missions (k, n)."""
-        # A resample without a successful flight of a kind counts as having no longer flight.
+        """Return the reduction of the worst increase, (k,), for resamples of missions (k, n)."""
+        # A resample in which all flights of a kind failed counts as having no increase.
         worst = [np.maximum(times[rows].max(axis=-1), 0.0) for times in (faulty, protected)]
         return np.asarray(worst[0] - worst[1])
 

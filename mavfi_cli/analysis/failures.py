@@ -3,8 +3,8 @@
 Every injected fault counts if the golden flight of its mission succeeds, even if nothing read it.
 `mavfi kernels` counts such a flip as a benign run, so both count the same population.
 
-The flights of a user's companion do not repeat. Every injected fault counts there, and the failures
-of all golden flights stand beside.
+The flights of a user's companion are not repeatable. There every injected fault counts, and the
+failures of all golden flights are given for comparison.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class SettingFailures:
 
     Attributes:
         name: phrase for the setting.
-        failure: share of injected faults that fail a mission whose golden flight succeeds, or
-            that fail any mission if flights do not repeat.
-        golden: share of golden flights that fail, if flights do not repeat; None for pairs.
+        failure: share of injected faults whose mission fails; only missions whose golden flight
+            succeeds count, unless flights are not repeatable.
+        golden: share of golden flights that fail, if flights are not repeatable; None for pairs.
         kernel: the only kernel that its faults strike at instruction level; None if there are
             several.
-        layers: SDC of the isolated kernel beside it; None without runs of the isolated kernel.
+        layers: comparison with the SDCs of the isolated kernel; None without runs of that kernel.
         per_hour: failures per flight hour with the ends of the interval; None unless requested.
-            If flights do not repeat, the failures beyond those of golden flights.
+            If flights are not repeatable, only failures in excess of those of golden flights.
     """
 
     labels: Labels
@@ -58,15 +58,16 @@ def setting_failures(
     upsets_per_hour: float | None = None,
     confidence: float = 0.95,
 ) -> list[SettingFailures]:
-    """Failures of every setting with faults that has golden flights.
+    """Compute the failures of every setting with faults that has golden flights.
 
     Args:
-        kernels: folder of a summary of isolated kernels; None for no layers.
+        kernels: folder with a summary of isolated kernels; None leaves out `layers`.
         upsets_per_hour: bit flips that reach the injection sites per flight hour.
 
     Raises:
         RecordError: the folder does not exist or cannot be read.
-        ConfigError: the kernels were attacked with other faults, or the rate is negative.
+        ConfigError: the kernels were attacked with other faults or the sample is stratified, both
+            only with `kernels`; or the rate is negative.
     """
     alone = None if kernels is None else KernelSummary.read(kernels / KERNELS)
     silent = {own.name: own.outcomes["sdc"] for own in alone.kernels} if alone else {}
@@ -109,7 +110,7 @@ def setting_failures(
 def _unpaired(
     groups: Sequence[Group], upsets_per_hour: float | None, confidence: float
 ) -> Iterator[SettingFailures]:
-    """Failures of the settings with faults whose flights do not repeat."""
+    """Yield the failures of the settings with faults whose flights are not repeatable."""
     for group in groups:
         golden, places = group.golden_among(groups), group.among("injected", _STRUCK)
         if golden is None or not places.any():
@@ -131,7 +132,7 @@ def _unpaired(
 
 
 def _kernel(configs: Sequence[MissionConfig]) -> str | None:
-    """The only kernel that these missions attack, by its name in `mavfi kernels`."""
+    """Return the name in `mavfi kernels` of the only kernel that these missions attack, or None."""
     faults = [config.instruction for config in configs]
     if not faults or any(fault is None for fault in faults):
         return None

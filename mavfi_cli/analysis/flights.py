@@ -57,8 +57,8 @@ EXPORTED = (
     "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
     "wall_s", *COSTS, "attempts", "path", STRATUM, WEIGHT, "changes",
 )  # fmt: skip
-BITS = pa.list_(pa.list_(pa.int64()))  # of each struck component, its bits
-_TYPES = {  # of the columns that are not text, even if they hold no value
+BITS = pa.list_(pa.list_(pa.int64()))  # a list of bits for each struck component
+_TYPES = {  # types of the columns that are not text, in case they hold no value
     "struck_bits": BITS,
     **dict.fromkeys(
         ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
@@ -69,7 +69,7 @@ _TYPES = {  # of the columns that are not text, even if they hold no value
 }  # fmt: skip
 # Labels in which protected flights differ from unprotected ones.
 TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
-SETTLING = "settling"  # meta of a reproduction whose claims were settled (`reproduce --settle`)
+SETTLING = "settling"  # metadata of a reproduction that settled claims (`reproduce --settle`)
 _HOST = ("machine", "cores", "started")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -78,7 +78,7 @@ IntArray = NDArray[np.int64]
 def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     """Return the finished missions. Missions that could not begin have the state `error`.
 
-    The columns are the measures of `mission.measures`, the requested values of CONFIG and of the
+    The columns are the measures of `mission.measures`, the values requested for CONFIG and for the
     fault's FAULT, each label as `label_NAME`, and all labels as text in `labels`. `succeeded` means
     that the mission reached its goal. `counted` means that it is golden, or that its fault struck
     something that was read or caught. `check_share` and `recovery_share_STAGE` are the shares of
@@ -93,7 +93,7 @@ def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
         return table if among is None else chosen(table, number=(*among,))
     labels = sorted({name for cell in ledger.cells() for name in cell})
     rows = [_row(entry, labels) for entry in ledger.results(among)]
-    names = _row(_NOTHING, labels)  # the columns of a ledger without results, too
+    names = _row(_NOTHING, labels)  # gives the columns even without results
     return pa.table({name: _column([row[name] for row in rows]) for name in names})
 
 
@@ -142,7 +142,7 @@ def _row(entry: MissionResult, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def _column(values: Sequence[Any]) -> pa.Array:
-    """A column of one type; labels of mixed types become text."""
+    """Return a column of one type; labels of mixed types become text."""
     kinds = {type(value) for value in values if value is not None}
     if len(kinds) > 1 and kinds != {int, float}:
         values = [None if value is None else str(value) for value in values]
@@ -150,12 +150,12 @@ def _column(values: Sequence[Any]) -> pa.Array:
 
 
 def untreated(labels: Labels) -> str:
-    """The labels that protected and unprotected flights with the same faults share, as text."""
+    """Return, as text, the labels common to protected and unprotected flights with equal faults."""
     return canonical({name: value for name, value in labels.items() if name not in TREATMENT})
 
 
 def chosen(table: pa.Table, **values: Any) -> pa.Table:
-    """The rows with these values. None matches empty cells; a tuple matches any of its items."""
+    """Return rows with these values. None matches empty cells; a tuple matches any of its items."""
     for name, value in values.items():
         allowed = value if isinstance(value, tuple) else (value,)
         equal = (
@@ -166,7 +166,7 @@ def chosen(table: pa.Table, **values: Any) -> pa.Table:
 
 
 def flown(table: pa.Table) -> pa.Table:
-    """The rows of missions that ended with any outcome, without those that could not begin."""
+    """Return the rows of missions that have an outcome, without those that could not begin."""
     return table.filter(pc.equal(table["state"], ResultState.FLOWN.value))
 
 
@@ -177,25 +177,25 @@ def errors(table: pa.Table, phrase: str) -> list[str]:
 
 
 def numbers(table: pa.Table, name: str) -> FloatArray:
-    """A column as floats, (n,); NaN if a cell is empty."""
+    """Return a column as floats, (n,); NaN for empty cells."""
     column = table[name].cast(pa.float64())
     return np.asarray(column.fill_null(math.nan).to_numpy(), dtype=np.float64)
 
 
 def flags(table: pa.Table, name: str) -> BoolArray:
-    """A column of truth values, (n,)."""
+    """Return a boolean column, (n,)."""
     return np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=bool)
 
 
 def known(values: FloatArray) -> FloatArray:
-    """The values that are not NaN."""
+    """Return the values that are not NaN."""
     return values[~np.isnan(values)]
 
 
 def exported(ledger: Ledger) -> pa.Table:
     """Return one row per finished mission, in the order of the list, with the labels as columns.
 
-    The metadata of the table hold its provenance.
+    The table's metadata contain its provenance.
     """
     whole = flights(ledger)
     if ledger.export is not None:
@@ -216,7 +216,7 @@ def read_export(path: Path) -> pa.Table:
 
 def _updated(table: pa.Table, path: Path) -> pa.Table:
     place = table.schema.get_field_index("struck_bits")
-    if place >= 0 and pa.types.is_string(table.schema.field(place).type):  # as in "53;1 55"
+    if place >= 0 and pa.types.is_string(table.schema.field(place).type):  # like "53;1 55"
         try:
             bits = [_parsed(text) for text in table["struck_bits"].to_pylist()]
         except ValueError as error:
@@ -234,7 +234,7 @@ def _parsed(text: str | None) -> list[list[int]] | None:
 
 
 def _typed(table: pa.Table) -> pa.Table:
-    """Give columns without values the types that they have when they hold values."""
+    """Give columns without values the types that they would have with values."""
     kinds = {
         field.name: _TYPES.get(field.name, pa.string())
         for field in table.schema
@@ -253,7 +253,7 @@ def provenance(source: Ledger | pa.Table) -> dict[str, Any]:
 
     Returns:
         `name` of the campaign; `planned`, the number of missions on its list; `sampling`, how its
-        faults were drawn; `settling`, what was flown to settle claims; `versions` of the programs;
+        faults were drawn; `settling`, how claims were settled; `versions` of the programs;
         and `host`, with the `machine`, `cores` and `started` of the first record.
     """
     table = source if isinstance(source, pa.Table) else source.export
@@ -322,7 +322,7 @@ def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str,
 
 
 def number_span(ledger: Ledger) -> str:
-    """The range of a campaign's mission numbers, such as `missions 0 to 199`."""
+    """Return the range of a campaign's mission numbers, such as `missions 0 to 199`."""
     numbers = [number for number, *_ in ledger.rows()]
     return f"missions {min(numbers)} to {max(numbers)}" if numbers else "no missions"
 

@@ -39,9 +39,9 @@ class KernelSummary:
     """A summary of attacked kernels.
 
     Attributes:
-        faults: the way in which they were drawn: `rule`, `compat` and `model`.
+        faults: how the faults were drawn: `rule`, `compat` and `model`.
         seed: seed of the faults.
-        flight: the flight whose inputs the kernels had.
+        flight: the flight that the kernels' inputs come from.
     """
 
     path: Path
@@ -52,12 +52,12 @@ class KernelSummary:
 
     @property
     def runs(self) -> int:
-        """Runs of all kernels."""
+        """Number of runs of all kernels."""
         return sum(kernel.runs for kernel in self.kernels)
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a summary; RecordError if the file is missing or is no summary."""
+        """Read a summary; RecordError if the file is missing or is not a summary."""
         try:
             data = json.loads(read_bounded(path, _LARGEST))
             plan = data["plan"]

@@ -30,9 +30,9 @@ from mavfi_cli.stats.shares import Interval
 
 MEASURED = "measured"  # first word of the source of a measured overhead
 TIMES = " x "  # separates a platform's name from its latency factor in a file name
-NEAR = 0.1  # latency factors within this distance of 1 are still the platform
+NEAR = 0.1  # with a latency factor this close to 1, a variant counts as the platform itself
 _STAGES = tuple(stage.value for stage in Stage)
-# Places of ledgers: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
+# Paths of ledgers: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
 _LEDGERS = (LEDGER, f"protected/*/{LEDGER}", f"flights/{LEDGER}")
 
 
@@ -47,13 +47,12 @@ class FlightOverhead:
         labels: labels of the setting, including the detector.
         flights: number of flights with checks.
         checks_per_s: checks per second of flight.
-        check_host_s: mean time of a check on the host that flew.
-        detection_host_share: share of all checks, in time of the host that flew.
+        check_host_s: mean time of a check on the host of the flight.
+        detection_host_share: time of all checks on that host, as a share.
         recomputations: number in all flights, by stage.
         recovery_share: simulated latency of recomputations, by stage.
         recovery_share_in_all: its sum over the stages.
-        share_in_all: detection and recovery, host time and simulated time added up as the paper
-            does.
+        share_in_all: detection plus recovery; adds host time and simulated time, as the paper does.
     """
 
     labels: Labels
@@ -106,7 +105,7 @@ class FlightOverhead:
 def flight_overheads(
     ledger: Ledger, groups: Sequence[Group], confidence: float = 0.95
 ) -> list[FlightOverhead]:
-    """Overheads of every setting with a detector; one row for each detector of a setting.
+    """Compute the overheads of every setting with a detector, one row per setting and detector.
 
     Raises:
         RecordError: the campaign was opened from an export, which has no records of flights.
@@ -130,11 +129,12 @@ class ComputeOverhead:
     """The compute overhead of a detector, summed over flights.
 
     Attributes:
-        detection_s: all checks of the gate, host time.
-        recompute_s: recomputations, each at the mean latency of its stage's kernels, simulated.
-        compute_s: all kernels, recomputations included, simulated.
-        host_compute_s: all kernels, host time.
-        alarms: alarms with a recomputation.
+        detection_s: host time of all checks of the gate.
+        recompute_s: simulated time of recomputations, each at the mean latency of its stage's
+            kernels.
+        compute_s: simulated time of all kernels, including recomputations.
+        host_compute_s: host time of all kernels.
+        alarms: number of alarms that led to a recomputation.
         platforms: names of the flights' platforms, in alphabetical order.
         left_out: number of ignored flights on other platforms.
     """
@@ -168,7 +168,7 @@ class ComputeOverhead:
     def of(
         cls, records: Iterable[FlightRecord], platform: str | None = None
     ) -> dict[str, ComputeOverhead]:
-        """The overhead of every detector in these records, summed over its flights.
+        """Compute the overhead of every detector in these records, summed over its flights.
 
         Flights with a fault are ignored, because the fault may cause their alarms.
 
@@ -202,7 +202,7 @@ class ComputeOverhead:
         }
 
     def describe(self, where: str) -> str:
-        """Name the source of the overhead: flights, their place and platforms, and its parts."""
+        """Describe the overhead: its flights, where they are, their platforms, and its parts."""
         again = self.share - self.checks_share
         left = f" ({self.left_out} on other platforms left out)" if self.left_out else ""
         return (
@@ -215,7 +215,7 @@ class ComputeOverhead:
 
 
 def _platform_name(called: str) -> str:
-    """The name in a platform's file if the file still exists, else the recorded name."""
+    """Return the name in a platform's file if the file still exists, else the recorded name."""
     if not called.endswith(".toml"):
         return called
     try:
@@ -225,7 +225,7 @@ def _platform_name(called: str) -> str:
 
 
 def _same(name: str, platform: str) -> bool:
-    """Whether a platform is this one, or the variant that `mavfi vpm --fly` makes of it."""
+    """Return whether `name` is the platform, or a variant of it made by `mavfi vpm --fly`."""
     base, times, factor = name.rpartition(TIMES)
     if name == platform or not times or base != platform:
         return name == platform
@@ -238,7 +238,7 @@ def _same(name: str, platform: str) -> bool:
 def recorded_overheads(
     path: Path, detectors: Sequence[str], platform: str | None = None
 ) -> dict[str, ComputeOverhead]:
-    """The overheads of detectors in the error-free flights at a path.
+    """Return the overheads of detectors in the error-free flights at a path.
 
     Args:
         path: a run folder, a folder of them, a campaign, or the folder of another command.
@@ -265,7 +265,7 @@ def recorded_overheads(
 
 
 def _records(path: Path) -> Iterator[FlightRecord]:
-    """Records of a run folder, of all runs in a folder, or of all missions of a campaign."""
+    """Yield the records of a run folder, of all runs in a folder, or of a campaign's missions."""
     if path.is_file() or (path / RESULT).is_file():
         yield load_run(path).record
         return

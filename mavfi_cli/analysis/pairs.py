@@ -1,6 +1,6 @@
-"""Flown missions as one table, each beside its golden flight and its flight without detector.
+"""Flown missions as one table, each matched with its golden and its unprotected flight.
 
-Items and claims choose rows of this table and count its columns.
+Items and claims select rows of this table and count the values in its columns.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ STAGES = tuple(stage.value for stage in Stage)
 WORLDS = ("factory", "farm", "sparse", "dense")  # in the paper's order
 PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
-LONGER = 1.10  # a flight is longer if it takes more than this times its own golden flight
+LONGER = 1.10  # a flight is longer if its time is above this multiple of its golden flight's
 _COLUMNS: Mapping[str, pa.DataType] = {
     **dict.fromkeys(("number", "seed", "fault_seed", "fault_bits"), pa.int64()),
     **dict.fromkeys((
@@ -49,8 +49,8 @@ _COLUMNS: Mapping[str, pa.DataType] = {
 }  # fmt: skip
 _STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
 _FAULTS = ("fault", "instruction")
-# A mission is one of the paper's if it differs from the defaults in these only, and its fault in
-# _DRAWN only.
+# A mission is one of the paper's if it differs from the defaults only in these, and its fault only
+# in _DRAWN.
 _PAPER = {*_FAULTS, "detector", "isolate", "stack", "world", "seed", "world_seed", "planner",
           "platform", "time_limit_s"}  # fmt: skip
 _DRAWN = {"target", "seed", "field", "bits", "together", "at"}
@@ -66,7 +66,7 @@ class Fate(Enum):
     """The effect of a fault on the node that it strikes."""
 
     ALL = "all faults"
-    SILENT = "silent"  # the node goes on, with or without a wrong value
+    SILENT = "silent"  # the node continues, with or without a wrong value
     DEAD = "dead node"  # it crashes or hangs
 
 
@@ -75,7 +75,7 @@ class Balance:
     """The harm that a detector undoes and the harm that it causes, on the same faults.
 
     Attributes:
-        pairs: faults that were flown without and with the detector.
+        pairs: faults with flights both without and with the detector.
         before: harmed missions without the detector.
         undone: missions that are harmed only without it.
         caused: missions that are harmed only with it.
@@ -93,22 +93,23 @@ class Balance:
 class Flights:
     """Flown missions, one per row, with the columns that items, claims and comparisons read.
 
-    A column that an export lacks is empty. Beside the columns of `analysis.flights`, it has:
+    A column that an export lacks is empty. Columns in addition to those of `analysis.flights`:
         fault: the configured fault as text; equal faults have equal texts.
         together: whether it strikes all components of a group at once.
         at: the trigger of a source-level fault; empty without one.
-        as_paper: whether vehicle, speed, sensors, the single flip of drawn bits and the 13 watched
+        as_paper: whether vehicle, speed, sensors, the single flip of random bits and the 13 watched
             states are those of the paper. Stack, detector model and `at` may differ.
-        struck: whether the fault flipped a bit, read or not, as the paper counts.
+        struck: whether the fault flipped a bit, read or not, as in the paper's counts.
         lost: whether the mission did not end in success.
-        ended: whether the fault ended a node, by a crash or a hang.
+        ended: whether the fault made a node crash or hang.
         restart_s: time after which a dead node is restarted.
-        repeats: whether the flight would repeat; one of a user's companion has no partner.
+        repeats: whether the flight is repeatable; one of a user's companion is not, and has no
+            partner.
     Columns about its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.
-        over_own: flight time divided by it; empty if one of the two is lost.
-        added_s: flight time minus it; empty if one of the two is lost.
+        over_own: flight time / its flight time; empty if either flight is lost.
+        added_s: flight time - its flight time; empty if either flight is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
     Columns about the flight with the same fault and no detector, empty without such a flight:
@@ -119,7 +120,7 @@ class Flights:
 
     @classmethod
     def of(cls, table: pa.Table) -> Flights:
-        """The flights of `analysis.flights.flights`, or of an export.
+        """Take the flights from a table of `analysis.flights.flights`, or from an export.
 
         Raises:
             ConfigError: they are a stratified sample, whose missions cannot be counted.
@@ -137,7 +138,7 @@ class Flights:
 
     @classmethod
     def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
-        """The missions of several tables, each mission once; None means all stacks."""
+        """Return the missions of several tables without duplicates; None means all stacks."""
         own = [flights.table.select(_NOTHING_FLOWN.column_names) for flights in several]
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
@@ -147,7 +148,7 @@ class Flights:
         return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
 
     def without(self, left_out: Iterable[bool]) -> Flights:
-        """The flights for which `left_out` (n,) is false, compared among themselves."""
+        """Return the flights for which `left_out` (n,) is false, compared only with each other."""
         kept = pa.array([not own for own in left_out], pa.bool_())
         return Flights(_beside_golden(self.table.select(_NOTHING_FLOWN.column_names).filter(kept)))
 
@@ -155,53 +156,53 @@ class Flights:
         return int(self.table.num_rows)
 
     def __getitem__(self, name: str) -> list[Any]:
-        """A column; None where it is empty."""
+        """Return a column; None for empty cells."""
         return list(self.table[name].to_pylist())
 
     def rows(self, *names: str) -> list[dict[str, Any]]:
-        """The flights as rows of these columns; none mean all."""
+        """Return the flights as rows of these columns, or of all columns if none are given."""
         return list((self.table.select(names) if names else self.table).to_pylist())
 
     def numbers(self, name: str) -> FloatArray:
-        """A column, (n,); NaN where it is empty."""
+        """Return a column, (n,); NaN for empty cells."""
         return tables.numbers(self.table, name)
 
     def known(self, *names: str) -> FloatArray:
-        """The sum of columns in each flight that has them all."""
+        """Return the sum of the columns for each flight that has values in all of them."""
         return tables.known(np.sum([self.numbers(name) for name in names], axis=0))
 
     def flags(self, name: str) -> BoolArray:
-        """A column of truth values, (n,)."""
+        """Return a boolean column, (n,)."""
         return tables.flags(self.table, name)
 
     # Rows
 
     def where(self, chosen: Iterable[bool]) -> Flights:
-        """The flights for which `chosen` (n,) is true."""
+        """Return the flights for which `chosen` (n,) is true."""
         return Flights(self.table.filter(pa.array(chosen, pa.bool_())))
 
     def chosen(self, **values: Any) -> Flights:
-        """The flights with these values; None means empty, and a tuple allows several."""
+        """Return the flights with these values; None means empty, and a tuple allows several."""
         return Flights(tables.chosen(self.table, **values))
 
     def faulty(self, detector: str | None = None, **values: object) -> Flights:
-        """The flights with a fault, without a detector or with this one."""
+        """Return the flights with a fault, and without a detector or with this one."""
         struck = Flights(self.table.filter(pc.is_valid(self.table["level"])))
         return struck.chosen(detector=detector, **values)
 
     def struck(self, **values: object) -> Flights:
-        """The flights in which a bit was flipped, without a detector or with the named one."""
+        """Return the flights with a flipped bit, and without a detector or with the named one."""
         return self.chosen(**{"struck": True, "detector": None, **values})
 
     def protected(self, detector: str, protect: str = EVERY_STAGE, **values: object) -> Flights:
-        """The flights with a detector of these stages, whose fault struck without it as well."""
+        """Return protected flights with a successful golden flight and a struck unprotected one."""
         seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
         return self.chosen(**seen, **values)
 
     def of_fate(self, fate: Fate) -> Flights:
-        """The flights without a fault, and those whose fault has this fate without a detector.
+        """Return flights without a fault, and those whose fault has this fate without a detector.
 
-        A fault that was not flown without a detector has no fate.
+        A fault that has no flight without a detector has no fate.
         """
         if fate is Fate.ALL:
             return self
@@ -212,7 +213,7 @@ class Flights:
 
     @property
     def seeds(self) -> list[tuple[str, int]]:
-        """World and seed of each flight; flights of one seed are not independent."""
+        """World and seed of each flight; flights with the same seed are not independent."""
         return list(zip(self["world"], self["seed"], strict=True))
 
     def balance(
@@ -237,7 +238,7 @@ class Flights:
 
     @property
     def golden(self) -> Flights:
-        """The flights without fault and detector."""
+        """The flights with neither a fault nor a detector."""
         return self.chosen(level=None, detector=None)
 
     @property
@@ -252,11 +253,11 @@ class Flights:
         return self.chosen(protect=(None, EVERY_STAGE))
 
     def shared(self, *names: str, arm: str = "detector") -> Flights:
-        """The flights without a fault, and those whose fault was flown in every arm.
+        """Return the flights without a fault, and those whose fault has a flight in every arm.
 
         Args:
             names: columns; each combination of their values has its own arms.
-            arm: column whose values are the arms; None, as without a detector, is one of them.
+            arm: column whose values are the arms; None, such as no detector, is an arm too.
         """
         arms = self.where(level is not None for level in self["level"]).by(*names, arm)
         groups: dict[tuple[Any, ...], list[set[tuple[str, str]]]] = {}
@@ -267,11 +268,11 @@ class Flights:
         return self.where(level is None or fault in shared for level, fault in faults)
 
     def by(self, *names: str) -> dict[tuple[Any, ...], Flights]:
-        """The flights of each combination of values, in the order of their first flights."""
+        """Group the flights by the values of columns, in the order of the groups' first flights."""
         return self.grouped(zip(*map(self.__getitem__, names), strict=True))
 
     def grouped(self, keys: Iterable[Any]) -> dict[Any, Flights]:
-        """The flights by key, in the order of their first flights, given the key of each flight."""
+        """Group the flights by a key for each, in the order of the groups' first flights."""
         places: dict[Any, list[int]] = {}
         for place, key in enumerate(keys):
             places.setdefault(key, []).append(place)
@@ -280,10 +281,10 @@ class Flights:
     # Numbers
 
     def share(self, column: str = "lost", *, value: bool = True, clustered: bool = False) -> Share:
-        """The share of flights in which a column has a value, among those where it is not empty.
+        """Return the share of flights whose column equals `value`, among those with a value.
 
         Args:
-            clustered: whether the interval has the design effect of missions of one seed.
+            clustered: whether the interval includes the design effect of missions with one seed.
         """
         there = Flights(self.table.filter(pc.is_valid(self.table[column])))
         hits = [cell is value for cell in there[column]]
@@ -303,21 +304,21 @@ class Flights:
 
     @property
     def worst(self) -> WorstCase:
-        """The largest ratios of the same faults without and with a detector.
+        """The largest `ratios` of the same faults without and with a detector.
 
-        Only faults that were also flown with the detector count, because the longest of more
-        flights is longer.
+        Only faults with a flight in both arms count, because the maximum grows with the number of
+        flights.
         """
         return WorstCase.of(OWN, self.known("bare_over_own").tolist(), self.ratios.tolist())
 
     @property
     def faults(self) -> list[tuple[str, str]]:
-        """Mission and fault of each flight; two flights of one fault differ in their detector."""
+        """Mission and fault of each flight; flights with one fault differ in their detector."""
         return list(zip(self["pair"], self["fault"], strict=True))
 
     @property
     def worlds(self) -> list[str]:
-        """The worlds that were flown, the paper's first."""
+        """The worlds of the flights, the paper's first."""
         flown = set(self["world"])
         return [*(world for world in WORLDS if world in flown), *sorted(flown - set(WORLDS))]
 
@@ -364,7 +365,7 @@ def _as_paper(config: Mapping[str, Any]) -> bool:
 
 
 def _beside_golden(table: pa.Table) -> pa.Table:
-    """Add the columns that compare each flight with its golden and its bare flight."""
+    """Add the columns that compare each flight with its golden and its unprotected flight."""
     unprotected = pc.and_(pc.is_null(table["detector"]), table["repeats"])
     golden = pc.and_(unprotected, pc.equal(table["fault"], _NO_FAULT))
     own = _places(partners(table, table, ("pair",), only=golden))
@@ -395,8 +396,8 @@ def against_golden(
     """Compare flights with their golden flights, which may be empty; all columns are (n,).
 
     Returns:
-        Flight time / golden flight time, empty if one of the two is lost; and whether the flight
-        is harmed: lost, or longer than LONGER; empty unless the golden flight succeeds.
+        Flight time / golden flight time, empty if either flight is lost; and whether the flight is
+        harmed: lost, or with a ratio above LONGER; empty unless the golden flight succeeds.
     """
     succeeds = pc.equal(own_lost, _NO)
     ratio = pc.divide(time_s, own_time_s)
@@ -416,9 +417,9 @@ def partners(
     only: pa.ChunkedArray | BoolArray | None = None,
     repeats: bool = False,
 ) -> IntArray:
-    """Find the partner of each row: the first of the other rows with equal values in some columns.
+    """Find the partner of each row: the first of the other rows with equal values in columns `on`.
 
-    Two empty cells are equal.
+    Empty cells are equal to each other.
 
     Args:
         rows, others: (n,) and (m,) rows; may be the same table.
@@ -428,7 +429,7 @@ def partners(
             Otherwise all of them have the same partner.
 
     Returns:
-        Index of the partner among all the other rows, (n,); -1 for a row without partner.
+        Index of the partner among all the other rows, (n,); -1 for a row without a partner.
     """
     allowed = np.arange(others.num_rows)
     if only is not None:
@@ -458,7 +459,7 @@ def paired(rows: pa.Table, others: pa.Table, on: Sequence[str]) -> tuple[pa.Tabl
 
 
 def _repeat(keys: IntArray) -> IntArray:
-    """Number of earlier equal keys, (n,)."""
+    """Return the number of earlier equal keys, (n,)."""
     order = np.argsort(keys, kind="stable")
     _, begins, counts = np.unique(keys[order], return_index=True, return_counts=True)
     earlier = np.empty(len(keys), dtype=np.int64)
@@ -467,5 +468,5 @@ def _repeat(keys: IntArray) -> IntArray:
 
 
 def _places(partner: IntArray) -> pa.Array:
-    """Indices for `take`, which gives an empty cell for a missing partner."""
+    """Return indices for `take`, which gives an empty cell for a missing partner."""
     return pa.array(partner, mask=partner < 0)

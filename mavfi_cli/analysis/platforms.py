@@ -2,7 +2,7 @@
 
 Flight time, distance, energy and replans are computed over the counted flights that succeeded.
 Response times are computed over all counted flights. A faulty flight counts if its fault struck,
-unless the struck value expired before anything read it. A value that a detector withheld counts.
+unless the struck value expired before anything read it. It counts if a detector withheld the value.
 
 The cost of a fault (Fig. 16 of the paper) is the flight time divided by that of the golden flight
 of the same mission on the same platform, if both reached the goal. The paper measures this in one
@@ -36,16 +36,16 @@ LATE = 0.95  # quantile given with the worst case, which has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
 _SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
 GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
-CONFIDENCE = 0.95  # of all intervals
+CONFIDENCE = 0.95  # confidence level of all intervals
 
 
 class _Quantity(NamedTuple):
-    """A quantity that is measured in each flight, by the name of its column."""
+    """A quantity that is measured in each flight; `name` is its column."""
 
     name: str
     title: str
     unit: str
-    any_end: bool = False  # failed flights have it, too
+    any_end: bool = False  # failed flights have it too
     ratio: bool = True  # platforms are compared by ratio, else by difference
 
 
@@ -68,7 +68,7 @@ SCHEMA = pa.schema(
 
 
 def compared(flights: pa.Table) -> Flights:
-    """The missions that ended, with the columns of SCHEMA; golden flights have an empty target."""
+    """Return ended missions with the columns of SCHEMA; golden flights have an empty target."""
     table = Flights.of(flights).table
     bare = pc.if_else(pc.is_null(table["level"]), GOLDEN, NONE)
     table = table.append_column("setting", pc.coalesce(table["detector"], bare))
@@ -89,7 +89,7 @@ class PlatformSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedPlan:
-    """The plan that a comparison flew."""
+    """The plan of a comparison."""
 
     platforms: tuple[PlatformSummary, ...]
     world: str
@@ -104,14 +104,14 @@ class ComparedPlan:
 
     @property
     def flip(self) -> str:
-        """The bits that each faulty flight flips, in words; empty if no fault is flown."""
+        """The bits flipped in each faulty flight, in words; empty if there are no faults."""
         bits = "one bit" if self.field is None else f"one bit of the {self.field}"
         return f"{bits} in {', '.join(self.inject)}" if self.inject else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredQuantity:
-    """A quantity of the flights of a setting."""
+    """A quantity over the flights of a setting."""
 
     unit: str
     median: Interval
@@ -134,7 +134,7 @@ class SettingFlights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangedQuantity(Interval):
-    """A quantity on two platforms: mean `ratio` with its interval, or `difference`."""
+    """A quantity on two platforms: mean `ratio` or mean `difference`, with its interval."""
 
     kind: str
     unit: str
@@ -144,7 +144,7 @@ class ChangedQuantity(Interval):
 class _SuccessChange(McNemar):
     """Successes on two platforms, and the difference of the rates; NaN without pairs."""
 
-    difference: float = field()  # no property as in the base class, so that `asdict` has it
+    difference: float = field()  # replaces the base class's property, so that `asdict` has it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,8 +173,8 @@ class _CostRatio:
     """Flight time divided by that of the golden flight.
 
     Attributes:
-        recovered_share: the part of the largest increase without detector that the detector
-            removes; NaN if there is none.
+        recovered_share: the part of the largest increase without a detector that the detector
+            removes; NaN if there is no increase.
     """
 
     p95: Interval
@@ -198,7 +198,7 @@ class CostRow:
     Attributes:
         pairs: faulty flights that reached the goal as their golden flights did.
         lost: flights that failed where the golden one reached the goal.
-        worst_flight: the one with the largest ratio; the lowest seed of equal ones.
+        worst_flight: the one with the largest ratio, with the lowest seed if several are equal.
     """
 
     platform: str
@@ -221,10 +221,10 @@ class CostDifference:
 
     Attributes:
         pairs: faults that have a cost on both platforms.
-        differ: number of them that have different costs.
-        extra_s, p_value: mean difference of costs and its p-value, by missions.
+        differ: number of pairs with different costs.
+        extra_s, p_value: mean difference of costs and its p-value, with missions as units.
         p95_ratio: ratio of the 95th percentiles of flight time / own golden flight time.
-        largest_ratio: the same ratio of the largest values, over all flights of each platform.
+        largest_ratio: the same for the largest values, over all flights of each platform.
         longest_ratio: ratio of the longest flight times, over all flights of each platform.
     """
 
@@ -260,7 +260,7 @@ class LongestFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedTimelines:
-    """Timelines of one mission on all platforms that answered."""
+    """Timelines of one mission on all platforms that reacted to a frame."""
 
     seed: int
     platforms: list[Timeline]
@@ -272,7 +272,7 @@ class PlatformComparison:
 
     `settings`, `costs` and `worst` have one row per platform and setting. `ratios` and
     `cost_differences` have one row per setting and platform other than the first. Shares, increases
-    and ratios have no unit; all other names end in the unit or have it in a field of its own.
+    and ratios have no unit; all other names end in their unit, or a separate field gives it.
 
     Attributes:
         flights: one row per flight, with the columns of SCHEMA.
@@ -372,7 +372,7 @@ def _ratio(
 
 
 def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQuantity:
-    """Geometric mean ratio with its interval, or mean difference for values that may be zero."""
+    """Return the geometric mean ratio, or mean difference if values may be zero, with interval."""
     if not quantity.any_end:
         both = pa.array(~(flags(first, "lost") | flags(second, "lost")))
         first, second = first.filter(both), second.filter(both)
@@ -389,7 +389,7 @@ def _changed(quantity: _Quantity, first: pa.Table, second: pa.Table) -> ChangedQ
 
 @dataclass(frozen=True, slots=True)
 class FaultCosts:
-    """The cost of the faults of a platform and setting, over their own golden flights."""
+    """The cost of the faults of a platform and setting, relative to their own golden flights."""
 
     counted: Flights
 
@@ -408,7 +408,7 @@ class FaultCosts:
         return max(numbers(self.costs, measure).tolist(), default=math.nan)
 
     def row(self, platform: str, setting: str) -> CostRow:
-        """The cost of a setting's faults on a platform.
+        """Compute the cost of a setting's faults on a platform.
 
         Several faults of one mission are not independent, so the intervals resample missions.
         """
@@ -438,7 +438,7 @@ class FaultCosts:
     def beyond(
         self, first: FaultCosts, platform: str, setting: str, reference: str
     ) -> CostDifference:
-        """The additional cost compared with the reference platform, `first`."""
+        """Compute the additional cost compared with the reference platform, `first`."""
         here, there = paired(self.costs, first.costs, MISSION)
         extra = _by_mission(here, "added_s") - _by_mission(there, "added_s")
         extra[np.abs(extra) < _SAME_S] = 0.0
@@ -481,7 +481,7 @@ def _longest(
 
 
 def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
-    """Values, (missions, targets), in the order of seeds; NaN if there is no flight."""
+    """Return the values, (missions, targets), in the order of seeds; NaN if there is no flight."""
     seeds, row = np.unique(np.asarray(costs["seed"].to_pylist()), return_inverse=True)
     targets, column = np.unique(np.asarray(costs["target"].to_pylist()), return_inverse=True)
     table = np.full((len(seeds), len(targets)), np.nan)
@@ -490,19 +490,19 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
 
 
 def _over(count: int, statistic: Callable[[IntArray], FloatArray]) -> Interval:
-    """A statistic over missions with its interval; `statistic` takes (..., missions) indices."""
+    """Return `statistic` over missions, with its interval; it takes (..., missions) indices."""
     return interval_of_rows(count, statistic, resamples=TABLE_RESAMPLES)
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Mean over the last two axes, without NaN."""
+    """Return the mean over the last two axes, ignoring NaN."""
     return np.asarray(np.nanmean(values, axis=(-2, -1)))
 
 
 def _late(values: FloatArray) -> FloatArray:
-    """The LATE quantile over the last two axes, without NaN.
+    """Return the LATE quantile over the last two axes, ignoring NaN.
 
-    `numpy.nanquantile` with several axes goes row by row; sorting puts NaN at the end.
+    `numpy.nanquantile` with several axes loops over rows; here sorting puts NaN at the end.
     """
     flat = np.sort(values.reshape((*values.shape[:-2], -1)), axis=-1)
     place = LATE * (np.count_nonzero(~np.isnan(flat), axis=-1) - 1)
@@ -533,7 +533,7 @@ def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
 
 
 def titles(platforms: Sequence[str]) -> dict[str, str]:
-    """Names of platforms in tables and pictures: the stem of a file, if that is unique."""
+    """Return names of platforms for tables and pictures: the stem of a file, if that is unique."""
     short = [name.removesuffix(".toml").rpartition("/")[2] for name in platforms]
     return {
         name: stem if short.count(stem) == 1 else name

@@ -1,8 +1,8 @@
-"""Recorded flights as detectors see them: samples to fit to, and one score per replayed flight.
+"""Recorded flights as seen by detectors: samples for fitting, and one score per replayed flight.
 
-The score of a flight without protection is the highest of its messages, in units of the detector's
+The score of an unprotected flight is the highest score of its messages, in units of the detector's
 threshold. Above 1 the gate would have raised an alarm. Nothing is withheld during the replay, so
-the scores do not depend on the threshold. They include the checks of the plan in flight.
+the scores do not depend on the threshold. They include the checks of the active plan.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LARGEST = 1 << 27  # bytes of stored scores
 _WAY = "looks ahead"  # scoring method; scores of other methods are not mixed with these
 
 
-_Seen = tuple[Columns, Sequence[Trajectory], list[PlanStrike]]  # the part of a flight at the gate
+_Seen = tuple[Columns, Sequence[Trajectory], list[PlanStrike]]  # what the gate sees of a flight
 
 
 def scored(
@@ -45,13 +45,13 @@ def scored(
     pairs: tuple[pa.Table, pa.Table],
     note: Callable[[str], None],
 ) -> Scored:
-    """Compute the detectors' scores of the harmful faults and of the error-free flights.
+    """Compute the detectors' scores for the harmful faults and for the error-free flights.
 
     Args:
         detectors: all except `none`.
         folder: stores the scores by the name of the run folder; only missing ones are computed.
         pairs: without faults and with one, as `detectors.pairs_of` returns them.
-        tell: receives a text with the number of replayed flights.
+        note: receives a text with the number of replayed flights.
     """
     store = folder / SCORES
     kept: dict[str, dict[str, float | None]] = {}
@@ -82,7 +82,7 @@ def scored(
         write_json(store, kept)
 
     def known(path: str | None, detector: str) -> float | None:
-        """The score of a flight; None where it has no trace. A NaN score counts as an alarm."""
+        """Return a flight's score; None without a run folder. A NaN score counts as an alarm."""
         if path is None or Path(path).name not in scores[detector]:
             return None
         score = scores[detector][Path(path).name]
@@ -115,13 +115,13 @@ def _seen_of(path: Path) -> _Seen:
 
 
 def _value(state: str, pattern: str) -> float | int | bool:
-    """Decode a value from its bits, because a record has finite numbers only."""
+    """Decode a value from its bits, because a record contains only finite numbers."""
     kind = bits.NUMPY_TYPES[BY_NAME[state].dtype.value]
     return kind.value(int(pattern, 16))
 
 
 def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack: str) -> float:
-    """The highest score from the strike on, or of the whole flight without one."""
+    """Return the highest score at or after the strike, or of the whole flight without a strike."""
     columns, plans, strikes = seen
     if not columns:  # it ended before the first tick
         return 0.0
@@ -141,12 +141,11 @@ def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack:
 
 
 def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], int, set[str]]:
-    """Collect the samples of the error-free flights among the run folders of a folder.
+    """Collect the samples of the error-free flights among the run folders in `flown`.
 
     Returns:
-        The samples, the number of other flights, and the autopilots that flew. A flight has the
-        name of its world, or that of its run folder if the world and the seed have been flown
-        before.
+        The samples, the number of other flights, and the autopilots used. A flight has the name of
+        its world, or that of its run folder if an earlier flight has the same world and seed.
     """
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]
@@ -172,7 +171,7 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
 
 
 def _is_error_free(run: Run, stack: StackMark) -> bool:
-    """Return True for a flight of the stack that reached the goal without fault and alarm."""
+    """Return True for a flight of the stack that reached the goal without a fault or an alarm."""
     record = run.record
     faults = (record.config["fault"], record.config["instruction"])
     return (

@@ -1,9 +1,9 @@
 """Summary of a campaign: its settings, and comparisons of their missions.
 
-The flight of a user's companion does not repeat, so it has no pair: such settings are compared as
-independent samples.
+The flights of a user's companion are not repeatable, so they have no pairs: such settings are
+compared as independent samples.
 
-Reads the short rows of the ledger, because a campaign may have a million missions.
+Only the short rows of the ledger are read, because a campaign may have a million missions.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class SettingSummary:
         name: its labels in one phrase.
         planned, errors: number of missions on the list, and of those that could not begin.
         outcomes, injected: number of flown missions by outcome, and by the fate of the fault.
-        success: share over golden missions and faults that struck.
-        inactive: share over faults that were not injected or not activated.
-        every: share over all flown missions, as in the paper.
-        metrics: means over the successful missions of `success`, by METRICS.
+        success: success rate over golden missions and faults that struck.
+        inactive: success rate over faults that were not injected or not activated.
+        every: success rate over all flown missions, as in the paper.
+        metrics: means over the successful missions that `success` counts, by METRICS.
     """
 
     labels: Labels
@@ -70,7 +70,7 @@ class SettingSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """Comparison of two settings over the missions that both flew.
+    """Comparison of two settings over the missions flown in both.
 
     Attributes:
         first, second: labels of the reference and of the other setting.
@@ -80,7 +80,7 @@ class Comparison:
         over_own: largest ratio of a flight time to that of the golden flight of the same mission,
             if both succeeded.
         over_mean: ratio of the longest of these flights to the mean of their golden flights, as in
-            the paper. If the second setting is protected, both hold what protection recovers.
+            the paper. If the second setting is protected, both include what protection recovers.
     """
 
     first: Labels
@@ -95,18 +95,18 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnpairedComparison:
-    """Comparison of two settings of a user's companion, whose flights do not repeat.
+    """Comparison of two settings of a user's companion, whose flights are not repeatable.
 
     Attributes:
         first, second: labels of the reference and of the other setting.
         name: phrase for the other setting.
-        first_success, second_success: share of success of each.
+        first_success, second_success: success rate of each.
         difference: second minus first, with Newcombe's interval.
-        p_value, corrected_p: of Fisher's exact test, and corrected by Holm over all comparisons of
-            this kind.
-        differences: mean of the successful flights of the second minus that of the first, by
+        p_value, corrected_p: p-value of Fisher's exact test, and the same corrected by Holm over
+            all comparisons of this kind.
+        differences: mean over the successful flights of the second minus that of the first, by
             METRICS, with Welch's interval.
-        golden: share of success of the golden flights.
+        golden: success rate of the golden flights.
         golden_deviation: standard deviation over the successful golden flights, by METRICS; NaN
             with fewer than two.
     """
@@ -129,9 +129,10 @@ class Quality:
     """A metric of a setting over its successful missions.
 
     Attributes:
-        least, median, most: values over the flights; NaN without flights.
+        least, median, most: smallest, median and largest value; NaN without flights.
         difference: difference from the golden flights of the same missions, or from all golden
-            flights if they do not repeat; None for golden settings, and for settings of both.
+            flights if flights are not repeatable; None for golden settings, and for settings with
+            flights of both kinds.
     """
 
     labels: Labels
@@ -146,16 +147,16 @@ class Quality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignSummary:
-    """A campaign by setting.
+    """The results of a campaign by setting.
 
     Attributes:
-        missions: number on the list.
-        over, missing: number with a result, and without one.
+        missions: number of missions on the list.
+        over, missing: number of missions with a result, and without one.
         confidence: confidence level of all intervals.
         sampling: how faults were drawn, `uniform` or `stratified`.
         faults: each setting with faults compared with the golden one.
         protection: each protected setting compared with the unprotected one with the same faults.
-        unpaired_faults, unpaired_protection: the same of the flights that do not repeat.
+        unpaired_faults, unpaired_protection: the same for flights that are not repeatable.
     """
 
     name: str
@@ -199,8 +200,8 @@ class Group:
 
     @property
     def name(self) -> str:
-        """A phrase of the labels and of the grouping labels that the missions lack."""
-        if not self.lacked or "setting" in self.labels:  # its name identifies it
+        """A phrase for the labels, and for the grouping labels that the missions lack."""
+        if not self.lacked or "setting" in self.labels:  # the setting's name is enough
             return label_text(self.labels)
         less = "golden" if self.flights.num_rows and self.golden else f"no {', '.join(self.lacked)}"
         return f"{label_text(self.labels)} {less}" if self.labels else less
@@ -227,12 +228,12 @@ class Group:
 
     @cached_property
     def repeats(self) -> BoolArray:
-        """Whether each flight would repeat, (n,)."""
+        """Whether each flight is repeatable, (n,)."""
         return self.codes("repeats").astype(bool)
 
     @staticmethod
     def parts(groups: Iterable[Group], *, repeats: bool) -> list[Group]:
-        """The flights of each setting that repeat, or that do not; without empty settings."""
+        """Return the repeatable or the other flights of each setting, without empty settings."""
         chosen = [(group, group.repeats == repeats) for group in groups]
         return [
             group if own.all() else replace(group, flights=group.flights.filter(pa.array(own)))
@@ -246,22 +247,22 @@ class Group:
         return np.unique(self.codes("pair")[self.counted])
 
     def codes(self, name: str) -> IntArray:
-        """An integer column, (n,)."""
+        """Return an integer column, (n,)."""
         return np.asarray(self.flights[name].to_numpy(), dtype=np.int64)
 
     def among(self, name: str, words: Iterable[str]) -> BoolArray:
-        """Whether each mission has one of these words in a text column, (n,)."""
+        """Return whether each mission has one of these words in a text column, (n,)."""
         matches = pc.is_in(self.flights[name], value_set=pa.array(sorted(words), pa.string()))
         return np.asarray(matches.to_numpy(), dtype=bool)
 
     def counts(self, name: str) -> dict[str, int]:
-        """Number of occurrences of each word in a column."""
+        """Count the occurrences of each word in a column."""
         entries = pc.value_counts(self.flights[name]).to_pylist()
         return dict(sorted((entry["values"], entry["counts"]) for entry in entries))
 
     @cached_property
     def stratified(self) -> bool:
-        """Whether some of the missions are of a stratified sample."""
+        """Whether some of the missions belong to a stratified sample."""
         return bool(self.flights[STRATUM].null_count < self.flights.num_rows)
 
     @cached_property
@@ -273,14 +274,14 @@ class Group:
     def clusters(self) -> IntArray | None:
         """The cluster of each mission, (n,), if several faults of a uniform sample strike one pair.
 
-        They strike the same invocation of a node, so that their effects are alike.
+        They strike the same invocation of a node, so their effects are correlated.
         """
         places = np.column_stack([self.codes("cell"), self.codes("pair")])
         alone = self.golden or self.stratified or len(np.unique(places, axis=0)) == len(places)
         return None if alone else self.codes("pair")
 
     def share(self, hits: BoolArray, chosen: BoolArray, confidence: float = 0.95) -> Share:
-        """The share of hits among chosen missions, both (n,), by weight and by cluster."""
+        """Return the share of hits among the chosen missions, both (n,), by weight and cluster."""
         if self.clusters is not None:
             own, places = hits[chosen].tolist(), self.clusters[chosen].tolist()
             effect = design_effect(own, [("", place) for place in places])
@@ -295,15 +296,15 @@ class Group:
         )
 
     def success(self, confidence: float = 0.95) -> Share:
-        """The share of success of the counted missions."""
+        """Return the success rate of the counted missions."""
         return self.share(self.succeeded, self.counted, confidence)
 
     def successes(self, metric: str) -> FloatArray:
-        """A metric of the counted successful missions that have it."""
+        """Return a metric of the counted successful missions that have it."""
         return known(self.metrics[metric][self.succeeded & self.counted])
 
     def mean(self, metric: str, confidence: float = 0.95) -> Interval:
-        """The mean of `successes`, by weight."""
+        """Return the mean of `successes`, by weight and cluster."""
         values = self.metrics[metric]
         there = self.succeeded & self.counted & ~np.isnan(values)
         weights = None if self.weights is None else self.weights[there]
@@ -311,12 +312,12 @@ class Group:
         return _interval(values[there], confidence, weights, clusters)
 
     def deviation(self, metric: str) -> float:
-        """The standard deviation of `successes`; NaN with fewer than two."""
+        """Return the standard deviation of `successes`; NaN with fewer than two."""
         values = self.successes(metric)
         return float(np.std(values - values[0], ddof=1)) if len(values) > 1 else np.nan
 
     def golden_among(self, groups: Sequence[Group]) -> Group | None:
-        """The golden setting that flew most of this setting's missions; None for a golden one."""
+        """Return the golden setting that shares the most pairs; None if golden or without any."""
         if self.golden:
             return None
         shared = [
@@ -328,9 +329,9 @@ class Group:
         return groups[-most[1]] if most[0] else None
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
-        """Row indices of the counted missions with equal pairs, in this and the other, (m,) each.
+        """Return the rows of counted missions with equal pairs, in this and the other, (m,) each.
 
-        They follow the other's order. Missions with faults match if the same faults strike them.
+        They are in the other's order. Missions with faults match if they have the same faults.
         If a pair was flown several times, the first flights match, then the second ones, and so on.
         A golden flight matches every flight of its pair.
         """
@@ -403,7 +404,7 @@ def _fault_text(changes: str) -> str:
 
 
 def _split(whole: pa.Table, members: Sequence[Sequence[int]], cells: int) -> list[pa.Table]:
-    """The rows of each group of cells, in the order of the list."""
+    """Return the rows of each group of cells, in the order of the list."""
     group_of = np.zeros(cells, dtype=np.int64)
     for index, cells_of_group in enumerate(members):
         group_of[cells_of_group] = index
@@ -437,7 +438,7 @@ class _Match(_Arms):
 
     @property
     def clusters(self) -> IntArray | None:
-        """The cluster of each pair, (m,), as for `Group`."""
+        """The cluster of each pair, (m,), as in `Group`."""
         return None if self.second.clusters is None else self.second.clusters[self.at_second]
 
     @property
@@ -446,7 +447,7 @@ class _Match(_Arms):
         return None if self.second.weights is None else self.second.weights[self.at_second]
 
     def difference(self, metric: str, confidence: float) -> Interval:
-        """Second minus first, over the pairs in which both succeeded and have the metric."""
+        """Return second minus first, over the pairs in which both succeeded and have the metric."""
         first, second = self.success
         change = self.second.metrics[metric][self.at_second]
         change = change - self.first.metrics[metric][self.at_first]
@@ -456,7 +457,7 @@ class _Match(_Arms):
         return _interval(change[there], confidence, weights, clusters)
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
-        """Worst cases relative to each pair's own golden flight, and to the mean of these.
+        """Return worst cases relative to each pair's own golden flight, and to their mean.
 
         A pair counts only if its golden flight succeeded.
         """
@@ -480,7 +481,7 @@ class _Match(_Arms):
         )
 
     def _golden_of_first(self) -> IntArray:
-        """Row index of the golden flight of each pair, (m,); -1 if there is none."""
+        """Return the row index of the golden flight of each pair, (m,); -1 if there is none."""
         own = np.full(self.first.flights.num_rows, -1)
         at_golden, at_faulty = self.golden.matched(self.first)
         own[at_faulty] = at_golden
@@ -488,7 +489,7 @@ class _Match(_Arms):
 
     @staticmethod
     def _times(group: Group, places: IntArray) -> FloatArray:
-        """Flight times of successful flights, (m,); NaN for others and at index -1."""
+        """Return the flight times of successful flights, (m,); NaN for others and at index -1."""
         times_s = np.full(len(places), np.nan)
         there = (places >= 0) & group.succeeded[places]
         times_s[there] = group.metrics["flight_time_s"][places[there]]
@@ -496,13 +497,13 @@ class _Match(_Arms):
 
 
 def _against_golden(groups: Sequence[Group]) -> list[_Arms]:
-    """Each setting with faults beside the golden setting that shares most pairs."""
+    """Match each setting that has faults to the golden setting that shares the most pairs."""
     goldens = [(group, group.golden_among(groups)) for group in groups]
     return [_Arms(golden, group, golden) for group, golden in goldens if golden is not None]
 
 
 def _protection(groups: Sequence[Group]) -> list[_Arms]:
-    """Each protected setting beside the unprotected one that has the same faults."""
+    """Match each protected setting to the unprotected one that has the same faults."""
     bare = {
         untreated(group.labels): group for group in groups if not (group.watched or group.golden)
     }
@@ -517,7 +518,7 @@ def _protection(groups: Sequence[Group]) -> list[_Arms]:
 
 
 def _paired(arms: Sequence[_Arms], confidence: float) -> list[Comparison]:
-    """Compare settings over the missions that both flew."""
+    """Compare settings over the missions flown in both."""
     matches = [
         _Match(own.first, own.second, own.golden, *own.first.matched(own.second)) for own in arms
     ]
@@ -581,7 +582,7 @@ def _interval(
     weights: FloatArray | None,
     clusters: IntArray | None,
 ) -> Interval:
-    """Return the mean. With clusters it is that of their means, which are independent."""
+    """Return the mean; with clusters, the mean of their means, which are independent."""
     if clusters is not None and len(values):
         _, which = np.unique(clusters, return_inverse=True)
         values = np.bincount(which, values) / np.bincount(which)
@@ -628,7 +629,7 @@ def _setting(group: Group, confidence: float) -> SettingSummary:
 
 
 def qualities(groups: Sequence[Group], confidence: float = 0.95) -> list[Quality]:
-    """Every metric of every setting over its successful missions, metric by metric."""
+    """Return every metric of every setting over its successful missions, metric by metric."""
     pairs, apart = (
         {
             row.name: row.differences

@@ -18,19 +18,19 @@ from mavfi_cli.core.types import KERNELS, Invocation, Outcome, Reaction
 from mavfi_cli.mission.run_folder import Run
 
 _CHAIN = ("point_cloud", "octomap", "collision_check")  # from a frame to the verdict
-LEAST_S = 1.0  # least duration of a timeline
+LEAST_S = 1.0  # minimum duration of a timeline
 _ANSWERS = ("slow", "stop")  # events: reactions of the pilot to a foreseen collision
 _PLAN_WITHIN_S = 3.0
 _MARGIN_S = 0.05
 _SAME_S = 1e-9
 
 
-Span = tuple[float, float]  # begin and end, s from the frame's stamp
+Span = tuple[float, float]  # begin and end, s after the frame's stamp
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """At least a second of a flight after a typical depth frame, in s from the frame's stamp.
+    """At least a second of a flight after a typical depth frame, in s after the frame's stamp.
 
     Attributes:
         platform: its name.
@@ -38,7 +38,7 @@ class Timeline:
         response_s: time of the first setpoint that depends on the frame.
         answer: the pilot's reaction.
         plan_setpoint_s: time of the first setpoint of the new plan; None without one.
-        shown_s: the window.
+        shown_s: the time window.
         chain_s: the invocations that led to the setpoints, by kernel.
         lanes_s: all invocations in the window, by kernel.
         setpoints_s: all setpoints in the window.
@@ -70,9 +70,9 @@ def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
 
 
 def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) -> Timeline | None:
-    """The timeline of a flight, at least `least_s` long; None without a reaction.
+    """Return the timeline of a flight, at least `least_s` long; None without a reaction.
 
-    If a verdict made the vehicle slow down or stop, the frame is one with such a verdict, and the
+    If a verdict made the vehicle slow down or stop, a frame with such a verdict is used, and the
     timeline ends with the first setpoint of the new plan.
     """
     ran, reactions = run.folder.read_timetable()
@@ -117,7 +117,7 @@ def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) 
 
 
 def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> Reaction | None:
-    """The reaction whose duration is nearest the flight's median; the first if several are.
+    """Return the reaction whose duration is closest to the flight's median; the first if tied.
 
     Args:
         answers: stamps of setpoints; reactions that end in one of them are preferred.
@@ -137,7 +137,7 @@ def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> React
 
 
 def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
-    """The invocations through which a frame reached its setpoint, in order; control's is the last.
+    """Return the invocations through which a frame reached its setpoint, in order, control last.
 
     The list is shorter if the time table lacks some.
     """
@@ -155,7 +155,7 @@ def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Inv
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
-    """The first invocation of the planner after a reaction, in motion or at rest."""
+    """Return the planner's first invocation after a reaction, in motion or at rest, or None."""
     for invocation in invocations:
         if invocation.node == "planner" and invocation.start_s >= answer_s - _SAME_S:
             return invocation if invocation.start_s <= answer_s + _PLAN_WITHIN_S else None
@@ -165,7 +165,7 @@ def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation |
 def _answered(
     invocations: Sequence[Invocation], stamps_s: Sequence[float], ready_s: float
 ) -> float | None:
-    """The stamp of the first setpoint that uses an output that was ready at `ready_s`."""
+    """Return the stamp of the first setpoint that uses an output ready at `ready_s`, or None."""
     for invocation in invocations:
         if invocation.node == "control" and invocation.start_s >= ready_s - _SAME_S:
             delay_s = invocation.end_s - invocation.start_s
@@ -175,9 +175,9 @@ def _answered(
 
 
 def timeline_seed(flights: pa.Table, platforms: Sequence[str]) -> int | None:
-    """Seed of the first mission that succeeds and replans on all platforms.
+    """Return the seed of the first mission that succeeds and replans on all platforms.
 
-    If none replans, the first that succeeds on all platforms; None without such a mission.
+    If none replans, it is the first that succeeds on all platforms; None without such a mission.
 
     Args:
         flights: golden and other flights, with the columns of `platforms.SCHEMA`.

@@ -23,7 +23,7 @@ class _DrawnFlight:
 
     Attributes:
         number: number of its mission.
-        name: name of its setting, as short as the other flights of the panel allow.
+        name: name of its setting, only as long as it takes to be distinct in the panel.
         flight_time_s: None if the flight has none.
         path: its run folder.
     """
@@ -50,7 +50,7 @@ class _Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionPicture:
-    """The flights that share world, start and noise, panel by panel.
+    """The flights that share world, start and noise, by panel.
 
     Attributes:
         panels: one for each fault; at least one.
@@ -82,7 +82,7 @@ class _Flown:
 
     @property
     def setting(self) -> str:
-        """The name in the specification, else a description."""
+        """The setting's name in the specification, otherwise a description."""
         named = self.labels.get("setting")
         if named is not None:
             return str(named)
@@ -91,7 +91,7 @@ class _Flown:
 
     @property
     def treatment(self) -> list[str]:
-        """The labels, except the name, that distinguish its setting from others of that name."""
+        """The labels other than the name that distinguish its setting from others of that name."""
         values = (self.labels.get(name) for name in TREATMENT[1:])
         return [
             "no detector" if value == "none" else str(value)
@@ -106,14 +106,14 @@ def pair(
     """Find the flights that share world, start and noise with a mission.
 
     Args:
-        number: number of the mission. None selects the pair in which a fault prolongs a flight
-            most without failing it, relative to the golden flight time, among the pairs with all
-            run folders; the first pair of the list if no fault does.
+        number: number of the mission. None selects, among the pairs with all run folders, the one
+            in which a fault prolongs a successful flight most, relative to the golden flight time;
+            the first such pair on the list if no fault does.
         among: numbers of the missions to choose from and to draw; None means all.
 
     Raises:
         ConfigError: the list has no such mission.
-        RecordError: its pair is not flown, or not all of its run folders were kept.
+        RecordError: its pair has not been flown, or not all of its run folders were kept.
     """
     listed = {row[0]: row for row in ledger.rows()}
     chosen = listed.keys() if among is None else among

@@ -40,9 +40,9 @@ PROGRAM_COLUMNS = f"run outcome signal exit_code magnitude {_OF_EVERY_RUN}".spli
 
 
 def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> Share:
-    """The share of hits in the injected runs, or in all.
+    """Return the share of hits among the injected runs, or among all.
 
-    Where windows are sampled, the spread between them widens the interval.
+    If windows are sampled, the spread between them widens the interval.
     """
     chosen: list[bool] = []
     windows: list[Cluster | None] = []
@@ -63,7 +63,7 @@ def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> S
 
 
 def _share_entry(share: Share) -> Json:
-    """A share as in `kernels.json`, where a share of nothing is None."""
+    """Return a share as in `kernels.json`, in which the share of no runs is None."""
     return {
         "count": share.count, "of": share.total, "share": _finite(share.share),
         "wilson95": [share.low, share.high],
@@ -72,7 +72,7 @@ def _share_entry(share: Share) -> Json:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _TargetCounts:
-    """The counts of one target; shares are those of the *injected* runs."""
+    """The counts of one target; shares are relative to the *injected* runs."""
 
     null_runs: NullRuns
     outcomes: dict[str, Share]
@@ -102,11 +102,11 @@ class _TargetCounts:
 
     @property
     def differing(self) -> float:
-        """Upper 95 % bound of the share that differs without a flip."""
+        """Upper 95 % bound of the share of runs that differ without a flip."""
         return unseen_share(self.null_runs.reached)
 
     def as_dict(self) -> Json:
-        """Plain values, as in `kernels.json`."""
+        """Return plain values, as in `kernels.json`."""
         null_runs = self.null_runs
         return {
             "null_runs": {
@@ -120,7 +120,7 @@ class _TargetCounts:
         }  # fmt: skip
 
     def lines(self, indent: str) -> Iterator[str]:
-        """Null runs, crashes, reasons and activations as text."""
+        """Yield null runs, crashes, reasons and activations as text."""
         null_runs = self.null_runs
         counting = _listed(dict(sorted(null_runs.counting.items())))
         yield (
@@ -144,8 +144,8 @@ class _KernelCounts:
 
     Attributes:
         noticeable: the share of runs with a silent corruption beyond the kernel's own tolerance.
-        sdc: relative sizes of silent corruptions, None without one.
-        parts: sizes of each part of silent corruptions, from the smallest.
+        sdc: relative sizes of silent corruptions; None for one without a relative size.
+        parts: sizes of silent corruptions by part, in ascending order.
     """
 
     kernel: Kernel
@@ -177,11 +177,11 @@ class _KernelCounts:
 
     @property
     def comparable(self) -> list[float]:
-        """Relative sizes of silent corruptions that have one, from the smallest."""
+        """Relative sizes of the silent corruptions that have one, in ascending order."""
         return sorted(size for size in self.sdc if size is not None)
 
     def as_dict(self) -> Json:
-        """Plain values, as in `kernels.json`."""
+        """Return plain values, as in `kernels.json`."""
         runs, records = self.runs, self.runs.records
         run_s = sum(entry["run_s"] for entry in records)
         return {
@@ -207,7 +207,7 @@ class _KernelCounts:
         }  # fmt: skip
 
     def lines(self) -> Iterator[str]:
-        """The notes on the runs as text."""
+        """Yield the notes on the runs as text."""
         yield f"{self.kernel.title}: scope {', '.join(self.runs.context['scope'])}"
         for number in range(len(self.runs.goldens)):
             yield f"  input {number}: {_population(self.runs, number)}"
@@ -229,7 +229,7 @@ class _KernelCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelsSummary:
-    """A campaign on kernels.
+    """The summary of a campaign on kernels.
 
     Attributes:
         plan: everything that the results depend on.
@@ -240,12 +240,12 @@ class KernelsSummary:
     kernels: list[_KernelCounts]
 
     def as_dict(self) -> Json:
-        """Plain values, the contents of `kernels.json`."""
+        """Return plain values, the contents of `kernels.json`."""
         kernels = [kernel.as_dict() for kernel in self.kernels]
         return {"schema": SCHEMA, "plan": self.plan, "sampling": self.sampling, "kernels": kernels}
 
     def text(self) -> str:
-        """A table with one row per kernel, and notes."""
+        """Return a table with one row per kernel, and notes."""
         head = ["kernel", "runs", *(outcome.title for outcome in RunOutcome)]
         rows = [
             [kernel.kernel.title, str(len(kernel.runs.records)),
@@ -265,7 +265,7 @@ class KernelsSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramSummary:
-    """A campaign on a program, with its counts."""
+    """The summary of a campaign on a program."""
 
     runs: TargetRuns
     sampling: str
@@ -273,7 +273,7 @@ class ProgramSummary:
     counts: _TargetCounts
 
     def as_dict(self) -> Json:
-        """Plain values, as `--json` prints them."""
+        """Return plain values, as `--json` prints them."""
         runs, profile = self.runs, self.runs.profile
         part = partial(getattr, profile) if profile is not None else lambda _name: None
         return {
@@ -293,7 +293,7 @@ class ProgramSummary:
         }
 
     def text(self) -> str:
-        """A table with one row per outcome, and notes."""
+        """Return a table with one row per outcome, and notes."""
         lines = [f"{'outcome':<14}{'runs':>7}{'share':>9}   95 % interval"]
         for name, share in self.counts.outcomes.items():
             lines.append(
@@ -353,7 +353,7 @@ def _median(sizes: Sequence[float]) -> float:
 
 
 def _sizes(sizes: Sequence[float]) -> dict[str, float | None]:
-    """The median and the largest of sizes from the smallest."""
+    """Return the median and the largest of sizes in ascending order."""
     largest = sizes[-1] if sizes else None
     return {"median": _median(sizes) if sizes else None, "largest": largest}
 
@@ -365,7 +365,7 @@ def _population(runs: TargetRuns, number: int) -> str:
 
 
 def _input(runs: TargetRuns, number: int) -> Json:
-    """Plain values of an input: how much of its run was profiled, and the outcomes of its runs."""
+    """Return an input as plain values: how far it was profiled, and the outcomes of its runs."""
     profile, golden = runs.profiles[number], runs.goldens[number]
     length = None if profile is None else profile.instructions
     return {
@@ -455,7 +455,7 @@ def _kernel_figure(summary: KernelsSummary) -> Figure:
 
 
 def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
-    """Stack the segments from below. All but the last have an interval at their upper edge."""
+    """Stack the segments upwards. All but the last have an interval at their upper edge."""
     base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]

@@ -226,7 +226,7 @@ def _comparison_lines(settings: SettingColumns, comparisons: Sequence[Comparison
 
 
 def _comparison_cells(row: Comparison) -> list[str]:
-    """Success, time and worst cases; only protection has the one over the mean golden flight."""
+    """Return success, time and worst cases; that over the mean golden flight only if protected."""
     time = row.differences["flight_time_s"]
     return [
         f"{row.success.pairs}",
@@ -322,7 +322,7 @@ def _recovery_cells(row: FlightOverhead) -> list[str]:
 
 
 def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
-    """Per cent with four decimals, as in the paper's table; smaller positive values as "<"."""
+    """Format per cent with four decimals, as in the paper's table; tiny positive values as "<"."""
     value, *between = spread(share, 4, 100.0).split(" ", 1)
     value = "<0.0001" if 0.0 < share.value < 0.5e-6 else value
     return " ".join([value, *between]) if ends else value
@@ -385,7 +385,7 @@ def flights_file(table: pa.Table, path: Path) -> bytes:
 
 
 def _flat(table: pa.Table) -> pa.Table:
-    """A table whose lists, which CSV lacks, are JSON text."""
+    """Return the table with its lists as JSON text, because CSV has no lists."""
     for place, field in enumerate(table.schema):
         if pa.types.is_list(field.type):
             texts = [

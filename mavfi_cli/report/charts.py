@@ -28,7 +28,7 @@ _OWN_ID = re.compile(r' id="[a-z]+[a-z0-9]*_[0-9_]+"')  # figure_1, text_3: not 
 _FONT = re.compile(r"font: (?:[a-z0-9]+ )*?([0-9.]+px)[^;\"]*")
 
 
-Curve = tuple[str, str, FloatArray]  # label, detector, sorted added seconds; infinite: lost
+Curve = tuple[str, str, FloatArray]  # label, detector, sorted added seconds (infinite if lost)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,13 +53,13 @@ class Picture:
     def of(
         cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
     ) -> Picture:
-        """Return the chart of a figure, and of one for narrow screens, in the page's style."""
+        """Return the chart of a figure, with one for narrow screens, in the page's style."""
         wide, small = (_markup(part) if part else "" for part in (figure, narrow))
         return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
 
 
 def _markup(figure: Figure) -> str:
-    """A figure as an SVG element in the page's font and colours."""
+    """Return a figure as an SVG element in the page's font and colours."""
     text = svg(figure)
     markup = _OWN_ID.sub("", text[text.index("<svg") :])
     markup = _FONT.sub(r"font-size: \1", markup)
@@ -68,7 +68,7 @@ def _markup(figure: Figure) -> str:
     return markup.strip()
 
 
-# Effects beside ranges ----------------------------------------------------------------------------
+# Effects and claimed ranges -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,9 +76,9 @@ class ForestRow:
     """A claim in the forest plot.
 
     Attributes:
-        low, high: ends of the claimed range; infinite where it has no end.
+        low, high: ends of the claimed range; infinite where it is open.
         number: whether the effect is a plain number; otherwise it is a share.
-        effects: effect by stack; None if the stack was not flown or has no number.
+        effects: one effect per stack; None if the stack was not flown or has no number.
         verdict: verdict on the first stack.
     """
 
@@ -145,7 +145,7 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str =
 
 
 def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
-    """An effect with its interval; that of the first stack has the colour of the verdict."""
+    """Draw an effect with its interval; that of the first stack has the colour of the verdict."""
     colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
     height = y - 0.14 if not place else y + 0.26
     width, size = (1.3, 3.2) if not place else (0.6, 2.2)
@@ -162,7 +162,7 @@ def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, ve
 def draw_delays(
     panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float], columns: str = "two"
 ) -> Figure:
-    """Draw the share of flights that are longer by more than given seconds and per cent.
+    """Draw the share of flights that are longer by more than a time, in seconds and per cent.
 
     Args:
         columns: `one` on a narrow screen, otherwise `two`.
@@ -209,7 +209,7 @@ def draw_delays(
 def _per_cent_of(
     mean_s: float,
 ) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
-    """Functions that convert seconds to per cent of a mean time, and back."""
+    """Return functions that convert seconds to per cent of a mean time, and back."""
     return lambda added_s: 100.0 * added_s / mean_s, lambda rate: rate * mean_s / 100.0
 
 
@@ -217,10 +217,10 @@ def _per_cent_of(
 
 
 def draw_arms(arms: Sequence[tuple[str, Share, float | None]]) -> Figure:
-    """Draw the lost missions of each arm.
+    """Draw the share of lost missions in each arm.
 
     Args:
-        arms: name, lost missions, and corrected p-value; None of the unprotected arm.
+        arms: name, share of lost missions, and corrected p-value; None for the unprotected arm.
     """
     figure = new_figure(WIDTHS_IN["one"], 0.6 + 0.17 * len(arms))
     axes = figure.add_subplot()

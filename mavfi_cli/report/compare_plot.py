@@ -308,7 +308,7 @@ _ANSWER = "#c22f2f"
 _HEIGHT = 0.62
 _THINNEST = 0.0022  # minimum bar length as a fraction of the window
 _ROOM = 0.085  # minimum bar length for a text inside, as a fraction of the window
-_LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window from which texts go to the left
+_LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window beyond which text goes to the left
 
 
 def _draw_timeline(comparison: PlatformComparison) -> Figure:
@@ -398,7 +398,7 @@ def _time(seconds: float) -> str:
 
 
 def _steps(axes: Axes, row: Timeline) -> None:
-    """Draw lines from each end to the start that it triggered, level while a message waited."""
+    """Link each end to the start that it triggered, with a level line while a message waits."""
     places = {kernel: lane for lane, kernel in enumerate(_LANES)}
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip

@@ -1,4 +1,4 @@
-"""An evaluation of detectors as text, CSV and pictures; the loss of a training."""
+"""An evaluation of detectors as text, CSV and pictures; the loss curve of a training."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _INTERVALS = "in brackets: 95 % intervals (Wilson for shares, bootstrap for the 
 
 
 def detector_lines(evaluation: Evaluation) -> list[str]:
-    """The evaluation in words and columns."""
+    """Return the evaluation as text and tables."""
     lines = _head(evaluation)
     lines += ["", "Without faults, against the same flights without a detector"]
     lines += Table([*_error_free_rows(evaluation.error_free)]).lines()
@@ -199,7 +199,7 @@ def _share(share: Share) -> str:
 
 
 def detector_csv(*pairs: pa.Table) -> str:
-    """One row per pair: first the pairs without faults, then those with one."""
+    """Return one row per pair: first the pairs without a fault, then those with one."""
     rows = (row for table in pairs for row in table.select([*CSV]).to_pylist())
     return Table.of_records(rows, [*CSV]).csv()
 
@@ -208,9 +208,9 @@ def detector_csv(*pairs: pa.Table) -> str:
 
 
 def _draw_roc(evaluation: Evaluation) -> Figure:
-    """Draw a figure with ROC on the left and precision over recall on the right.
+    """Draw ROC curves on the left, and precision over recall on the right.
 
-    A dot marks the detector at its own threshold.
+    A dot marks each detector at its own threshold.
     """
     figure = new_figure(8.4, 4.4)
     roc, precision = figure.subplots(1, 2)
@@ -323,7 +323,7 @@ def _bars(
 
 
 def draw_loss_curve(curve: Sequence[Sequence[float]]) -> Figure:
-    """Draw a figure of the mean squared errors of scaled deltas, logarithmic, over the epochs.
+    """Draw the mean squared errors of scaled deltas over the epochs, on a logarithmic scale.
 
     Args:
         curve: Rows of epoch, mean training error and largest validation error.

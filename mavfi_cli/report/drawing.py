@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mavfi_cli.core.types import FloatArray
 
 PICTURES = (".svg", ".pdf", ".png")
-_STAMPS: dict[str, dict[str, str | None]] = {  # metadata that is the same at any time
+_STAMPS: dict[str, dict[str, str | None]] = {  # metadata that does not depend on the time
     "svg": {"Date": None, "Creator": "mavfi"},
     "pdf": {"CreationDate": None, "Creator": "mavfi", "Producer": "mavfi"},
     "png": {"Software": "mavfi"},
@@ -27,7 +27,7 @@ _DPI = 300
 _TURN = 0.6180339887498949  # golden ratio
 
 Look = Mapping[str, Any]  # keywords of matplotlib
-DASHED = (0, (5, 3))  # of lines of reference
+DASHED = (0, (5, 3))  # style of reference lines
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"
@@ -89,7 +89,7 @@ def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
 
 def scattered(count: int) -> FloatArray:
     """Return offsets from -0.5 to 0.5 that spread dots evenly, the same in every call, (count,)."""
-    import numpy as np  # the commands load this module
+    import numpy as np  # here, because the commands load this module
 
     return (0.5 + np.arange(count, dtype=np.float64) * _TURN) % 1.0 - 0.5
 

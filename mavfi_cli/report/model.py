@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Ratios of flights in vpm.json and flights.csv: scheme below, ending of the keys, fields.
+# Ratios of flights in vpm.json and flights.csv: field of the scheme, suffix of the keys, ratios.
 _OVER: Sequence[tuple[str, str, Sequence[str]]] = (
     ("over_none", "", ("velocity_ratio", "flight_time_ratio", "energy_ratio")),
     ("over_aad", "_over_aad", ("flight_time_ratio",)),
@@ -53,15 +53,15 @@ _OVER: Sequence[tuple[str, str, Sequence[str]]] = (
 
 
 def model_json(model: ModelReport, flights: FlightsReport | None = None) -> Any:
-    """The model, and its flights as `flights` if there are any, as plain values."""
+    """Return the model as plain values, with its flights, if any, under the key `flights`."""
     parts = {} if flights is None else {"flights": _with_rows(flights)}
     return plain(_with_rows(model) | parts)
 
 
 def model_csv(model: ModelReport | FlightsReport) -> str:
-    """CSV text of the model or of its flights, one row per vehicle and scheme.
+    """Return the model or its flights as CSV text, one row per vehicle and scheme.
 
-    The header names the units.
+    The column names include the units.
     """
     distance = {"distance_m": model.distance_m} if isinstance(model, ModelReport) else {}
     return Table.of_records(
@@ -85,7 +85,7 @@ def _with_rows(report: ModelReport | FlightsReport) -> Json:
 
 
 def _cells_of(row: SchemeResult | FlownScheme) -> Json:
-    """The cells of a scheme by the names of their columns; lists are tuples."""
+    """Return the cells of a scheme by the names of their columns; lists are tuples."""
     if isinstance(row, SchemeResult):
         cells = asdict(row)
         problem = cells.pop("problem")
@@ -117,7 +117,7 @@ def _cells_of(row: SchemeResult | FlownScheme) -> Json:
 
 
 def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
-    """The cells of a number whose name ends in its unit."""
+    """Return the cells of a number whose name ends in its unit."""
     quantity, _, unit = name.rpartition("_")
     compared = name if unit == "ratio" else quantity
     return {
@@ -133,7 +133,7 @@ def _number_with_ends(name: str, number: ModelAndFlights) -> dict[str, float]:
 
 
 def model_lines(model: ModelReport, flights: FlightsReport | None = None) -> list[str]:
-    """The lines that are printed: the model's, and below them those of its flights, if any."""
+    """Return the lines to print: the model's, and below them those of its flights, if any."""
     lines = [
         f"Model {model.model}; knee: where velocity is "
         f"{100 * model.knee_velocity_over_roof_ratio:g} % of the roof",
@@ -228,9 +228,9 @@ def _calibration_lines(rows: Sequence[CalibratedNumber]) -> Iterator[str]:
     ]).lines()  # fmt: skip
 
 
-# Text: flights beside the model -------------------------------------------------------------------
+# Text: flights against the model ------------------------------------------------------------------
 
-_MANY_ALARMS = 10.0  # alarms of an error-free flight; more is not the detector's usual rate
+_MANY_ALARMS = 10.0  # alarms of an error-free flight; a detector usually raises fewer
 _NUMBERS = (  # heading, field of FlownNumbers, format of a number, unit, factor
     ("Mean velocity against the model's safe velocity", "velocity_mps", ".2f", "m/s", 1.0),
     ("Top velocity against it", "top_velocity_mps", ".2f", "m/s", 1.0),
@@ -339,7 +339,7 @@ def _reasons(own: FlownNumbers) -> list[str]:
 
 
 def _known(text: str, value: float, otherwise: str = "-") -> str:
-    """The text of a value, or `otherwise` if it is NaN because no flight succeeded."""
+    """Return the text of a value, or `otherwise` if it is NaN because no flight succeeded."""
     return otherwise if math.isnan(value) else text
 
 
@@ -462,7 +462,7 @@ _COST_WIDTH = 0.15
 
 
 def _draw_redundancy(model: ModelReport) -> Figure:
-    """Draw a panel per vehicle, a bar per scheme and ratios to the reference."""
+    """Draw a panel per vehicle, with ratios to the reference as a bar per scheme."""
     vehicles = model.vehicles
     figure = new_figure(max(6.8, 4.6 * len(vehicles)), 4.2)
     panels = figure.subplots(1, len(vehicles), squeeze=False)[0]
@@ -503,7 +503,7 @@ def _cost_panel(axes: Axes, vehicle: VehicleReport) -> None:
 
 
 def _beside(place: float, number: int, count: int, width: float) -> float:
-    """Centre of one of several bars around a place."""
+    """Return the centre of one of `count` bars around a place."""
     return place + (number - (count - 1) / 2) * width
 
 
@@ -514,7 +514,7 @@ _UPRIGHT: Look = {"va": "bottom", "fontsize": 7, "rotation": 90.0}
 
 
 def draw_flights(flights: FlightsReport) -> Figure:
-    """Draw a row per vehicle: velocities left, ratios to the reference right.
+    """Draw a row per vehicle: velocities on the left, ratios to the reference on the right.
 
     A diamond marks the model. A bar shows the flights with their 95 % interval over missions.
     """
@@ -579,7 +579,7 @@ def _ratio_panel(axes: Axes, vehicle: FlownVehicle, reference: str) -> None:
 def _bar(
     axes: Axes, place: float, width: float, row: FlownScheme, number: ModelAndFlights | None
 ) -> None:
-    """Draw a number of the flights as a bar and of the model as a diamond; None: not flown."""
+    """Draw the flights' number as a bar and the model's as a diamond; None means not flown."""
     if number is None:
         note_at(axes, "not flown", (place, 0.0), 3, **{**_UPRIGHT, "color": NOTE})
         return
@@ -595,4 +595,4 @@ MODEL_PICTURES: Mapping[str, Callable[[ModelReport], Figure]] = {
     "roofline.svg": _draw_roofline,
     "redundancy.svg": _draw_redundancy,
 }
-"""Of the model, by the names of their files."""
+"""The pictures of the model, by file name."""

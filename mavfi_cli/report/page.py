@@ -1,7 +1,7 @@
 """Fills the page's template: formats the numbers and inserts the charts.
 
 The page is one file without a script. Its charts are SVG elements, which take font and colours from
-the page: light, dark, print.
+the page's style: light, dark or print.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FOLDER = Path(__file__).parent
 
 
 def require_page(path: Path) -> None:
-    """Check what a page needs before its numbers are computed.
+    """Check the requirements of a page before its numbers are computed.
 
     Raises:
         MavfiError: jinja2, which the extra `report` installs, is missing.
@@ -36,7 +36,7 @@ def require_page(path: Path) -> None:
 
 
 def render(document: object) -> str:
-    """The page as one HTML text; equal values give equal pages.
+    """Render the page as one HTML text; equal values give equal pages.
 
     Args:
         document: `mavfi_cli.paper.document.Document`.
@@ -62,7 +62,7 @@ def _unbroken(value: Any) -> Any:
 
 
 def _effect(effect: Interval, unit: str) -> str:
-    """An effect with its interval, in per cent or in points of a success rate."""
+    """Format an effect with its interval: a number, per cent, or points of a success rate."""
     parts = (effect.value, effect.low, effect.high)
     if unit == "number":
         return with_ends(parts, "z.2f")
@@ -76,7 +76,7 @@ def _digits(largest: float) -> int:
 
 
 def _range(claim: Any) -> str:
-    """The range of a claim's effect."""
+    """Format the range of a claim's effect."""
     scale, unit = (1.0, "") if claim.unit == "number" else (100.0, _UNITS[claim.unit])
     low, high = (f"{scale * end:.4g}" for end in (claim.low, claim.high))
     if math.isinf(claim.low) and math.isinf(claim.high):
@@ -108,4 +108,4 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "hourly": lambda rates: with_ends(rates, ".2g"),
     "shade": lambda share: f"{100 * math.sqrt(share):.0f}" if math.isfinite(share) else "0",
 }  # fmt: skip
-"""By the names that page.html uses."""
+"""The template's filters, by the names that page.html uses."""

@@ -1,4 +1,4 @@
-"""The form of the paper's items: tables with our numbers beside the paper's, figures for print."""
+"""The form of the paper's items: tables of our numbers and the paper's, and figures for print."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Printed = float | str | None  # a number of the paper, its words for it, or nothing
+Printed = float | str | None  # the paper's number, its words for it, or nothing
 DETECTOR_TITLES = {"gad": "Gaussian", "aad": "autoencoder"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperCell:
-    """A number of ours with its interval and count, and the paper's.
+    """Our number with its interval and count, and the paper's number.
 
     Attributes:
         value, low, high: NaN if there are none; a maximum has no interval.
@@ -51,7 +51,7 @@ class PaperCell:
 
     @classmethod
     def of_share(cls, share: Share, paper: Printed = None) -> PaperCell:
-        """A share in per cent."""
+        """Return a share in per cent."""
         if not share.total:
             return cls(paper=paper)
         ends = {"value": share.share, "low": share.low, "high": share.high}
@@ -59,12 +59,12 @@ class PaperCell:
 
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
-        """A mean with its bootstrap interval."""
+        """Return a mean with its bootstrap interval."""
         return replace(cls.of_interval(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
 
     @classmethod
     def of_interval(cls, mean: Interval, scale: float = 1.0) -> PaperCell:
-        """A mean with its interval, both multiplied by `scale`."""
+        """Return a mean with its interval, both multiplied by `scale`."""
         ends = {"value": mean.value, "low": mean.low, "high": mean.high}
         return cls(**{k: scale * v for k, v in ends.items()}, count=mean.count)
 
@@ -76,8 +76,8 @@ class PaperColumn:
     Attributes:
         title: heading with the unit.
         digits: number of digits after the decimal point.
-        ends: digits of the interval's ends; None means as many.
-        sign: whether positive numbers have a plus.
+        ends: digits of the interval's ends; None means `digits`.
+        sign: whether positive numbers have a plus sign.
     """
 
     title: str
@@ -86,11 +86,11 @@ class PaperColumn:
     sign: bool = False
 
     def formatted(self, value: float) -> str:
-        """A number in the column's form; a dash if there is none."""
+        """Format a number for the column; a dash if there is none."""
         return number(value, self._shape(self.digits))
 
     def ours(self, cell: PaperCell) -> str:
-        """A number of ours with its interval."""
+        """Format our number with its interval."""
         ends = self._shape(self.digits if self.ends is None else self.ends)
         return with_ends((cell.value, cell.low, cell.high), self._shape(self.digits), ends)
 
@@ -98,7 +98,7 @@ class PaperColumn:
         return f"{'+' if self.sign else ''}.{digits}f"
 
     def printed(self, paper: Printed) -> str:
-        """A number of the paper in its own form."""
+        """Format the paper's number for the column, or return the paper's words."""
         if isinstance(paper, float):
             return self.formatted(paper)
         return paper or ""
@@ -141,11 +141,11 @@ class PaperTable:
     result: str = ""
 
     def printed_in(self, place: int) -> bool:
-        """Whether the paper prints anything in a column."""
+        """Return whether the paper prints anything in a column."""
         return any(row.cells[place].paper is not None for row in self.rows)
 
     def beside(self, row: PaperRow, place: int, unit: str = " %") -> str:
-        """Our number in a row and a column, with the paper's in brackets if it prints one."""
+        """Format our number in a row and a column, with the paper's in brackets if there is one."""
         column, cell = self.columns[place], row.cells[place]
         paper = column.printed(cell.paper)
         return f"{column.formatted(cell.value)}{unit}" + (
@@ -153,13 +153,13 @@ class PaperTable:
         )
 
     def ranked(self, place: int) -> list[PaperRow]:
-        """The rows with a number in a column, the largest first."""
+        """Return the rows with a number in a column, the largest first."""
         rows = [row for row in self.rows if not math.isnan(row.cells[place].value)]
         return sorted(rows, key=lambda row: -row.cells[place].value)
 
     @property
     def table(self) -> Table:
-        """Labels, n, then our numbers, which always stay on one page with the paper's."""
+        """Labels, n, then our numbers, each always on the same page as the paper's."""
         head = [*self.labels, "n"]
         parts = [1 + self.printed_in(place) for place in range(len(self.columns))]
         for column, part in zip(self.columns, parts, strict=True):
@@ -201,16 +201,16 @@ def _plain(value: float) -> float | None:
 
 # Figures for print --------------------------------------------------------------------------------
 
-WIDTHS_IN = {"one": 3.5, "two": 7.16}  # columns of an IEEE page
+WIDTHS_IN = {"one": 3.5, "two": 7.16}  # of one and two columns on an IEEE page
 SMALLEST = 7.0  # points
-PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; no two alike in grey
+PALETTE = ("#16213e", "#b3402a", "#4f93c8", "#f0b95a")  # dark to light; distinct in greyscale
 MARKERS = ("o", "s", "^", "D")
 _PAPER: Look = {
     "marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
     "markeredgewidth": 0.9, "linestyle": "none",
 }  # fmt: skip
-_OUTLIER, _LINEAR = 200.0, 20.0  # %; beyond the first the axis is logarithmic from the second on
-_LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of a further line of its name
+_OUTLIER, _LINEAR = 200.0, 20.0  # %; with values above the first, logarithmic above the second
+_LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of each further line of its name
 _NAME = 36  # characters in a line of a row's name
 
 
@@ -224,10 +224,10 @@ def print_axes(axes: Axes, title: str = "") -> None:
 
 
 def draw_dots(table: PaperTable, columns: str = "one") -> Figure:
-    """Draw a panel per column of a table: ours with its interval, the paper's as a diamond.
+    """Draw a panel per column of a table: our numbers with intervals, the paper's as diamonds.
 
     Args:
-        table: at least one row.
+        table: has at least one row.
     """
     places = [
         place
@@ -259,7 +259,7 @@ def _panels(
     *,
     sharex: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with panels of equal rows.
+    """Return a figure and its panels, which have the same rows.
 
     Args:
         names: names of the rows.
@@ -317,7 +317,7 @@ class Strip:
 def draw_strips(
     panels: Mapping[str, Sequence[Strip]], quantity: str, columns: str = "one"
 ) -> Figure:
-    """Draw each flight as a dot, the middle half as a bar, the median, and the paper's largest.
+    """Draw each flight as a dot, with quartiles, median and maximum, and the paper's maximum.
 
     Args:
         panels: the rows of each panel from top to bottom, by its title; all have the same labels.

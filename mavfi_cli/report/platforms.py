@@ -42,7 +42,7 @@ def _titles_of(plan: ComparedPlan) -> dict[str, str]:
 
 
 def platform_lines(comparison: PlatformComparison) -> list[str]:
-    """The comparison in words and columns."""
+    """Return the comparison as text and tables."""
     plan, settings = comparison.plan, comparison.settings
     lines = _head(plan)
     lines += ["", "Flights that count: golden, or with a fault that was read or caught; medians"]
@@ -101,7 +101,7 @@ def _head(plan: ComparedPlan) -> list[str]:
 OwnRow = TypeVar("OwnRow", bound=SettingFlights | CostRow | LongestFlight)
 PairedRow = TypeVar("PairedRow", bound=RatioRow | CostDifference)
 Row = TypeVar("Row")
-Columns = Mapping[str, Callable[[Row], str]]  # of a table: heading, and what a row has below it
+Columns = Mapping[str, Callable[[Row], str]]  # of a table: heading, and the cell of a row
 
 
 def _side_by_side(
@@ -111,7 +111,7 @@ def _side_by_side(
     *,
     by_setting: bool = False,
 ) -> list[str]:
-    """One line per platform and setting, grouped by platform or by setting."""
+    """Return one line per platform and setting, grouped by platform or by setting."""
     titles, last = _titles_of(plan), ""
     lines: list[list[str]] = []
     for row in rows:
@@ -130,7 +130,7 @@ def _against(
     title: str,
     columns: Columns[PairedRow],
 ) -> list[str]:
-    """One line per setting of a platform, compared with the reference."""
+    """Return one line per setting of a platform, compared with the reference."""
     lines = [
         [_setting_title(row.setting), *(cell(row) for cell in columns.values())]
         for row in rows
@@ -219,8 +219,8 @@ def _command_of(plan: ComparedPlan, platform: str, flight: WorstFault) -> str:
 _NAMES = ["table", "platform", "reference", "setting", "quantity", "statistic", "unit", "value",
           "low", "high", "count"]  # fmt: skip
 _OVER, _COST = "flight time over own golden", "cost of a fault"
-# Of a kind of row: quantity, statistic, unit, name of the number, name of the sample size of a
-# number without its own.
+# For each kind of row: quantity, statistic, unit, and the attributes with the number and, if the
+# number does not include it, with its sample size.
 _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
     "settings": (("success", "share", "1", "success", ""),),
     "ratios": (("success", "difference", "1", "success.difference", "pairs"),),
@@ -251,7 +251,7 @@ _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
 
 
 def platform_csv(comparison: PlatformComparison) -> str:
-    """One row per number: quantity, platform, setting, unit, value and interval."""
+    """Return one row per number: quantity, platform, setting, unit, value and interval."""
     rows = [_NAMES]
     for table, numbers in _NUMBERS.items():
         title = "costs" if table == "cost_differences" else table
@@ -271,14 +271,14 @@ def platform_csv(comparison: PlatformComparison) -> str:
 def _statistics(
     quantity: MeasuredQuantity | ChangedQuantity,
 ) -> Iterable[tuple[str, str, Interval]]:
-    """Name, unit and value of each statistic of a quantity."""
+    """Return name, unit and value of each statistic of a quantity."""
     if isinstance(quantity, ChangedQuantity):
         return [(quantity.kind, "1" if quantity.kind == "ratio" else quantity.unit, quantity)]
     return [("median", quantity.unit, quantity.median), ("mean", quantity.unit, quantity.mean)]
 
 
 def _number_cells(value: Interval | Share | float, count: int | None) -> list[str]:
-    """Value, ends of the interval and sample size, empty if there are none."""
+    """Return value, ends of the interval and sample size, empty if there are none."""
     if isinstance(value, Share):
         value = value.effect
     if isinstance(value, Interval):

@@ -69,7 +69,7 @@ class SettingColumns:
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
 
     def lines(self, head: Sequence[str], rows: Iterable[SettingRow]) -> list[str]:
-        """One line per setting, in several tables if the screen is too narrow.
+        """Return one line per setting, in several tables if the screen is too narrow.
 
         Args:
             head: headings of the cells.
@@ -78,7 +78,7 @@ class SettingColumns:
         return Table([[*self.heads, *head], *table], labels=len(self.heads)).lines(WIDTH)
 
     def cells(self, labels: Labels, name: str) -> list[str]:
-        """The cells of a setting's labels; the first empty one gets the rest of its name."""
+        """Return the cells of a setting's labels; the first empty one gets the rest of its name."""
         if not self.keys:
             return [name]
         cells = _cells(labels, self.keys)

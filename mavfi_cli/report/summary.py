@@ -47,7 +47,7 @@ def _number(value: float | None, unit: str, digits: int = 1, per: float = 1.0) -
 def outcome_line(flight: FlightRecord) -> str:
     """Return the outcome and its reason in one line."""
     text = _OUTCOMES.get(flight.outcome, flight.outcome)
-    if flight.programs:  # success and failure have the reasons of a user's companion
+    if flight.programs:  # a user's companion has its own reasons for success and failure
         text = text.partition(":")[0]
     return f"{text} ({flight.reason})" if flight.reason else text
 
@@ -109,7 +109,7 @@ def _flight_lines(flight: FlightRecord) -> list[str]:
         f"{_number(qof.goal_distance_m, 'm', 2)} from the goal",
         *_clearance_and_energy(qof),
     ]
-    if counters is None:  # of a user's companion
+    if counters is None:  # a user's companion has none
         return lines
     flown = counters.replans + any(e.kind in ("plan", "replan") for e in flight.events)
     wanted, failed, again = counters.plans_requested, counters.plans_failed, counters.replans
@@ -178,7 +178,7 @@ def _detection_lines(detection: Detection | None, cost: DetectionCost | None) ->
         lines.append(
             f"            at {alarm.stamp_s:.2f} s: {alarm.stage}, {where}: {alarm.response}"
         )
-    if "setpoint" in detection.checks:  # the gate before a user's companion
+    if "setpoint" in detection.checks:  # the gate for a user's companion
         counts = (f"{count} {name}" for name, count in responses.items() if count)
         return [*lines, *(f"            setpoints withheld: {text}" for text in counts)]
     if alarms:
@@ -213,7 +213,7 @@ def folder_lines(run: Run, picture: Path | None) -> list[str]:
 def run_html(run: Run) -> str:
     """Return summary and picture as HTML, with escaped text, because the record may be foreign.
 
-    The picture is drawn from the record as a separate image, in which a browser runs no script.
+    The picture is drawn from the record and embedded as an image, in which browsers run no script.
     """
     from mavfi_cli.report.drawing import svg
     from mavfi_cli.report.top_view import draw_top_view

@@ -1,6 +1,6 @@
 """A table as text, Markdown, LaTeX, CSV or HTML, and formats for the numbers in its cells.
 
-The text is not made by rich, which folds or cuts the cells of a table that is too wide. Here the
+The text does not use rich, which folds or truncates the cells of a table that is too wide. Here the
 columns continue in a further table that repeats the labels, so a file can be searched line by line.
 """
 
@@ -31,8 +31,8 @@ class Table:
         rows: may differ in length; missing cells are empty.
         labels: number of left-aligned columns; the others are right-aligned. None aligns all left.
         kept: number of columns after the labels that every page of a wide table repeats with them.
-        parts: numbers of the other columns that are never separated; empty if every column stands
-            alone.
+        parts: sizes of the groups of other columns that stay on one page; empty if every column is
+            a group of its own.
         prose: whether the last column is wrapped at the width.
         name: label of a LaTeX table.
         title: caption.
@@ -50,10 +50,10 @@ class Table:
 
     @classmethod
     def of_records(cls, records: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> Self:
-        """One row per record, below the names of the columns, with unrounded numbers.
+        """Return one row per record, below the names of the columns, with unrounded numbers.
 
         Args:
-            names: names of the columns; empty takes the keys of all records, in order.
+            names: names of the columns; if empty, the keys of all records, in order.
         """
         rows = list(records)
         keys = names or list(dict.fromkeys(key for row in rows for key in row))
@@ -61,7 +61,7 @@ class Table:
         return cls([[*keys], *cells])
 
     def lines(self, width: int | None = None) -> list[str]:
-        """Return one aligned line per row, with two blanks between the cells.
+        """Return one aligned line per row, with two spaces between the cells.
 
         Args:
             width: in characters. Columns beyond it continue in further tables below an empty line;
@@ -96,7 +96,7 @@ class Table:
     def latex(self) -> str:
         """Return a float with a plain tabular, which needs no package.
 
-        It is as wide as one of two columns, or as the page, in the largest size that fits.
+        It is as wide as one of two columns, or as the page, in the largest font size that fits.
         """
         head, *rows = self._padded()
         form = "".join("l" if left else "r" for left in self._left(len(head)))
@@ -125,10 +125,10 @@ class Table:
         return text.getvalue()
 
     def html(self, *, bare: bool = False) -> str:
-        """Return a table element with escaped cells; those of numbers have the class `n`.
+        """Return a table element with escaped cells; cells of numbers have the class `n`.
 
         Args:
-            bare: without title and notes.
+            bare: leave out title and notes.
         """
         head, *rows = self._padded()
         left = self._left(len(head))
@@ -154,7 +154,7 @@ class Table:
         return [self.labels is None or place < self.labels for place in range(columns)]
 
     def _wrapped(self, width: int) -> list[list[str]]:
-        """The rows, with further ones for prose that does not fit beside the other columns."""
+        """Return the rows, with further ones for the lines of prose that is too wide."""
         cells = self._padded()
         room = width - sum(column + _GAP for column in _widths(cells)[:-1])
         rows = []
@@ -215,14 +215,14 @@ _LATEX = {
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "<": r"\textless{}", ">": r"\textgreater{}",
 }  # fmt: skip
-# Sizes of 8 and of 7 points with the width of a character and of the gap between two columns, and
-# the widths of a column of a printed page and of the page; all in points.
+# Font sizes of 8 and 7 points, with the widths of a character and of the gap between columns. Then
+# the widths of one column of a printed page, and of the page. All in points.
 _SIZES = ((r"\footnotesize", 4.4, 6.0), (r"\scriptsize", 3.9, 6.0), (r"\scriptsize", 3.9, 4.0))
 _PLACES = (("table", 252.0), ("table*", 516.0))
 
 
 def _latex_place(widths: Sequence[int]) -> tuple[str, str, float]:
-    """The narrowest float and largest size that hold the table, and the gap; else the last."""
+    """Return the narrowest float and largest size that hold a table, and the gap; or the last."""
     for place, width_pt in _PLACES:
         for size, character_pt, gap_pt in _SIZES:
             if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:
@@ -265,7 +265,7 @@ def with_ends(
     Args:
         estimate: value, low, high.
         shape: format of the value.
-        ends: shape of the ends; empty means that of the value.
+        ends: format of the ends; empty means that of the value.
     """
     value, low, high = (scale * part for part in estimate)
     if not math.isfinite(value):

@@ -47,13 +47,13 @@ _MARKS: dict[str, tuple[str, str, Look]] = {
     "fault": ("fault", "*", {"s": 130, "facecolors": FAULT, "edgecolors": "white"}),
     "alarm": ("alarm", "D", {"s": 34, "facecolors": ALARM, "edgecolors": "white"}),
 }
-_WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points, so that equal paths stay visible
+_WIDEST, _STEP, _LEAST = 5.5, 1.7, 1.2  # line widths in points; identical paths stay visible
 _COLUMNS = 3
 _TITLE = 66  # characters in a line of a title
 _MARKED = {"fault": (-11.0, 8.0), "alarm": (11.0, -8.0)}  # offset from the position, points
 _BESIDE = 11.0  # points between marks at the same position
-_PLANS = 6  # plans that one can still distinguish; the newest are drawn
-_FROM_ABOVE, _OVER_TIME = [1, 2], [0, 3]  # what of stamp, x, y, z an axes shows
+_PLANS = 6  # number of plans that remain distinguishable; the newest are drawn
+_FROM_ABOVE, _OVER_TIME = [1, 2], [0, 3]  # columns of stamp, x, y, z that axes show
 
 
 # One flight: obstacles, path coloured by speed, plans and events ------------------------------
@@ -89,7 +89,7 @@ _Path = tuple[np.ndarray, np.ndarray]  # (n, 4) stamp in s and position in m; sp
 
 
 def _path_of(run: Run) -> _Path:
-    """The path of a flight, from the truth if it is known."""
+    """Return the path of a flight, from the true states if they are known."""
     trace = run.trace
     if trace is None or trace.num_rows == 0:
         return np.empty((0, 4)), np.empty(0)
@@ -180,7 +180,7 @@ def _draw_end(
 
 
 def _draw_start(axes: Axes, path: np.ndarray, columns: list[int] = _FROM_ABOVE) -> None:
-    above = 6.5  # the mark of a fault
+    above = 6.5  # above the mark of a fault
     _mark(axes, path[:1], columns, "start", "^", s=55, color="#222831", zorder=above)
 
 
@@ -298,7 +298,7 @@ _Flights = Sequence[tuple[str, Run]]
 
 @dataclass(frozen=True, slots=True)
 class Trajectories:
-    """Panels of superposed flights. Equal names have equal colours in all panels.
+    """Panels of superimposed flights. A name has the same colour in all panels.
 
     The first flight without fault and detector is the reference for the times of the others.
 
@@ -404,7 +404,7 @@ def _draw_panel(
 def _draw_panel_marks(
     figure: Figure, axes: Axes, flights: _Flights, colours: Mapping[str, str]
 ) -> None:
-    """Mark faults and alarms beside the path in the colours of their flights."""
+    """Mark faults and alarms next to the path in the colours of their flights."""
     from matplotlib.transforms import offset_copy
 
     for kind, (right, up) in _MARKED.items():

@@ -1,4 +1,4 @@
-"""Shows flights in rerun's viewer, or writes them to a file for it or for Foxglove."""
+"""Shows flights in rerun's viewer, or writes them to a file for rerun or Foxglove."""
 
 from __future__ import annotations
 

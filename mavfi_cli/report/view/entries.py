@@ -1,8 +1,8 @@
-"""A flight as a stream of typed, timed entries, which two formats of viewers show.
+"""A flight as a stream of typed, timed entries, from which files for two viewers are written.
 
 Lengths are in m and angles in rad; positions are in the world frame (ENU). The path of an entry is
-the place of a thing in the tree that the viewers show, such as `faulty/map`. A newer entry replaces
-an older one with the same path.
+its place in the tree that the viewers show, such as `faulty/map`. A newer entry replaces an older
+one with the same path.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _MAP = "#8b93a1"
 _FARTHEST_M = 1e5  # a corrupted position can be anywhere; viewers compute in single precision
 _MAP_EVERY_S = 1.0
 _PATH_EVERY_TICKS, _PATH_STEP_TICKS = 50, 10  # a path every second, with a point every 0.2 s
-_SETPOINT_S = 1.0  # a setpoint is drawn as the way that it commands in this time
+_SETPOINT_S = 1.0  # a setpoint is drawn as the motion that it commands in this time
 _MARK_M = 0.35
 _TALLEST_M = 15.0  # towers of generated worlds are 1000 m high, flights at most 10 m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """The state of one thing from a moment on.
+    """What a viewer shows at one path from a stamp until the next entry.
 
     Attributes:
         kind, data: what is shown.
@@ -72,7 +72,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewedFlight:
-    """A flight to look at.
+    """A flight to view.
 
     Attributes:
         name: First part of its paths, such as "golden".
@@ -89,11 +89,11 @@ class ViewedFlight:
         return FLIGHTS[0 if self.run.record.fault is None else 1]
 
     def entry(self, name: str, stamp_s: float, kind: str, data: Any, **look: Any) -> Entry:
-        """An entry of this name below the flight's."""
+        """Return an entry with this name below the flight's path."""
         return Entry(path=f"{self.name}/{name}", stamp_s=stamp_s, kind=kind, data=data, **look)
 
     def line(self, name: str, stamp_s: float, points: FloatArray, **look: Any) -> Entry:
-        """A line through points (n, 3), in the flight's colour."""
+        """Return a line through points (n, 3), in the flight's colour."""
         look = {"colour": self.colour, **look}
         return self.entry(name, stamp_s, "line", _drawable(points), **look)
 
@@ -151,7 +151,7 @@ def _marks(flight: ViewedFlight, kind: str) -> Iterator[Entry]:
 
 
 def _ticks(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
-    """Pose, setpoint and all states of each control tick."""
+    """Yield pose, setpoint and all states of each control tick."""
     for row in trace.drop_columns(["phase"]).to_pylist():
         stamp_s = row.pop("stamp_s")
         position = np.array([row["x_m"], row["y_m"], row["z_m"]])
@@ -173,7 +173,7 @@ def _path(flight: ViewedFlight, trace: pa.Table) -> Iterator[Entry]:
 
 
 def _drawable(points: FloatArray) -> FloatArray:
-    """Leave out the points (n, 3) that are not finite, and bring very far ones nearer."""
+    """Leave out the points (n, 3) that are not finite, and clip those that are very far away."""
     points = points.reshape(-1, 3)
     return points[np.isfinite(points).all(axis=1)].clip(-_FARTHEST_M, _FARTHEST_M)
 
@@ -193,7 +193,7 @@ def _clouds(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
 
 
 def _maps(flight: ViewedFlight, orders: Orders) -> Iterator[Entry]:
-    """Every map on which a plan was made, and at most one checked map per second in between."""
+    """Yield every map used for a plan, and at most one checked map per second in between."""
     planned = [(start_s, job[1], True) for job, start_s in orders.get("planner", ())]
     checked = [(at_s, job.snapshot, False) for job, at_s in orders.get("collision_check", ())]
     shown_s = -math.inf

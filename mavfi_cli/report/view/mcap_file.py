@@ -95,7 +95,7 @@ def _write(
 
 
 def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]]:
-    """Metadata records of an MCAP file, by name: the missions, and the versions of the software."""
+    """Return metadata records of an MCAP file, by name: missions, seeds, versions and faults."""
     records: dict[str, Mapping[str, object]] = {}
     for flight in flights:
         record = flight.run.record
@@ -111,7 +111,7 @@ def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]
 def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
     """Write a layout that Foxglove imports for the file of these flights.
 
-    The panels: the world, the camera of the last flight, its events, and three plots of states.
+    Its panels show the world, the camera of the last flight, its events, and three plots of states.
 
     Raises:
         RecordError: The file could not be written.
@@ -200,7 +200,7 @@ def _schema(message: dict[str, Any]) -> bytes:
 
 
 def _messages(entry: Entry) -> Iterator[tuple[str, Message | dict[str, Any]]]:
-    """The messages for an entry in an MCAP file, each with its topic."""
+    """Yield the messages for an entry in an MCAP file, each with its topic."""
     topic, data, stamp = f"/{entry.path}", entry.data, _timestamp(entry)
     match entry.kind:
         case "boxes":
@@ -255,13 +255,13 @@ def _turn(quaternion: Sequence[float]) -> Quaternion:
 
 
 def _optical(quaternion: FloatArray) -> tuple[float, float, float, float]:
-    """Turn a camera's axes (4,) from x forward, y left to z forward, x right."""
+    """Turn a camera's quaternion (4,) from axes x forward, y left to axes z forward, x right."""
     w, x, y, z = (quaternion / 2.0).tolist()
     return w + x - y + z, x - w - y - z, w + x + y - z, x - w + y + z
 
 
 def _scene(entry: Entry, **primitives: Any) -> SceneUpdate:
-    """Return the scene of an entry's primitives. It replaces what the entry's path had before."""
+    """Return the scene of an entry's primitives. It replaces the previous one at the same path."""
     entity = SceneEntity(timestamp=_timestamp(entry), frame_id=_WORLD, id=entry.path, **primitives)
     return SceneUpdate(entities=[entity])
 

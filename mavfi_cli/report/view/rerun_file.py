@@ -18,8 +18,8 @@ from mavfi_cli.report.view.entries import Entry, ViewedFlight, entries_of
 
 _TIME = "simulated_time"
 _BODY_M = (0.25, 0.25, 0.08)  # half sizes of the box that stands for the vehicle
-_WIDTH, _FAULTY_WIDTH = 1.5, 4.0  # of lines in plots, where golden flights are drawn on top
-_VEHICLE = {  # plots of columns that are no states
+_WIDTH, _FAULTY_WIDTH = 1.5, 4.0  # of lines in plots; golden ones are drawn on top
+_VEHICLE = {  # plots of columns that are not states
     "position": ("x_m", "y_m", "z_m"),
     "velocity": ("vx_mps", "vy_mps", "vz_mps"),
     "clearance": ("truth_clearance_m",),
@@ -43,7 +43,7 @@ def write_rrd(flights: Sequence[ViewedFlight], path: Path | None) -> None:
     stream = recording.binary_stream()
     try:
         _log(recording, flights)
-    finally:  # else rerun warns of data that nobody read
+    finally:  # otherwise rerun warns about unread data
         data = stream.read(flush=True) or b""
     write_atomically(path, lambda file: file.write(data))
 
@@ -62,10 +62,10 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
 def _log_entries(
     recording: Any, entries: Iterable[Entry], drawn: Mapping[str, ViewedFlight]
 ) -> None:
-    """Log entries one by one, but the numbers of all ticks at the end: a column at a time.
+    """Log entries one by one, except the numbers of all ticks: those follow column by column.
 
     Args:
-        drawn: The flight of each path of numbers; its colour is that of the lines.
+        drawn: The flight for each path of numbers, which gives the colour of the lines.
     """
     numbers: dict[str, list[Entry]] = {}
     for entry in entries:
@@ -92,7 +92,7 @@ def _log_entries(
 
 
 def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """The parts of an entry that rerun logs, each with its path."""
+    """Yield the parts of an entry that rerun logs, each with its path."""
     data, colours = entry.data, [to_rgb(entry.colour)] if entry.colour else None
     archetype: Any
     match entry.kind:
@@ -119,7 +119,7 @@ def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """The camera's pose and lens, and the frame; pixels without a measurement are 0."""
+    """Yield the camera's pose and lens, and the frame; pixels without a measurement are 0."""
     frame = entry.data
     rows, columns = frame.depth_m.shape
     w, x, y, z = frame.quaternion
