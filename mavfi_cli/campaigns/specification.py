@@ -223,7 +223,8 @@ class Spec:
 
     Attributes:
         seed: root of the seeds of all faults.
-        first_seed: first seed of the missions; repetition r flies with first_seed + r.
+        first_seed: first seed of the missions; repetition r flies with first_seed + r, or with
+            first_seed + r // faults_per_invocation if several faults share an invocation.
         repetitions: missions for each combination of factors.
         faults_per_invocation: number of faults at instruction level that strike the same
             invocation of a node, in consecutive repetitions with one seed. Missions without such

@@ -5,6 +5,8 @@ shares      proportions and their intervals, also for sampled clusters; sample s
 paired      the same missions under two treatments; families of tests; the paper's worst case;
             differences and recovered shares with intervals, and the verdict on a claim
 bootstrap   intervals of means, medians and paired differences
+sequences   tests and intervals that hold at any number of looks
+strata      allocation and weighted rates of stratified samples
 roc         detection against false alarms, over all thresholds
 
 Quantiles, exact tests, the bootstrap and permutations come from SciPy, which is imported inside the

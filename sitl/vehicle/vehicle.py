@@ -45,8 +45,8 @@ PHYSICS_DT_S = 0.004
 def regression_power(velocity_mps: Vector, acceleration_mps2: Vector, b: Vector) -> float:
     """Return rotor power, W, for velocity (3,), acceleration (3,) and coefficients (7,).
 
-    The regression is that of Tseng et al., arXiv 1703.10049, with speeds and accelerations in km/h
-    as in AirSim's fork. The result is never below zero.
+    The regression is that of Tseng et al., arXiv 1703.10049, with speeds in km/h and
+    accelerations in km/h/s as in AirSim's fork. The result is never below zero.
     """
     v = KMH_PER_MPS * math.sqrt(velocity_mps[0] ** 2 + velocity_mps[1] ** 2)
     a = KMH_PER_MPS * math.sqrt(acceleration_mps2[0] ** 2 + acceleration_mps2[1] ** 2)
