@@ -60,7 +60,7 @@ class LatencyModel:
         self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:
-        """Return the latency of the next invocation of a kernel, or of its measured one, s."""
+        """Return the latency of a kernel's next invocation, or of its newest if measured, s."""
         if self._profile.measured_factor is not None:
             assert self._wall is not None
             host_s = self._wall.newest.get(kernel, 0.0)
@@ -70,7 +70,7 @@ class LatencyModel:
         return latency.latency_s * math.exp(latency.spread * float(drawn))
 
     def summary(self) -> MeasuredPlatform | None:
-        """Return the factor of a measured platform, and each kernel's medians, s; else None."""
+        """Return a measured platform's factor and each kernel's medians, s; otherwise None."""
         factor = self._profile.measured_factor
         if factor is None:
             return None
@@ -108,7 +108,7 @@ class Node(Generic[In, Out]):
     restarts: int = 0
     free_s: float = 0.0  # end of the newest invocation outside the queue
     mates: list[AnyNode] = field(default_factory=list)  # others in its process, in cyclic order
-    standby: bool = False  # this process's kernel works on every input, too, and takes over
+    standby: bool = False  # this process's kernel also runs on every input, to take over
 
     @types.coroutine
     def run(self, value: In) -> Generator[tuple[AnyNode, In], Out, Out]:
@@ -118,7 +118,7 @@ class Node(Generic[In, Out]):
 
 @dataclass(slots=True, eq=False)
 class _Job:
-    """An invocation between its start and the effect of its output."""
+    """An invocation from its start until its output takes effect."""
 
     node: AnyNode
     start_s: float
@@ -205,8 +205,8 @@ class Executor:
     def stand_by(self, names: Sequence[str]) -> None:
         """Give the processes of these nodes a hot standby.
 
-        The standby works on every input as the process does, so it has the same state. When the
-        process dies or hangs, the standby's output takes effect at the same time instead.
+        The standby also processes every input, so it has the same state. When the process dies or
+        hangs, the standby's output takes effect instead, at the same time.
         """
         for name in names:
             for node in (self.nodes[name], *self.nodes[name].mates):
@@ -218,11 +218,11 @@ class Executor:
         return {member.name: member.kernel for member in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
-        """Run a node's kernel in a separate process from now on, until `close`.
+        """Run a node's kernel in a separate process until `close`.
 
         Args:
-            process: Process that serves them; by default a fork of this one with a copy of their
-                state.
+            process: Process that runs the kernels of the node and its mates; by default a fork of
+                this one, with a copy of their state.
         """
         node = self.nodes[name]
         node.process = process or NodeProcess.fork(self.process_of(name))
@@ -235,11 +235,11 @@ class Executor:
         fresh: Mapping[str, Callable[[Any, float], Any]],
         process: NodeProcess | None = None,
     ) -> None:
-        """Move a node that has already worked to a separate process, as `isolate` does.
+        """Move a node that has already run to a separate process, as `isolate` does.
 
         Args:
-            fresh: Unused kernels by node, from which the process is restarted. A hot standby keeps
-                the kernels that have worked.
+            fresh: Unused kernels by node, from which a lost process restarts. A hot standby keeps
+                the kernels that have already run.
             process: As for `isolate`.
         """
         self.isolate(name, process)
@@ -270,7 +270,7 @@ class Executor:
         """Run a node at once, outside the queue and without using a core of the platform.
 
         Args:
-            again: Repeat the newest invocation, even before its end, when other calls are dropped.
+            again: Repeat the newest invocation, even before it ends, when other calls are dropped.
 
         Returns:
             Output, and latency until it takes effect, s; None if the node is busy, down or lost.
@@ -293,7 +293,7 @@ class Executor:
     # Time
 
     def advance(self, stamp_s: float) -> None:
-        """Let all outputs take effect that are due up to `stamp_s`, in the order of time."""
+        """Apply all outputs due by `stamp_s`, in chronological order."""
         while self._events and self._events[0][0] <= stamp_s:
             due_s, _, event = heapq.heappop(self._events)
             self.now_s = max(self.now_s, due_s)
@@ -336,7 +336,7 @@ class Executor:
         return _Job(node=node, start_s=self.now_s, input=value)
 
     def _book(self, job: _Job) -> float:
-        """Draw the latency of an invocation and add it to the timetable."""
+        """Draw the latency of an invocation, and add the invocation to the timetable."""
         latency_s = self.draw_latency_s(job.node.name)
         job.node.busy_s += latency_s
         end_s = job.start_s + latency_s
@@ -388,7 +388,7 @@ class Executor:
     def kill(self, name: str) -> None:
         """Kill the process of a node as a signal would. Does nothing if the node is down.
 
-        Its present input is lost, as in a crash. Its successor takes the newest input.
+        Its current input is lost, as in a crash. Its successor takes the newest input.
         """
         node = self.nodes[name]
         members = (node, *node.mates)
@@ -412,7 +412,7 @@ class Executor:
         self._free_cores(len(jobs))
 
     def _take_over(self, node: AnyNode, loss: NodeLost) -> None:
-        """Let the standby of a lost process answer. It has worked on every earlier input."""
+        """Replace a lost process with its standby, which has processed every earlier input."""
         loss.node, loss.stamp_s = node.name, self.now_s
         self.losses.append(loss)
         if node.process is not None:
@@ -439,7 +439,7 @@ class Executor:
         self._free_cores(1)
 
     def _restart(self, node: AnyNode) -> None:
-        """Start a new process with fresh state, as the nodes' copies in this process never ran."""
+        """Start a new process with fresh state: the nodes' kernels in this process never ran."""
         if node.process is not None:
             node.process.close(kill=True)
         members = (node, *node.mates)

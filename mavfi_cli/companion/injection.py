@@ -49,7 +49,7 @@ class NoInjection:
         self.injector = NoInjector()
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
-        """Draw the values that depend on the way to the goal and on the detector."""
+        """Draw the values that depend on the distance to the goal and on the detector."""
 
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
@@ -110,7 +110,7 @@ class SourceInjection(NoInjection):
             protection: Protection whose detector the fault may corrupt.
 
         Raises:
-            FaultSpecError: A fault in the detector needs one.
+            FaultSpecError: The fault targets a detector, but the mission has none.
         """
         config = self._config
         common: Any = {
@@ -142,7 +142,7 @@ class SourceInjection(NoInjection):
             self._units = {state.name: state.unit for state in fault.states}
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Run a node that will be killed in its own process."""
+        """Give a node that will be killed a process of its own."""
         if self._config.killed_node is not None:
             self._executor = executor
             executor.isolate(self._config.killed_node)
@@ -158,7 +158,7 @@ class SourceInjection(NoInjection):
         return news
 
     def _on_strike(self, strike: Strike) -> None:
-        """Write the first strike to disk before its message is passed on, or kill the process."""
+        """Write the first strike to disk before it takes effect, and kill a targeted process."""
         if self._state == "planned":
             self._news.append(_strike_text(strike))
             self._state = "applied"
@@ -210,13 +210,13 @@ class SourceInjection(NoInjection):
 
 
 class StruckNode(NoInjection):
-    """The injection of a fault that has struck its node outside the flight.
+    """Injection of a fault that has already struck its node outside the flight.
 
     Attributes:
-        node, order: the node, and the number of the struck order, from 1.
+        node, order: the node, and the number of the request in which it was struck, from 1.
         effect: what the fault did to the node, in one word.
-        process: the node from this order on; None if the fault left it unchanged.
-        how: how the node ended; empty if it answers or hangs.
+        process: serves the node starting with this request; None if the fault left it unchanged.
+        how: how the node ended or hung; empty if it answers.
     """
 
     how = ""
@@ -231,7 +231,7 @@ class StruckNode(NoInjection):
             process.answered = self.note_answer
 
     def note_answer(self) -> None:
-        """Note that the flight has taken the answer to the order, or the loss of the node."""
+        """Note that the flight has received the node's answer, or has noticed its loss."""
         self._news, self._text = [self._text] if self._text else [], ""
 
     def news(self) -> list[str]:

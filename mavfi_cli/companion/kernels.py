@@ -1,6 +1,6 @@
 """The kernels of the mission's nodes with their state between invocations.
 
-If a node runs in its own process, its state is there, too.
+If a node runs in its own process, its state lives there.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ControlInput:
     """Input of the controller.
 
     Attributes:
-        goes_on: Control follows its own plan and ignores that of `inputs`.
+        goes_on: Control follows its own plan and ignores the one in `inputs`.
     """
 
     inputs: tracking.TrackingInputs
@@ -127,14 +127,14 @@ class Kernels:
         return command
 
     def restore_check(self, report: CollisionReport | None) -> None:
-        """Give a collision check that is about to restart the number of its last report."""
+        """Set the number of the last report in a collision check that is about to restart."""
         if report is not None:
             self._collision_state = collision.CollisionState(
                 future_collision_seq=report.future_collision_seq
             )
 
     def restore_planner(self, plans: Sequence[Trajectory]) -> None:
-        """Give a planner that is about to restart the number of its last plan."""
+        """Set the number of the last plan in a planner that is about to restart."""
         if plans:
             self._plans = plans[-1].trajectory_seq
 
@@ -148,5 +148,5 @@ class Kernels:
 
 
 def _next_int32(value: int) -> int:
-    """Return the next value of a 32-bit counter with wrap-around, which a fault can cause."""
+    """Increment a 32-bit counter; it wraps around, as it may after a fault."""
     return (value + 1 + 2**31) % 2**32 - 2**31

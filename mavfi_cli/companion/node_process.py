@@ -1,8 +1,8 @@
 """A process that runs the kernels of nodes, separate from the process of the mission.
 
 The process is a fork of the companion, so it has every kernel loaded and its own copy of every
-node's state. Inputs and outputs are sent as pickles over a socket pair. Numbers stay exact, so the
-process of a node does not change the record of a mission.
+node's state. Inputs and outputs are sent as pickles over a socket pair. Numbers stay exact, so
+running a node in its own process does not change the record of a mission.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Answer:
 
 
 class NodeLost(Exception):
-    """A node's process has ended or had to be killed. The executor notes node and stamp."""
+    """A node's process has ended or had to be killed. The executor sets node and stamp."""
 
     node = ""
     stamp_s = 0.0  # due time of the output, or time of the watchdog's kill
@@ -92,7 +92,7 @@ class NodeProcess:
             connection.settimeout(HANG_WALL_S)  # a corrupted node may stop in mid-message
         self._answers: dict[int, _Answer] = {}
         self._count = 0
-        self._gone = False  # True after it was reaped, as its id may then be reused
+        self._gone = False  # True once it was reaped, because its id may then be reused
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
@@ -120,16 +120,16 @@ class NodeProcess:
 
     @property
     def next_number(self) -> int:
-        """The number of the next order."""
+        """Number of the next request."""
         return self._count + 1
 
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
-        """Send an input, under the next order's number, to a fork that shares the connection."""
+        """Send an input to a fork that shares the connection, under the next request's number."""
         self.order(node, value, start_s)
         self._count -= 1
 
     def take(self, number: int) -> tuple[Any, float]:
-        """Wait for the output of an order. Return it with its host time in seconds.
+        """Wait for the output of a request. Return it with the kernel's host time in seconds.
 
         Raises:
             NodeLost: The process ended, hung and was killed, or its kernel raised an error.
@@ -195,7 +195,7 @@ class NodeProcess:
 
     @staticmethod
     def serve(connection: socket.socket, runs: Mapping[str, Run]) -> NoReturn:
-        """Process orders in the child until the parent closes the connection. Does not return."""
+        """Serve requests in the child until the parent closes the connection. Does not return."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)  # only the parent ends this process
         faulthandler.disable()
@@ -221,12 +221,12 @@ class NodeProcess:
 
 
 class StruckNodeProcess(NodeProcess):
-    """A process that was struck outside the flight, and is working on the next order already.
+    """A process that was struck outside the flight and is already working on its next request.
 
     It is the child of another process, which reaps it later.
 
     Args:
-        number: the number of the order that it is working on.
+        number: the number of the request that it is working on.
     """
 
     def __init__(self, connection: socket.socket, pid: int, *, number: int) -> None:
@@ -234,7 +234,7 @@ class StruckNodeProcess(NodeProcess):
         self._count, self._has_order = number, True
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """See `NodeProcess`. The first order is the one that the process has."""
+        """See `NodeProcess`. The first call stands for the request that the process already has."""
         if self._has_order:
             self._has_order = False
             return self._count
@@ -252,7 +252,7 @@ class StruckNodeProcess(NodeProcess):
 
 
 class LostNode(NodeProcess):
-    """A stand-in for a process that ends or hangs during the next order."""
+    """A stand-in for a process that ends or hangs during its next request."""
 
     def __init__(self, loss: NodeLost) -> None:
         self._loss = loss

@@ -80,7 +80,7 @@ class _Setpoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionParts:
-    """Stack, platform and planner of a mission, loaded by their names."""
+    """Stack, platform and planner of a mission, loaded by name."""
 
     stack: Stack
     platform: PlatformProfile
@@ -101,7 +101,7 @@ class Companion:
 
     Attributes:
         plan_failures: Number of failed plans by the planner's reason.
-        reactions: Depth frames with the first setpoint that depends on each.
+        reactions: Depth frames, each with the first setpoint that depends on it.
     """
 
     def __init__(
@@ -233,7 +233,7 @@ class Companion:
         """
         if self._takeover_s is None:
             self._takeover_s = self._now_s
-        if self._map is None:  # which planning needs
+        if self._map is None:  # planning needs a map
             return None
         self._ticks += 1
         self._state = self._recovery.state = state
@@ -260,7 +260,7 @@ class Companion:
         """Compute a command, which is due after control's latency.
 
         Args:
-            fresh: State of the controller to begin with; None for its own.
+            fresh: State from which the controller starts; None for its own.
         """
         assert self._state is not None
         followed = inputs.trajectory
@@ -307,11 +307,11 @@ class Companion:
     def _track_again(self, setpoint: _Setpoint, decision: Decision) -> None:
         """Recompute a withheld command, in this tick if the platform is fast enough.
 
-        If that did not help, or the waypoint is at fault, drop the waypoint and begin with a fresh
+        If that did not help, or the waypoint is at fault, drop the waypoint and start from a fresh
         state. After ATTEMPTS alarms the last command holds until the next tick.
         """
         if self._fresh_frame_s is None:
-            self._fresh_frame_s = setpoint.frame_s  # still without a setpoint
+            self._fresh_frame_s = setpoint.frame_s  # no setpoint has used it yet
         if decision.response is Response.HOLD or setpoint.attempt >= ATTEMPTS:
             return
         assert self._state is not None
@@ -372,7 +372,7 @@ class Companion:
         """Let a fault strike memory, then have the detector judge the active plan before its use.
 
         If control owns its queue, its copy is the active trajectory, and control passes the rest of
-        it to the other nodes. Otherwise the copy lasts for this tick, and is returned.
+        it to the other nodes. Otherwise the copy lasts only for this tick, and is returned.
         """
         active, moment, copy = self.pilot.active, self._moment(), None
         self._injector.strike(moment)
@@ -416,7 +416,7 @@ class Companion:
             self.pilot.plan_lost()
 
     def _control_is_up(self) -> None:
-        """The pilot requests a new plan if control owned its queue."""
+        """Have the pilot request a new plan if control owns its queue."""
         if self._stack.control_owns_queue and self._state is not None:
             self._queued = None
             self.pilot.control_lost(self._state)

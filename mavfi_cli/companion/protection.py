@@ -44,7 +44,7 @@ class Response(Enum):
 
     PASS = "pass"
     RECOMPUTE = "recompute"  # withheld; its stage is recomputed
-    HOLD = "hold"  # withheld; the vehicle holds and plans anew
+    HOLD = "hold"  # withheld; the vehicle holds and replans
     ACCEPT = "accept"  # accepted in spite of the alarm, because recomputation confirmed it
 
 
@@ -56,7 +56,7 @@ class _Outage:
     total_s: float = 0.0
     since_s: float | None = None
     in_a_row: int = 0
-    alarm: Alarm | None = None  # of the last message, if it raised one
+    alarm: Alarm | None = None  # alarm of the last message, if any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,18 +85,18 @@ class NoProtection:
     gate: Gate | None = None
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
-        """Judge a collision report on its arrival."""
+        """Judge a collision report when it arrives."""
         return PASSED
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
-        """Judge a plan on its arrival."""
+        """Judge a plan when it arrives."""
         return PASSED
 
     def lose_plan(self) -> None:
         """Note that the planner has answered without a usable plan."""
 
     def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
-        """Judge the active plan from the present waypoint on, or a single waypoint."""
+        """Judge the active plan from waypoint `first` to its end, or only waypoint `only`."""
         return PASSED
 
     def tick(
@@ -106,7 +106,7 @@ class NoProtection:
         return PASSED
 
     def news(self) -> list[str]:
-        """Return the lines to announce since the last call."""
+        """Return the new lines to announce since the last call."""
         return []
 
     def summary(self) -> Detection | None:
@@ -118,7 +118,7 @@ class Protection(NoProtection):
     """A gate with its counters.
 
     Args:
-        wall: Clock for the host time of all checks, under "gate".
+        wall: Accumulates the host time of all checks under "gate".
     """
 
     def __init__(self, config: DetectorConfig, stack: str, wall: WallClock) -> None:
@@ -136,12 +136,12 @@ class Protection(NoProtection):
         self._announced_s: dict[Stage, float] = {}
 
     def report(self, report: CollisionReport, stamp_s: float) -> Decision:
-        """Judge a collision report on its arrival."""
+        """Judge a collision report when it arrives."""
         alarm = self._judge("report", self.gate.judge_report, report)
         return self._decide(alarm, "report", Stage.PERCEPTION, stamp_s, self.gate.accept_report)
 
     def plan(self, plan: Trajectory, stamp_s: float) -> Decision:
-        """Judge a plan on its arrival."""
+        """Judge a plan when it arrives."""
         alarm = self._judge("plan", self.gate.judge_plan, plan)
         accept = partial(self.gate.accept_plan, plan)
         return self._decide(alarm, "plan", Stage.PLANNING, stamp_s, accept, proven=False)
@@ -151,7 +151,7 @@ class Protection(NoProtection):
         self.gate.lose_plan()
 
     def ahead(self, plan: Trajectory, first: int, only: int | None, stamp_s: float) -> Decision:
-        """Judge the active plan from the present waypoint on, or a single waypoint."""
+        """Judge the active plan from waypoint `first` to its end, or only waypoint `only`."""
         alarm = self._judge("ahead", self.gate.judge_ahead, plan, first)
         if alarm is None or only not in (None, alarm.waypoint):
             return PASSED
@@ -189,10 +189,10 @@ class Protection(NoProtection):
         """Pass a message without an alarm, or respond to its alarm.
 
         Args:
-            accept: Makes the gate accept the message in spite of its alarm.
+            accept: Makes the gate accept the message despite its alarm.
             proven: The message contained all states for which its stage raises alarms. Only such a
-                message ends the series of a holding vehicle, because the steps within a plan and
-                the commands of a hover always pass.
+                message ends the series of alarms of a holding vehicle, because the steps within a
+                plan and the commands of a hover always pass.
         """
         if alarm is not None:
             decision = self._respond(alarm, message, stage, stamp_s)
@@ -255,7 +255,7 @@ class Protection(NoProtection):
             outage.since_s = None
 
     def news(self) -> list[str]:
-        """Return the lines to announce since the last call."""
+        """Return the new lines to announce since the last call."""
         news, self._news = self._news, []
         return news
 
@@ -283,7 +283,7 @@ class Protection(NoProtection):
 
     @staticmethod
     def warm_up(config: DetectorConfig, stack: str) -> None:
-        """Load and compile everything that a gate runs. Raises as `DetectorConfig.build`."""
+        """Load and compile all that a gate runs. Raises what `DetectorConfig.build` raises."""
         gate = Gate(config.build(stack))
         report = CollisionReport(
             stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
@@ -325,7 +325,7 @@ class Recovery:
         self.state: VehicleState | None = None
 
     def recover(self, withheld: Message, decision: Decision) -> None:
-        """Request what a withheld message needs; a command is recomputed by its sender."""
+        """Start the recovery from a withheld message; a command is recomputed by its sender."""
         self._follower.withheld(withheld)
         if isinstance(withheld, Trajectory):
             self._pilot.reject_plan()
@@ -377,7 +377,7 @@ class Recovery:
             return
 
     def drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """Drop a waypoint from a plan, even the active one. Return the new plan."""
+        """Return a plan without a waypoint, and replace the active plan if it is `flown`."""
         bridged = without_waypoint(flown, waypoint)
         self._replace(flown, bridged)
         return bridged

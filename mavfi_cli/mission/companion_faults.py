@@ -26,7 +26,7 @@ from mavfi_cli.spec.fault import PROCESS, FaultConfig
 
 _SIDES = {None: None, "output": Side.COMPANION, "input": Side.AUTOPILOT}
 _RECEIVERS = {Side.COMPANION: "autopilot", Side.AUTOPILOT: "companion"}
-_PERIOD_S = 0.02  # of a slowed program
+_PERIOD_S = 0.02  # cycle of running and stopping a slowed program
 
 
 class LinkInjector(Injector):
@@ -34,10 +34,10 @@ class LinkInjector(Injector):
 
     Args:
         shortest_flight_s, listener: As for `Injector`.
-        signing: Key with which a struck frame is signed again.
+        signing: Key for signing a struck frame again.
 
     Attributes:
-        units: Unit of each struck field by its name; of a whole message, its name with no unit.
+        units: Unit of each struck field by name; for a whole message, its name with no unit.
         side: Sender of the struck messages; None before the first strike.
     """
 
@@ -119,16 +119,16 @@ class LinkInjector(Injector):
         return struck
 
     def deliver(self, message: Message, side: Side, stamp_s: float) -> None:
-        """Record that a message has reached its receiver, which reads all but ignored fields."""
+        """Record a message's arrival. The receiver reads every field except those it ignores."""
         read = {state.name for state in self._states if not is_ignored(message, state)}
         self.follower.read(message, _RECEIVERS[side], stamp_s, read)
 
 
 class Throttle(threading.Thread):
-    """Lets a program run for a share of the time, and stops it for the rest of every 20 ms.
+    """Lets a program run for a share of every 20 ms, and stops it for the rest.
 
-    The signals reach the process group of the program. With a share of 0 the program is stopped
-    until `end`.
+    The signals go to the program's process group. With a share of 0 the program is stopped until
+    `end`.
     """
 
     def __init__(self, program: RunningProgram, share: float) -> None:
@@ -152,18 +152,18 @@ class Throttle(threading.Thread):
                 os.killpg(pid, number)
 
     def end(self) -> None:
-        """Let the program run from now on."""
+        """Stop throttling, so that the program runs freely."""
         self._over.set()
         self.join()
 
 
 class CompanionFault(NoInjection):
-    """A fault in a user's companion; by itself none.
+    """A fault in a user's companion. The base class injects none.
 
     Attributes:
         running: The started programs by name.
         link: Strikes messages; None for a fault in a process.
-        ends: The death of a struck process, by the name of its program.
+        ends: How a struck process died, by the name of its program.
     """
 
     running: Mapping[str, RunningProgram] = MappingProxyType({})
@@ -171,10 +171,10 @@ class CompanionFault(NoInjection):
     ends: Mapping[str, NodeEnds] = MappingProxyType({})
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """Draw the fault over the shortest time of flight, s."""
+        """Draw the fault, with a random trigger within the shortest flight time, s."""
 
     def tick(self, moment: Moment) -> None:
-        """Strike a process if it is due, and end what has a duration."""
+        """Strike a process when the fault is due, and end the effect after its duration."""
 
 
 class CompanionInjection(CompanionFault, SourceInjection):
@@ -227,7 +227,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
             self._throttle.end()
 
     def _on_strike(self, strike: Strike) -> None:
-        """Record the first strike before it takes effect, and strike a process."""
+        """Record the first strike before it takes effect, then strike a targeted process."""
         first = self._state == "planned"
         super()._on_strike(strike)
         if first and not strike.changes:
@@ -248,7 +248,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
 
 
 def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> None:
-    """Refuse a fault that a user's companion cannot have. Raises as `CompanionInjection`."""
+    """Reject a fault unfit for a user's companion. Raises what `CompanionInjection` raises."""
     if config.wire_target is not None:
         config.draw_wire()
     elif config.killed_node is not None:

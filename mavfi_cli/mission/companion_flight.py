@@ -1,11 +1,13 @@
 """One flight of a user's own companion, which mavfi starts, connects and judges.
 
-The vehicle's clock is simulated time. Programs run by the wall clock, so a flight does not repeat.
+The vehicle's clock is simulated time. Programs run on the wall clock, so a flight is not
+repeatable.
 
-A flight in lockstep repeats if its companion does. The vehicle sends all messages of a tick,
-LOCAL_POSITION_NED last, and waits. The companion sends its own, SET_POSITION_TARGET_LOCAL_NED with
-the same time_boot_ms last, and the next tick begins. Programs, fault and outcome are looked at only
-at a tick or while the companion is gone, so the wall clock decides only when to give up.
+A flight in lockstep is repeatable if its companion is. The vehicle sends all messages of a tick,
+ending with LOCAL_POSITION_NED, and waits. The companion sends its messages, ending with a
+SET_POSITION_TARGET_LOCAL_NED of the same time_boot_ms, and the next tick begins. Programs, fault
+and outcome are checked only at a tick or while the companion is gone, so the wall clock only
+determines when to give up.
 """
 
 from __future__ import annotations
@@ -45,10 +47,10 @@ from mavfi_cli.spec.companion import CompanionConfig, SuccessConfig
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 
 _TURN_S = 0.02
-_SERVE_S = 0.02  # longest service of the links in a turn
-_BOOT_S = 60.0  # simulated time after which programs start although the vehicle cannot arm yet
+_SERVE_S = 0.02  # longest time to serve the links in a turn
+_BOOT_S = 60.0  # simulated time after which programs start even if the vehicle cannot arm yet
 _SILENCE_S = 60.0  # wall-clock time without a message after which the vehicle counts as lost
-_REST_MPS, _REST_S = 0.5, 1.0  # largest speed of a vehicle at rest, and how long it lasts
+_REST_MPS, _REST_S = 0.5, 1.0  # largest speed at rest, and how long it must last
 _MOST_EVENTS = 1000
 _NO_SYSTEM = 255  # target of a setpoint that ends a tick and commands nothing
 _NO_TARGET = (0x0FFF, *[0.0] * 11)  # type mask that ignores all fields, and the fields
@@ -60,8 +62,8 @@ class CompanionFlight:
     """One flight, from the start of the first program to its outcome.
 
     Args:
-        link: Open link to the vehicle. Its opener closes it.
-        interrupts: Signals that request the end.
+        link: Open link to the vehicle, which the caller closes.
+        interrupts: Received signals that request the end.
 
     Attributes:
         programs: At the end, how often each program has started and how its processes ended.
@@ -86,7 +88,7 @@ class CompanionFlight:
         self._router = Router(link, self._open_companion(companion.url), passes=self._pass)
         self.stamp_s = self.begun_s = self.end_s = 0.0
         self._begun = False
-        self.takeover_s = math.inf  # of the first arming
+        self.takeover_s = math.inf  # stamp of the first arming
         self.outcome: Outcome | None = None
         self.reason = ""
         self.programs: dict[str, ProgramEnds] = {}
@@ -159,7 +161,7 @@ class CompanionFlight:
             self.programs = self._crew.summary()  # before they are ended
 
     def _turn(self) -> None:
-        """Pass frames on for a moment, then look after programs, fault and outcome."""
+        """Forward frames for a moment, then check programs, fault and outcome."""
         self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
         if self.telemetry.ready or self.stamp_s > _BOOT_S:
             self._crew.manage(self.stamp_s, self.telemetry.state)
@@ -172,7 +174,7 @@ class CompanionFlight:
             self.reason = f"{self.reason}: {why}"
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return the time over which a random fault is drawn, s."""
+        """Return the length of the interval from which a random fault time is drawn, s."""
         way_m = norm(briefing.goal_enu_m - briefing.start_enu_m)
         return self._companion.flight_s or way_m / self._config.v_max_mps
 
@@ -209,7 +211,7 @@ class CompanionFlight:
         return [frame for own in passed for frame in self._deliver(own, side)]
 
     def _gated(self, message: Message, side: Side) -> Iterable[Message]:
-        """Return what the gate passes on."""
+        """Return the messages that the gate passes on."""
         if self._gate is None:
             return (message,)
         passed = self._gate.pass_between(message, side, self.stamp_s)
@@ -239,7 +241,7 @@ class CompanionFlight:
         return Moment(stamp_s=self.stamp_s, flight_s=flight_s, tick=self._ticks, phase=self._mode)
 
     def _strike(self) -> None:
-        """Strike a process if it is due, pass late messages on, and log the fault."""
+        """Strike a process if the fault is due, pass late messages on, and log the fault."""
         self.injection.tick(self._moment)
         if self.injection.link is not None:
             for message, side in self.injection.link.release(self.stamp_s):
@@ -249,7 +251,7 @@ class CompanionFlight:
             self.logger.note(self.stamp_s, "fault", text, self.telemetry.state)
 
     def _hear(self, message: Message) -> None:
-        """Handle a message of the vehicle's side."""
+        """Handle a message from the vehicle's side."""
         self._heard_s = time.monotonic()
         telemetry = self.telemetry
         if not isinstance(message, dialect.MAVLink_unknown):
@@ -297,7 +299,7 @@ class CompanionFlight:
         )  # fmt: skip
 
     def _watch(self, message: Message) -> None:
-        """Handle a message of the companion's side."""
+        """Handle a message from the companion's side."""
         if isinstance(message, dialect.MAVLink_heartbeat_message):
             self._crew.heartbeat = True
         if message.get_msgId() != _SETPOINT:
@@ -358,7 +360,7 @@ class CompanionFlight:
 
 
 def _free_port() -> int:
-    """Return a TCP port of this machine that is free now."""
+    """Return a TCP port that is currently free on this machine."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -373,7 +375,7 @@ class LockstepFlight(CompanionFlight):
 
     _end_of_link: Transport
     _tick_ms = 0  # stamp of the vehicle's newest tick
-    _awaited_ms: int | None = None  # stamp that the companion has to answer; None: none
+    _awaited_ms: int | None = None  # stamp of the tick that the companion must answer, if any
     _since_s = 0.0  # when the present wait began
 
     def _open_companion(self, url: str) -> Transport:
@@ -404,7 +406,7 @@ class LockstepFlight(CompanionFlight):
         self._judge()
 
     def _look_after(self) -> None:
-        """Give up a wait that is too long, and let the vehicle go on without an ended companion."""
+        """Give up too long a wait, and let the vehicle continue once the companion has ended."""
         waited_s, limit_s = time.monotonic() - self._since_s, self._companion.answer_limit_s
         if self.outcome is not None:
             pass
@@ -462,7 +464,7 @@ class LockstepFlight(CompanionFlight):
             self._link.send(self._release())
 
     def _release(self) -> bytes:
-        """Return a setpoint that ends the tick, and that the autopilot ignores."""
+        """Return a setpoint that ends the tick and that the autopilot otherwise ignores."""
         return Codec(_NO_SYSTEM, 0).encode(
             dialect.MAVLink_set_position_target_local_ned_message(
                 self._tick_ms, _NO_SYSTEM, 0, dialect.MAV_FRAME_LOCAL_NED, *_NO_TARGET
@@ -470,11 +472,11 @@ class LockstepFlight(CompanionFlight):
         )
 
     def _hear(self, message: Message) -> None:
-        """Handle a message of the vehicle. With the last of a tick, strike and judge."""
+        """Handle a message from the vehicle. After the last one of a tick, strike and judge."""
         super()._hear(message)
         if self._is_tick(message):
             self._strike()
-            self._awaited_ms = None  # late messages are no ticks
+            self._awaited_ms = None  # a late message does not start a tick
             self._judge()
 
     def _deliver(self, message: Message, side: Side) -> Iterable[bytes]:
@@ -493,7 +495,7 @@ class _Verdict:
 
     Raises:
         RecordError: The golden flight of the corridor cannot be read.
-        ConfigError: It has no trace.
+        ConfigError: It has no path.
     """
 
     def __init__(self, success: SuccessConfig, crew: Crew) -> None:
@@ -541,7 +543,7 @@ class _Verdict:
         return corridor_m is not None and self.deviation_m > corridor_m
 
     def is_over(self) -> bool:
-        """Return True if all given conditions but that of the corridor hold."""
+        """Return True if all given conditions except that of the corridor hold."""
         success = self._success
         ends = (
             *([self._rests] if success.goal_m is not None else ()),
@@ -569,7 +571,7 @@ def path_of(folder: Path) -> FloatArray:
 
 
 def distance_from(place: FloatArray, path: FloatArray) -> float:
-    """Return the distance of a place (3,) from a polyline (n, 3), m."""
+    """Return the distance from a point (3,) to a polyline (n, 3), m."""
     begin, along = path[:-1], np.diff(path, axis=0)
     lengths = np.maximum((along**2).sum(axis=1), 1e-12)
     shares = np.clip(((place - begin) * along).sum(axis=1) / lengths, 0.0, 1.0)

@@ -30,8 +30,8 @@ class Crew:
         begun_s: Stamp of the start of the first program; infinite before.
         running: Started programs by name.
         heartbeat: A MAVLink heartbeat has arrived from the companion.
-        connected: The program in lockstep has connected; always true by the wall clock.
-        unready: Why the companion never became ready; empty while it may.
+        connected: The program in lockstep has connected; always true without lockstep.
+        unready: Why the companion did not become ready; empty while it still may.
     """
 
     def __init__(self, companion: CompanionConfig, note: Note) -> None:
@@ -41,8 +41,8 @@ class Crew:
         self.running: dict[str, RunningProgram] = {}
         self.heartbeat, self.connected = False, not companion.in_lockstep
         self.unready = ""
-        self._started_s = self._looked_s = 0.0  # of the newest program; wall clock
-        self._known: dict[str, tuple[int, int]] = {}  # starts and ends that the log has
+        self._started_s = self._looked_s = 0.0  # newest start, newest look at a port; wall clock
+        self._known: dict[str, tuple[int, int]] = {}  # number of logged starts and ends
         self._throttles: list[Throttle] = []
 
     def prepare(self, programs: Programs, values: dict[str, str]) -> None:
@@ -127,7 +127,7 @@ class Crew:
 
     @property
     def over(self) -> bool:
-        """True once every program has ended for good."""
+        """True once every program has ended and none will restart."""
         return self.ready and all(map(self._is_over, self.running))
 
     def _is_over(self, name: str) -> bool:
@@ -137,21 +137,21 @@ class Crew:
         return rule == "never" or (rule == "on-failure" and program.codes[-1] == 0)
 
     def failure(self) -> str:
-        """Return how a program failed for good; empty if none has."""
+        """Describe the failure of a program that will not restart; empty if there is none."""
         for name, program in self.running.items():
             if program.codes and program.codes[-1] and self._is_over(name):
                 return f"{name} {_how(program.codes[-1])}"
         return ""
 
     def ended(self) -> str:
-        """Return which program has ended, or does not run at present; empty if all run."""
+        """Return which program has ended, even if it will restart; empty if all are running."""
         for name, program in self.running.items():
             if program.codes and program.pid is None:
                 return f"the program {name} is gone"
         return ""
 
     def succeeded(self, name: str) -> bool:
-        """Return True if a program has ended for good with code 0."""
+        """Return True if a program has ended with code 0 and will not restart."""
         return name in self.running and self._is_over(name) and self.running[name].codes[-1] == 0
 
 

@@ -1,8 +1,8 @@
 """The loop of one mission: receives messages, runs a control tick per state, sends setpoints.
 
 The vehicle provides the clock: every LOCAL_POSITION_NED starts the control tick of its stamp. In
-lockstep the vehicle waits for the setpoint of that stamp. The setpoint is sent first, so that a
-vehicle in its own process simulates the next tick while the heavy kernels run.
+lockstep the vehicle waits for the setpoint of that stamp. The setpoint is sent before the heavy
+kernels run, so that a vehicle in its own process can simulate the next tick meanwhile.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from mavfi_cli.mission.run_folder import Trace
 from mavfi_cli.spec.mission import OWN_AUTOPILOT, MissionConfig
 
 SILENCE_S = 60.0  # time without a message after which a lockstep vehicle counts as lost
-BOOT_S = 300.0  # the same for real firmware, which may boot by the wall clock
+BOOT_S = 300.0  # the same for real firmware, which may boot in wall-clock time
 IDLE_S = 0.1  # period of messages to a silent foreign autopilot
 CAMERA_BELOW_M = 1.0  # the camera starts this far below the take-off height
-_WAITING_FRAMES = 16  # of a camera that sends before the companion flies
+_WAITING_FRAMES = 16  # newest frames kept until the companion flies
 _POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 SYSTEM_ID, COMPONENT_ID = 1, dialect.MAV_COMP_ID_ONBOARD_COMPUTER
-_PACE_AFTER_S = 1.0  # wall time after which the pace of a foreign vehicle is known
+_PACE_AFTER_S = 1.0  # wall time after which a foreign vehicle's pace is estimated
 _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERRUPTED)
 
 
@@ -96,12 +96,12 @@ class ForeignClock:
             self._pace = min(1.0, flown_s / passed_s)
 
     def wait(self, waited_s: float) -> None:
-        """Note the wall-clock time without a new state."""
+        """Add wall-clock time that passed without a new state."""
         self._waited_s += waited_s
 
     @property
     def silence_s(self) -> float:
-        """Time since the newest state, on both the vehicle's and the wall clock, s."""
+        """Estimated vehicle time since the newest state, at most the wall-clock time, s."""
         return self._waited_s * self._pace
 
     @property
@@ -136,7 +136,7 @@ class Flight:
         self.images = ImageReceiver()
         self._frames: deque[ImageFrame] = deque(maxlen=_WAITING_FRAMES)
         self._camera_called = False
-        self._seen_s = 0.0  # when the newest frame arrived, or frames were asked for
+        self._seen_s = 0.0  # when the newest frame arrived, or frames were requested
         self._clock = None if config.link is None else ForeignClock()
         self._unspoken_s = 0.0
         self._patience_s = SILENCE_S if config.autopilot == OWN_AUTOPILOT else BOOT_S
@@ -146,7 +146,7 @@ class Flight:
         self.logger = FlightLogger(watcher)
         self.trace = Trace()
         self.wall = WallClock()
-        self.stamp_s = self.begun_s = 0.0  # of now, and of the first state
+        self.stamp_s = self.begun_s = 0.0  # current stamp, and that of the first state
         self.takeover_s = float("inf")
         self.end_s = 0.0
         self.outcome: Outcome | None = None
@@ -189,7 +189,7 @@ class Flight:
         """Set goal and camera mounting, and create the companion.
 
         Args:
-            recorder: Keeps the briefing and the inputs of the nodes.
+            recorder: Records the briefing and the inputs of the nodes.
         """
         config, protection = self._config, NoProtection()
         config.require_flyable(briefing, self.stack.goal_tolerance_m)
@@ -212,14 +212,14 @@ class Flight:
         self.lose_nodes_as(config)
 
     def lose_nodes_as(self, config: MissionConfig) -> None:
-        """Restart lost nodes from now on as another mission does."""
+        """Adopt the restart and watchdog times of another mission."""
         if self.companion is not None:
             executor = self.companion.executor
             executor.restart_s = config.node_restart_s
             executor.watchdog_s = config.node_watchdog_s
 
     def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor:
-        """Move a node that has already worked to its own process; it restarts with fresh state.
+        """Move a node that has already run to its own process; it restarts with fresh state.
 
         Args:
             process: As for `Executor.isolate`.
@@ -234,7 +234,7 @@ class Flight:
         return executor
 
     def _shortest_flight_s(self, briefing: Briefing) -> float:
-        """Return a lower bound of the flight time from the take-over to the goal, s."""
+        """Return a lower bound on the flight time from the take-over to the goal, s."""
         takeoff = np.add(briefing.start_enu_m, (0.0, 0.0, self._config.takeoff_height_m))
         way_m = norm(briefing.goal_enu_m - takeoff) - self.stack.goal_tolerance_m
         turn_s = TURN_S if self.stack.turns_before_departure else 0.0
@@ -300,7 +300,7 @@ class Flight:
         """Set the outcome of the mission. Later calls have no effect.
 
         Args:
-            lands: Land although the outcome does not require it; the vehicle still responds.
+            lands: Land even if the outcome does not require it, as the vehicle still responds.
         """
         if self.outcome is not None:
             return
@@ -334,7 +334,7 @@ class Flight:
         stamp_s = self._take(data) if data else None
         if self._session.telemetry.heard and self.link.rivals:
             self._session.telemetry.unfit = self.link.rivals
-        if stamp_s is not None and not clock.heard:  # adopt its clock, and begin the session anew
+        if stamp_s is not None and not clock.heard:  # adopt its clock, and restart the session
             self.begun_s = self._session.telemetry.now_s = stamp_s
             self._session = self._new_session(self._session.telemetry)
         if self._tick(stamp_s):
@@ -353,7 +353,7 @@ class Flight:
         with self.wall.sample("link"):
             for message in self.link.messages(data, self.stamp_s):
                 number = type(message).id
-                if number in IMAGE_MESSAGES:  # most of all
+                if number in IMAGE_MESSAGES:  # the most frequent ones
                     if telemetry.is_from(message, CAMERA) and (frames := self.images.feed(message)):
                         self._frames += frames
                         self._seen_s = self.stamp_s

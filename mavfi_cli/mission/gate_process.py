@@ -31,7 +31,7 @@ from mavfi_cli.spec.detector import DetectorConfig
 
 _TURN_S = 0.1
 _HANG_S = 1.0  # silence of the worker after which it is killed
-_LOOK_S = 0.5  # between two looks at the companion's process
+_LOOK_S = 0.5  # interval between checks of the companion's process
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ class GateProcess:
 
 
 class _Passing:
-    """The rule by which the router passes frames on. It may be replaced while the router runs."""
+    """The router's rule for passing frames on, which may be replaced while the router runs."""
 
     def __init__(self) -> None:
         self.rule: Callable[[Message, Side], Iterable[Message]] = lambda message, _: (message,)
@@ -171,7 +171,7 @@ def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> i
 
 
 class _Watch:
-    """Looks for the companion's process."""
+    """Checks whether the companion's process is gone."""
 
     def __init__(self, process: str | None) -> None:
         self._process = process
@@ -194,6 +194,6 @@ class _Watch:
 
 
 def require_process(process: str | None) -> None:
-    """Refuse a process that cannot be watched. Raises MavfiError."""
+    """Raise MavfiError if a process cannot be watched."""
     if why := _Watch(process).gone():
         raise MavfiError(why)

@@ -28,10 +28,8 @@ from mavfi_cli.spec.mission import MissionConfig
 
 _Any = TypeVar("_Any")
 INPUTS_A_KERNEL = 5
-_FORESEEN = (
-    2  # least number of the five checked trajectories with a collision, if the flight has as many
-)
-_FLIGHTS = 20  # largest number of flights to search for planning problems
+_FORESEEN = 2  # colliding trajectories among the five checked, if the flight has that many
+_FLIGHTS = 20  # maximum number of flights to search for planning problems
 
 
 def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
@@ -190,7 +188,7 @@ def kernel_targets(
 
 
 def kernel_flight(world: str = "dense", seed: int = 3) -> MissionConfig:
-    """The golden flight whose inputs `mavfi kernels` attacks.
+    """Return the golden flight that provides the inputs of `mavfi kernels`.
 
     Collision check, planner and control use the parameters of `hardened`.
     """

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from mavfi_cli.fi.tracer.tracee import Mechanism
 
 OK = "ok"
-LIMITED = "limited"  # missions fly, but another feature does not work
-FAILED = "failed"  # missions do not fly
+LIMITED = "limited"  # missions work, but another feature does not
+FAILED = "failed"  # missions do not work
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +190,7 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
 
 
 def _counting() -> Check:
-    """Report the mechanism that counts executions; try out the fallback if it is needed."""
+    """Report the mechanism that counts executions; try the fallback if it is needed."""
     from mavfi_cli.fi.tracer.tracee import Mechanism, perf_allowed
 
     refused = perf_allowed()

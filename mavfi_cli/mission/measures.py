@@ -76,7 +76,7 @@ def quality_of(
         for kind in ("regression", "propeller"):
             energy_j = np.trapezoid(flown[f"power_{kind}_w"], stamps)
             quality[f"energy_{kind}_j"] = float(energy_j)
-    # Without obstacles the clearance is infinite; what the referee could not measure is NaN.
+    # Without obstacles the clearance is infinite; values that the referee cannot measure are NaN.
     return QualityOfFlight(**{name: value for name, value in quality.items() if isfinite(value)})
 
 
@@ -94,8 +94,8 @@ class FlightRecord:
         plan_failures: Number of failed plans by reason.
         state_fault, instruction_fault: The section `fault`, by its level.
         recorded_fault: The whole section as plain values.
-        in_lockstep: The flight was one of a user's companion in lockstep.
-        referee: None if the vehicle left no truth.
+        in_lockstep: True for a flight of a user's companion in lockstep.
+        referee: None if the vehicle provided no truth.
         seeds: Seeds of the mission (`root`) and of its fault.
         files: SHA-256 of the user's files.
     """
@@ -232,7 +232,7 @@ STRUCK = (
     "struck_node", "struck_kernel", "struck_function", "struck_address", "struck_instruction",
     "struck_execution", "struck_role", "struck_register", "reading_instruction", "node_ended",
 )  # fmt: skip
-_FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by the digits of their bits
+_FLOATS = {len("0x") + 16: "float64", len("0x") + 8: "float32"}  # by length of the hex pattern
 
 
 def _of_state(flight: FlightRecord) -> dict[str, object]:
@@ -306,7 +306,7 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def _value(value: float | int | bool | None, pattern: str) -> object:
-    """Return a value, with infinities and NaN, which JSON lacks, restored from bits."""
+    """Return a value. Restore infinities and NaN, which JSON lacks, from their bits."""
     if value is not None:
         return value
     return bits.NUMPY_TYPES[_FLOATS[len(pattern)]].value(int(pattern, 16))

@@ -1,9 +1,9 @@
 """Starts the programs of a user's companion, and always ends them.
 
 A worker of the fork server runs one program: it starts the program, stores its output, restarts it
-by its rule, and then keeps running, because the program's children may outlive it. Its guard kills
-the worker and all descendants of the program when the mission ends, is killed, or closes the
-program.
+according to its rule, and then keeps running, because the program's children may outlive it. Its
+guard kills the worker and all descendants of the program when the mission ends, is killed, or
+closes the program.
 
 The worker reports by appending lines of JSON to a file: {"started": PID}, {"ended": CODE}, where a
 negative code is a signal, and {"ready": true}. The mission reads them.
@@ -30,9 +30,9 @@ from mavfi_cli.core.fork_server import PACKET, ForkServer
 
 _EVENTS = "events.jsonl"
 _STREAMS = ("stdout", "stderr")
-_MOST_BYTES = 16 << 20  # of a stream that is kept; the rest is read and dropped
+_MOST_BYTES = 16 << 20  # kept per stream; the rest is read and dropped
 _CHUNK, _LOOK_S = 1 << 16, 0.05
-_MOST_LINE = 4096  # bytes of a line that is searched for readiness
+_MOST_LINE = 4096  # bytes of a line that are searched for readiness
 _LONGEST_S = 1e6
 _GRACE_S = 2.0  # time to end after SIGTERM
 
@@ -85,7 +85,7 @@ class RunningProgram:
     Attributes:
         pid: Its process, which leads a process group; None while it does not run.
         codes: Exit codes of its processes so far; a negative one is a signal.
-        ready: The line of its readiness has appeared.
+        ready: True once its ready line has appeared.
     """
 
     def __init__(self, name: str, folder: Path, channel: socket.socket) -> None:
@@ -238,7 +238,7 @@ def _pump(
     until_s: float,
     process: subprocess.Popen[bytes] | None = None,
 ) -> None:
-    """Keep the outputs until a process has ended, or until a time."""
+    """Store the outputs until a process has ended, or until a given time."""
     ended = None if process is None else os.pidfd_open(process.pid)
     try:
         while (left_s := until_s - time.monotonic()) > 0.0:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from mavfi_cli.companion.pipeline import Companion
 
 _PROGRESS_EVERY_S = 1.0
-_MOST_TEXTS = 1000  # of the autopilot in a record
-_MODES = {  # kind and text of the event with which a mode of the pilot begins
+_MOST_TEXTS = 1000  # maximum autopilot texts in a record
+_MODES = {  # kind and text of the event that marks the start of a pilot mode
     PilotMode.SLOWING: ("slow", "slows down before an obstacle"),
     PilotMode.STOPPING: ("stop", "stops before an obstacle"),
 }
@@ -52,7 +52,7 @@ class Recorder:
     """Records the briefing, and the input and start stamp of every invocation, by node.
 
     Attributes:
-        sequence: Node of every invocation, in the order of their starts.
+        sequence: Node of every invocation, in order of start.
     """
 
     def __init__(self) -> None:
@@ -87,7 +87,7 @@ class FlightLogger:
 
     @staticmethod
     def event(stamp_s: float, kind: str, text: str, place_enu_m: FloatArray | None) -> Event:
-        """Return an event at a position (3,), both rounded as in a record."""
+        """Return an event with stamp and position (3,) rounded as in a record."""
         place = None
         if place_enu_m is not None:
             x, y, z = (round(float(c), 3) for c in place_enu_m)

@@ -52,7 +52,7 @@ from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-_ALLOCATIONS = 100_000  # live objects more than at the last collection of cycles
+_ALLOCATIONS = 100_000  # growth in live objects after which cycles are collected
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
 
 
@@ -84,16 +84,16 @@ def fly_mission(
         host: further entries of the record's host section.
 
     Raises:
-        SystemExit: this process has flown the shared flight.
+        SystemExit: this process has completed the shared flight.
         MavfiError: the mission could not begin (unknown name, blocked start, no autopilot, ...), or
             its record could not be written.
     """
     config = config.with_firmware()
     if config.companion is not None:
         return _fly_companion(config, out, watcher, repeat)
-    parts = CompanionParts.of(config)  # unknown names end here
+    parts = CompanionParts.of(config)  # raises for unknown names
     started, begun_s = datetime.datetime.now(datetime.UTC), time.perf_counter()
-    _warm_up(config, watcher)  # first: else a link is full of stale messages by then
+    _warm_up(config, watcher)  # before connecting, or the link fills with stale messages
     if shared is not None:
         recorder = shared.recorder
     injection = shared or _plan_injection(config, profiles or out / CACHE, repeat, for_debugger)
@@ -135,7 +135,7 @@ def fly_mission(
 def _fly_companion(
     config: MissionConfig, out: Path, watcher: Watcher, repeat: FaultRecord | None
 ) -> RunFolder:
-    """Fly a user's companion. Raises as `fly_mission`."""
+    """Fly a mission of a user's companion. Raises what `fly_mission` raises."""
     assert config.companion is not None
     programs = CompanionConfig.load(config.companion)
     if config.detector is not None:
@@ -187,10 +187,10 @@ def _fly_companion(
 
 @contextlib.contextmanager
 def _rare_collections() -> Iterator[None]:
-    """Let Python's collector of cycles run rarely during a flight.
+    """Make Python's collector of cycles run rarely during a flight.
 
-    The collector visits the growing traces again and again, a tenth of a flight's CPU time, but a
-    flight leaves only a few thousand objects in cycles.
+    The collector traverses the growing traces repeatedly, which takes a tenth of a flight's CPU
+    time, but a flight leaves only a few thousand objects in cycles.
     """
     usual = gc.get_threshold()
     gc.set_threshold(_ALLOCATIONS, *usual[1:])
@@ -402,14 +402,14 @@ def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
     )
 
 
-# Again --------------------------------------------------------------------------------------------
+# Repetition ---------------------------------------------------------------------------------------
 
 
 def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
     """Fly a mission that must not be interrupted. The options are those of `fly_mission`.
 
     Raises:
-        Interrupted: The user ended it. Nothing of it is kept.
+        Interrupted: The user interrupted it. Nothing of it is kept.
         MavfiError: As for `fly_mission`.
     """
     flown = load_run(fly_mission(config, out, Watcher(), **options).path)
@@ -420,7 +420,7 @@ def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
 
 
 def fly_golden(config: MissionConfig, out: Path, recorder: Recorder) -> Run:
-    """Fly a golden run for drawing faults or inputs. Raises as `fly_to_end`.
+    """Fly a golden run from which faults or inputs are drawn. Raises what `fly_to_end` raises.
 
     Raises:
         VehicleProcessError: The vehicle died.
@@ -439,10 +439,11 @@ def fly_again(
     firmware: str | None = None,
     **options: Any,
 ) -> Run:
-    """Repeat a run or fly its golden run. Arguments as in `fly_mission`; raises as `fly_to_end`.
+    """Repeat a run or fly its golden run. Raises what `fly_to_end` raises.
 
     Args:
         firmware: as for `Run.mission`.
+        out, options: as for `fly_mission`.
 
     Raises:
         RecordError: The run is not repeatable.
@@ -455,7 +456,7 @@ def fly_again(
 
 
 def watch_again(run: Run) -> tuple[Recorder, bool]:
-    """Repeat a run to capture the inputs of its nodes. Raises as `fly_again`.
+    """Repeat a run to capture the inputs of its nodes. Raises what `fly_again` raises.
 
     Returns:
         Inputs of all nodes, and whether the repetition has the same trace. It differs only if the
@@ -477,7 +478,7 @@ def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run
 
     Raises:
         RecordError: The run is not repeatable, or its folder cannot be written.
-        Interrupted: The user ended the golden run. Nothing of it is kept.
+        Interrupted: The user interrupted the golden run. Nothing of it is kept.
     """
     config = run.mission(with_fault=False)
     if (golden := run.golden) is not None:

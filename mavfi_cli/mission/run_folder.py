@@ -68,7 +68,7 @@ class RunFolder:
         self.plans = path / "plans.parquet"  # every waypoint of every plan
         self.kernels = path / "kernels.parquet"  # start and end of every invocation
         self.tlog = path / "flight.tlog"  # every MAVLink frame of both directions
-        self.picture = path / "flight.svg"  # the flight from above, and its height
+        self.picture = path / "flight.svg"  # top view and height of the flight
         self.fault = path / FAULT  # fault record, on disk before the fault strikes
         self.crash = path / "crash.txt"  # tracebacks of the companion and of nodes
         self.programs = path / "programs"  # outputs of a user's companion, by program
@@ -191,7 +191,7 @@ _TRUTH_COLUMNS = {
     "power_regression_w": ("power_regression_w",),
     "power_propeller_w": ("power_propeller_w",),
 }
-_GAP_MS = 100.0  # longest interpolated interval of rows; its error is 6 mm at 5 m/s^2
+_GAP_MS = 100.0  # longest gap between rows to interpolate; the error is 6 mm at 5 m/s^2
 _KINDS: tuple[type[Message], ...] = (CollisionReport, Trajectory, Command)
 
 
@@ -238,9 +238,9 @@ class Trace:
     def table(self, truth: Mapping[str, FloatArray] | None) -> pa.Table:
         """Return a table of stamp, phase, vehicle, monitored states and the referee's truth.
 
-        The stamps of report and trajectory and the index of the waypoint identify the messages of
-        the states. A state is null before its first message. Truth is joined by stamp. Foreign
-        autopilots also have stamps between the referee's rows, where truth is interpolated.
+        The stamps of report and trajectory and the index of the waypoint identify the messages that
+        contain the states. A state is null before its first message. Truth is joined by stamp.
+        Foreign autopilots also have stamps between the referee's rows, where truth is interpolated.
         """
         import pyarrow as pa
 
@@ -291,7 +291,7 @@ _Entry = tuple[Message, int] | None  # a message and the index of its waypoint
 
 
 def _distinct(entries: Sequence[_Entry]) -> tuple[list[_Entry], list[int]]:
-    """Return the entries without repetitions of the one before, and a row's place in them."""
+    """Return the entries without consecutive repetitions, and each row's index in them."""
     kept: list[_Entry] = []
     rows, last = [], (0, 0)
     for entry in entries:
@@ -310,7 +310,7 @@ def _between(before: FloatArray, after: FloatArray, shares: FloatArray) -> Float
     return mixed
 
 
-# A run that is read -------------------------------------------------------------------------------
+# Reading and comparing runs -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -366,7 +366,7 @@ class Run:
 
         Raises:
             ConfigError: The run names another program.
-            RecordError: The run is not repeatable: it flew a foreign autopilot, used measured
+            RecordError: The run is not repeatable: it used a foreign autopilot or measured
                 times, was interrupted by the user, or named a file that has changed since.
         """
         record, path, why = self.record, self.folder.path, ""
@@ -471,7 +471,7 @@ def load_run(path: str | Path) -> Run:
         raise RecordError(f"{folder.result}: written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
         raise RecordError(f"{folder.result}: damaged (missing: {', '.join(missing)})")
-    # Records from before the introduction of stacks flew the stack FIRST.
+    # Runs recorded before stacks were introduced used the stack FIRST.
     with reading(folder.result):
         result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}
     return Run(folder, result, trace)

@@ -24,20 +24,20 @@ from mavfi_cli.mission.setpoints import SETPOINTS, SetpointView
 from mavfi_cli.spec.companion import GateConfig
 from mavfi_cli.spec.detector import DetectorConfig
 
-_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # of the gate's own messages
-_SILENT_S = 3.0  # time without a heartbeat after which a companion that had one is gone
+_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER4  # sender of the gate's own messages
+_SILENT_S = 3.0  # time without a heartbeat after which a companion that sent one is gone
 _TEXT_EVERY_S = 1.0
 _MOST_ALARMS = 100
-_BRAKE = 0b1101_1100_0111  # type_mask of a setpoint with a velocity only
+_BRAKE = 0b1101_1100_0111  # type_mask of a velocity-only setpoint
 
 
 @dataclass(slots=True)
 class _Counts:
-    """Numbers of setpoints with an alarm, by what was sent in their place."""
+    """Numbers of anomalous or stale setpoints, by what was sent in their place."""
 
     hold: int = 0  # the last accepted setpoint
     brake: int = 0  # a standstill
-    autopilot: int = 0  # nothing: the autopilot was told to hold, or to notice the silence
+    autopilot: int = 0  # nothing: the autopilot was switched to hold, or notices the silence
     stale: int = 0  # nothing: the companion is gone
     none: int = 0  # the setpoint itself: the gate only watches
     alarms: list[dict[str, Any]] = field(default_factory=list)
@@ -49,7 +49,7 @@ class SetpointGate:
     Args:
         mark: Companion for which the model must be made; None for any.
         note: Receives one line per event.
-        signing: Key of the link, to sign replaced setpoints and own messages.
+        signing: Key of the link, for signing replacement setpoints and the gate's own messages.
         gone: Returns why the companion's process is gone; empty while it runs.
 
     Attributes:
@@ -77,7 +77,7 @@ class SetpointGate:
         self._view, self._note, self._signing, self._gone = SetpointView(), note, signing, gone
         self._codec = Codec(1, _COMPONENT, signing=signing)
         self._accepted: Message | None = None
-        self._yaw_rad = 0.0  # of the last accepted setpoint; a standstill keeps it
+        self._yaw_rad = 0.0  # yaw of the last accepted setpoint, kept at a standstill
         self._in_a_row = self._checks = 0
         self._counts = _Counts()
         self._noted_s = self._handed_s = self._heartbeat_s = -math.inf
@@ -88,7 +88,7 @@ class SetpointGate:
 
     @staticmethod
     def warm_up(detector: DetectorConfig, mark: StackMark | None) -> None:
-        """Load and compile what a gate runs, before it must be fast. Raises as the constructor."""
+        """Load and compile what a gate runs, ahead of time. Raises what the constructor raises."""
         gate = Gate(detector.build_for_companion(mark))
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
         plan = Trajectory(

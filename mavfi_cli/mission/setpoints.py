@@ -1,4 +1,4 @@
-"""A companion's setpoints and the states they came from, as samples of a detector.
+"""A companion's setpoints and the states they are based on, as samples for a detector.
 
 A detector has 13 inputs (`detect.preprocess`). The 7 of the waypoint take the vehicle's state: its
 position, yaw and velocity. The 4 of the command take the setpoint: its yaw, and the displacement
@@ -6,8 +6,9 @@ that it requests within 1 s,
 
     d = (p_target - p) + v_target * 1 s + a_target / 2 * (1 s)^2,
 
-each part only if the setpoint has it, ENU. A velocity setpoint is thus its own velocity. For
-SET_ATTITUDE_TARGET d is (roll, pitch, thrust). The 2 inputs of the collision check are not used.
+in ENU, with each term only if the setpoint has it. For a velocity setpoint d is thus its velocity
+times 1 s. For SET_ATTITUDE_TARGET d is (roll, pitch, thrust). The 2 inputs of the collision check
+are not used.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _OFFSET = (*_BODY, dialect.MAV_FRAME_LOCAL_OFFSET_NED)
 _RELATIVE = (
     dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT, dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
 )  # fmt: skip
-_NO_YAW, _NO_YAW_RATE = 0x400, 0x800  # of a setpoint's type_mask
+_NO_YAW, _NO_YAW_RATE = 0x400, 0x800  # bits of a setpoint's type_mask
 _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 
 
@@ -49,7 +50,7 @@ class SetpointView:
         self._trajectory: Trajectory | None = None
 
     def hear(self, message: Message) -> None:
-        """Handle a message of the autopilot."""
+        """Handle a message from the autopilot."""
         if not isinstance(message, dialect.MAVLink_unknown):
             self.telemetry.handle(message)
         if message.get_msgId() == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
@@ -85,7 +86,7 @@ def command_of(
         attitude = np.array([roll, pitch, setpoint.thrust])
         return Command(stamp_s=stamp_s, velocity_enu_mps=attitude, yaw_rad=yaw)
     mask, body = setpoint.type_mask, setpoint.coordinate_frame in _BODY
-    move = [0.0, 0.0, 0.0]  # north, east, down; of a body frame: forward, right, down
+    move = [0.0, 0.0, 0.0]  # north, east, down; in a body frame: forward, right, down
     targets = _position_errors(setpoint, state, global_position)
     velocity, pull = (
         (setpoint.vx, setpoint.vy, setpoint.vz),
@@ -113,7 +114,7 @@ def command_of(
 def _position_errors(
     setpoint: Message, state: VehicleState | None, here: Message | None
 ) -> tuple[float, float, float]:
-    """Return the way from the vehicle to the target in the setpoint's frame, m."""
+    """Return the displacement from the vehicle to the target in the setpoint's frame, m."""
     if setpoint.get_msgId() == _GLOBAL:
         if here is None:
             return 0.0, 0.0, 0.0

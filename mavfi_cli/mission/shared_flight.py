@@ -1,17 +1,17 @@
 """One flight from which missions are forked, each at the moment of its own fault.
 
-Missions that differ only in their fault, and in the restarts of lost nodes, fly the same way until
-the fault strikes. They fly that way once: a process flies without a fault, and forks itself when a
-fault is due. The fork is the mission from there on; the flight waits until it has ended, and
-continues. Missions whose fault was never due, and those without a fault, are forked when the flight
-is over.
+Missions that differ only in their fault, and in how they restart lost nodes, are identical until
+the fault strikes. This common part is flown once: a process flies without a fault, and forks itself
+when a fault is due. The fork continues as the mission; the flight waits until the fork has ended,
+and then continues. Missions whose fault was never due, and those without a fault, are forked when
+the flight is over.
 
-A fault in an instruction is struck after the flight, in a rehearsal of its node. If it is masked,
-its mission is forked from the end of the flight, too. Otherwise the same flight is flown once more,
-as far as the last of these faults. The mission is forked when its node begins the struck
-invocation. There it goes on with the struck node, or loses a node that has ended. If several faults
-end a node in the same invocation in the same way, one further flight loses the node, and their
-missions are forked from its end.
+An instruction-level fault is injected after the flight, in a rehearsal of its node. If it is
+masked, its mission is also forked at the end of the flight. Otherwise the same flight is repeated
+up to the last of these faults. The mission is forked when its node begins the struck invocation,
+and continues with the struck node, or with the loss of a node that has ended. If several faults end
+a node in the same invocation in the same way, one further flight includes this loss, and their
+missions are forked at its end.
 
 Every record equals that of the mission flown alone, except in its host section.
 """
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from mavfi_cli.companion.node_process import NodeProcess
     from mavfi_cli.companion.pipeline import Companion
 
-_CALLED = "control"  # the node that answers within the tick of its order
+_CALLED = "control"  # the node that answers within the tick of its request
 M = TypeVar("M")
 
 
@@ -72,7 +72,7 @@ StrikeNodes = Callable[
 
 
 class _Struck(Exception):
-    """Ends a strike in the shared flight, whose mission has been forked and has ended."""
+    """Raised to end a strike in the shared flight, after its mission was forked and has ended."""
 
 
 Branch = tuple[MissionConfig, Path]  # a mission, and the folder for its run folder
@@ -85,15 +85,15 @@ class SharedFlight(NoInjection):
         branches: missions by number, equal except for their faults.
         fork: forks this process for a mission and returns True in the fork; in this process,
             returns False after the fork's end.
-        strike: strikes nodes in rehearsals, for missions with faults in instructions: receives the
-            flown mission, the faults by number, and what recorded the flight.
+        strike: strikes nodes in rehearsals, for missions with instruction-level faults; receives
+            the flown mission, the faults by number, and the recorder of the flight.
 
     Attributes:
-        flight: the flight, which is set before its first message.
+        flight: the flight; set before its first message.
         config: the mission of this fork; None in the shared flight.
         folder: the fork's run folder.
         host: entries of the host section of the fork's record.
-        recorder: records the orders of the nodes, if there are faults in instructions.
+        recorder: records the requests to the nodes; None without instruction-level faults.
     """
 
     flight: _Flight
@@ -113,7 +113,7 @@ class SharedFlight(NoInjection):
             if config.instruction is not None
         }
         self.recorder = Recorder() if self._requests else None
-        self._struck: dict[int, StruckNode] = {}  # nodes that are taken into a further flight
+        self._struck: dict[int, StruckNode] = {}  # struck nodes that need a further flight
         self._ticks: list[tuple[float, int, FloatArray]] = []  # stamp, number of events, position
         self._injections = {
             number: NoInjection()
@@ -144,7 +144,7 @@ class SharedFlight(NoInjection):
                 injection.aim(shortest_flight_s, protection)
             except MavfiError:  # flown alone, the mission reports it
                 del self._injections[number]
-            injection.injector.follower = self.injector.follower  # which the companion informs
+            injection.injector.follower = self.injector.follower  # which the companion updates
 
     def news(self) -> list[str]:
         """See `NoInjection`."""
@@ -192,7 +192,7 @@ class SharedFlight(NoInjection):
         return self.config, self.folder
 
     def further(self) -> Iterator[SharedFlight]:
-        """Yield the flights of the missions whose nodes end or hang."""
+        """Yield the further flights for missions whose nodes changed, ended or hung."""
         deaths: dict[tuple[object, ...], dict[int, StruckNode]] = {}
         for number, node in self._struck.items():
             how = node.how or f"fault {number}"  # no two faults change a node in the same way
@@ -212,7 +212,7 @@ class SharedFlight(NoInjection):
         return {number: self._branches[number] for number in numbers}
 
     def _strike(self) -> dict[int, StruckNode]:
-        """Strike the faults in instructions. Return those that are masked."""
+        """Inject the instruction-level faults. Return those that are masked."""
         if self._strike_nodes is None or self.recorder is None or not self.recorder.sequence:
             return {}
         config, _ = next(iter(self._branches.values()))
@@ -223,7 +223,7 @@ class SharedFlight(NoInjection):
         return {number: node for number, node in struck.items() if node.process is None}
 
     def _log_strike(self, injection: StruckNode) -> None:
-        """Log the strike at the tick that took the answer of the struck invocation."""
+        """Log the strike at the tick that received the answer of the struck invocation."""
         self.host["struck"] = injection.effect
         assert self.flight.companion is not None
         timetable = self.flight.companion.executor.timetable
@@ -240,7 +240,7 @@ class SharedFlight(NoInjection):
 
 
 class _FurtherFlight(SharedFlight):
-    """The same flight once more, with nodes that were struck in rehearsals."""
+    """A repetition of the flight, with nodes that were struck in rehearsals."""
 
     def __init__(
         self,
@@ -255,14 +255,14 @@ class _FurtherFlight(SharedFlight):
         self.recorder = _Starts(self._lose)
 
     def _lose(self, node: str, order: int) -> None:
-        """Receive the start of each order of a node, by its number."""
+        """Handle the start of a request to a node, given its number, from 1."""
 
 
 class _StruckFlight(_FurtherFlight):
-    """The same flight once more, up to the last order for which a node was struck."""
+    """A repetition of the flight, up to the last request in which a node was struck."""
 
     def _lose(self, node: str, order: int) -> None:
-        """Fork the missions whose node was struck in this order.
+        """Fork the missions whose node was struck in this request.
 
         Raises:
             SystemExit: this is the shared flight, and no mission is left.
@@ -288,9 +288,9 @@ class _StruckFlight(_FurtherFlight):
 
 
 class _LostFlight(_FurtherFlight):
-    """The same flight once more, in which a node is lost as by each of several faults."""
+    """A repetition of the flight, with the loss of a node that several faults have in common."""
 
-    _text = ""  # of the logged strike
+    _text = ""  # text of the logged strike
 
     @property
     def _first(self) -> StruckNode:
@@ -298,13 +298,13 @@ class _LostFlight(_FurtherFlight):
         return next(iter(self._left.values()))
 
     def _lose(self, node: str, order: int) -> None:
-        """Lose the node in this invocation if the first fault ended it there."""
+        """Let the node end in this invocation if the first fault ended it there."""
         if (self._first.node, self._first.order) == (node, order):
             self.flight.lose_nodes_as(next(iter(self._branches.values()))[0])
             self.flight.isolate_late(node, self._first.process)
 
     def news(self) -> list[str]:
-        """See `NoInjection`. The news are those of the first fault."""
+        """See `NoInjection`. The news is that of the first fault."""
         news = self._first.news() if self.config is None else []
         self._text = "".join(news) or self._text
         return news
@@ -361,7 +361,7 @@ class _ForkedInjection(SourceInjection):
 
 
 class _Injectors(NoInjector):
-    """The injectors of the missions that have not been forked; in a fork, its own alone."""
+    """The injectors of the missions that have not been forked; in a fork, only its own."""
 
     def __init__(self, injections: dict[int, NoInjection]) -> None:
         super().__init__()

@@ -1,8 +1,8 @@
 """The simulated vehicle of a mission, in the mission's process or in another.
 
-Either way companion and vehicle share the bytes of a MAVLink link. The vehicle provides its
+Either way, companion and vehicle exchange bytes over a MAVLink link. The vehicle provides its
 briefing before its first message and the referee's truth at the end: as objects in this process, or
-as files of another. This is the only module of the companion's side that imports the vehicle's.
+as files from another. This is the only module on the companion's side that imports the vehicle's.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mavfi_cli.mission.run_folder import BRIEFED, BRIEFING
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import HIGHEST_M, LOWEST_M, OWN_AUTOPILOT, REMOTE_M, MissionConfig
 
-_START_LIMIT_S = 120.0  # of a camera; its first start compiles
+_START_LIMIT_S = 120.0  # long enough for the first start of a camera, which compiles
 _END_LIMIT_S = 20.0
 _LOOK_S = 0.2
 
@@ -55,7 +55,7 @@ class Vehicle(ABC):
 
     @staticmethod
     def start(config: MissionConfig) -> Vehicle:
-        """Start the vehicle in this process, or in its own if both run by the wall clock."""
+        """Start the vehicle in this process, or in its own if the flight uses the wall clock."""
         by_wall = config.realtime or config.companion is not None
         return (VehicleProcess if by_wall else VehicleInProcess)(config)
 
@@ -66,7 +66,7 @@ class Vehicle(ABC):
 
     @staticmethod
     def at(url: str, briefing: Path) -> StartVehicle:
-        """Return what connects to a vehicle in lockstep that another process has started.
+        """Return a function that connects to a vehicle in lockstep started by another process.
 
         Args:
             url: Endpoint of the link.
@@ -104,7 +104,7 @@ class Vehicle(ABC):
 
         Raises:
             VehicleProcessError: It has sent nothing in time, or has ended.
-            Interrupted: The user asked for the end.
+            Interrupted: The user interrupted the start.
         """
         deadline_s = time.monotonic() + _START_LIMIT_S
         while not select.select([self.link.fileno()], [], [], _LOOK_S)[0]:
@@ -197,7 +197,7 @@ def _read_truth(folder: Path) -> FlightTruth | None:
 
 
 class VehicleProcess(Vehicle):
-    """`python -m sitl` in lockstep, as `VehicleInProcess`. Closing the socket ends it.
+    """`python -m sitl` in lockstep, like `VehicleInProcess`. Closing the socket ends it.
 
     Raises:
         VehicleProcessError: It cannot be started.
@@ -276,7 +276,7 @@ class VehicleProcess(Vehicle):
 
 
 class _LockstepProcess(VehicleProcess):
-    """The vehicle of a user's companion in lockstep, whose flight limits the time of an answer."""
+    """The vehicle of a user's companion in lockstep; the flight limits the time for an answer."""
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -285,7 +285,7 @@ class _LockstepProcess(VehicleProcess):
 
 
 class _VehicleElsewhere(Vehicle):
-    """A vehicle of another process. Arguments as for `Vehicle.at`.
+    """A vehicle in another process. The arguments are those of `Vehicle.at`.
 
     Raises:
         LinkError: The link cannot be opened.

@@ -11,12 +11,12 @@ from mavfi_cli.core.files import file_digest
 from mavfi_cli.core.installed import installed_versions
 from mavfi_cli.spec.mission import MissionConfig
 
-PROGRAM = "mavfi_cli.mission.instruction.server"  # of the attacked node
-CACHE = ".profiles"  # folder in that of the runs
+PROGRAM = "mavfi_cli.mission.instruction.server"  # program of the attacked node
+CACHE = ".profiles"  # subfolder of the runs' folder
 
 
 def kept_in(folder: Path, golden: MissionConfig) -> Path:
-    """Return the subfolder for a golden mission's orders and profiles.
+    """Return the subfolder for a golden mission's requests and profiles.
 
     Its name is a hash of everything that determines the golden run.
     """

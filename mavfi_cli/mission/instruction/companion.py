@@ -1,4 +1,4 @@
-"""A fault in an instruction of a process of a user's companion."""
+"""An instruction-level fault in a process of a user's companion."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from mavfi_cli.mission.companion_faults import CompanionFault
 from mavfi_cli.mission.programs import RunningProgram
 from mavfi_cli.spec.fault import InstructionConfig
 
-# Signals by which programs end each other. Such an end, one with code 0 and one without a known
-# status count as a death by the fault if the program goes on for a time without the process.
+# Signals with which programs end each other. An end by such a signal, with code 0 or with unknown
+# status counts as a death by the fault if the program keeps running for a time without the process.
 _ORDINARY = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGHUP})
 _WITHOUT_S = 2.0
-# The tracer's thread computes in Python for up to seconds. The thread of the link must not wait for
-# Python's default of 5 ms whenever it has sent or received.
+# The tracer thread computes in Python for up to several seconds. The link thread must not wait
+# Python's default of 5 ms after every send or receive.
 _SWITCH_S = 1e-4
 
 
@@ -60,8 +60,8 @@ class ProcessInjection(CompanionFault):
         self._reported = False
         self._usual_switch_s: float | None = None
         self._watch: EndWatch | None = None
-        self._end: tuple[float, Ended] | None = None  # of the struck process, with its stamp
-        self._leads, self._codes = True, 0  # it is its program's own process; ended ones before it
+        self._end: tuple[float, Ended] | None = None  # stamp and end of the struck process
+        self._leads, self._codes = True, 0  # if it is the program's own; ended ones before it
 
     def aim_at(self, shortest_flight_s: float) -> None:
         """See `CompanionFault`."""

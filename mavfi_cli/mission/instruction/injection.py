@@ -1,13 +1,12 @@
 """Plans one exact instruction-level fault of a mission, and injects it during the flight.
 
-A node is a function of its orders. A rehearsal gives the orders of the golden run to a separate
-node, without a flight and as fast as the machine allows. Orders, numbers of kernel
-entries and profiles are kept below the output folder, under a hash of everything that determines
-them. In the flight a tracer thread injects the fault.
+A node is a function of its requests. A rehearsal sends the requests of the golden run to a separate
+node, without a flight and as fast as the machine allows. Requests, numbers of kernel entries and
+profiles are kept below the output folder, under a hash of everything that determines them. In the
+flight a tracer thread injects the fault.
 
-Nodes of missions that share a flight are struck in the rehearsal. A fault after which the node
-answers and remembers what it does without the fault needs no flight. Otherwise the flight takes
-over the struck node.
+Nodes of missions that share a flight are struck in the rehearsal. A fault that changes neither the
+node's answer nor its memory needs no flight. Otherwise the flight takes over the struck node.
 """
 
 from __future__ import annotations
@@ -74,10 +73,10 @@ _LARGEST = 1 << 31  # bytes of a kept file
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GoldenOrders:
-    """The briefing of a golden run, and its orders by node.
+    """The briefing of a golden run, and its requests by node.
 
     Attributes:
-        sequence: nodes in the order of the starts of all orders.
+        sequence: node of every request, in order of start.
     """
 
     briefing: Briefing
@@ -90,24 +89,24 @@ class GoldenOrders:
 
     @classmethod
     def of(cls, recorder: Recorder) -> GoldenOrders:
-        """Return what a recorder has seen of a flight."""
+        """Return the briefing and requests that a recorder captured in a flight."""
         assert recorder.briefing is not None
         orders = {name: tuple(given) for name, given in recorder.orders.items()}
         return cls(briefing=recorder.briefing, sequence=tuple(recorder.sequence), **orders)
 
     def __post_init__(self) -> None:
         if any(len(getattr(self, name)) != self.sequence.count(name) for name in KERNELS):
-            raise ValueError("sequence must name the node of every order")
+            raise ValueError("sequence must name the node of every request")
 
     def of_process(self, nodes: Sequence[str]) -> list[Order]:
-        """Return the orders of nodes that share a process, in the order of their starts."""
+        """Return the requests to nodes that share a process, in order of start."""
         left = {node: iter(getattr(self, node)) for node in nodes}
         return [(node, *next(left[node])) for node in self.sequence if node in left]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Entries:
-    """Cumulative number of kernel entries at the end of every order of its node."""
+    """Cumulative number of kernel entries at the end of every request to its node."""
 
     counts: tuple[int, ...]
 
@@ -119,13 +118,13 @@ class _Entries:
 def _golden_orders(
     golden: MissionConfig, profiles: Path, fly: Callable[[Path], Recorder]
 ) -> GoldenOrders:
-    """Return the kept orders of a golden mission; if there are none, `fly` it into a folder."""
+    """Return the kept requests of a golden mission; if there are none, `fly` it into a folder."""
     folder = own_folder(kept_in(own_folder(profiles), golden))
     return _kept(folder / "orders.npz", GoldenOrders, lambda: GoldenOrders.of(fly(folder)))
 
 
 def keep_orders(golden: MissionConfig, profiles: Path, fly_golden: FlyGolden) -> GoldenOrders:
-    """Return the kept orders of a golden mission; if there are none, fly it.
+    """Return the kept requests of a golden mission; if there are none, fly it.
 
     Args:
         profiles: folder of golden flights and profiles.
@@ -186,7 +185,7 @@ class _GoldenNode:
             self._rehearsal.close()
 
     def draw(self, request: InstructionConfig) -> tuple[KernelInvocation, np.random.Generator]:
-        """Draw the invocation to strike. Return the generator of the rest of the draw, too.
+        """Draw the invocation to strike. Also return the generator for the rest of the draw.
 
         Raises:
             FaultError: the flight never enters the kernel.
@@ -238,7 +237,7 @@ class _GoldenNode:
         return replace(fault, corruption=None) if request.null else fault, context
 
     def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
-        """Return True if the process got the same orders in another flight, up to an invocation."""
+        """Return True if another flight sent the process the same requests up to an invocation."""
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
         until = own[drawn.order - 1] + 1
         theirs = flown.of_process(self.process)[:until]
@@ -255,15 +254,15 @@ def struck_nodes(
     *,
     profiles: Path,
 ) -> dict[int, StruckInjection]:
-    """Strike the faults of missions in a rehearsal.
+    """Inject the faults of missions in a rehearsal.
 
     Faults that cannot be planned or compared there are left out.
 
     Args:
         flown: the missions without their faults.
         requests: their faults, by number.
-        recorder: has recorded the flight of `flown`. Orders of a golden mission with another
-            protection are kept already.
+        recorder: recorder of the flight of `flown`. If the golden mission has another protection,
+            its requests are already kept.
     """
     golden, seen = flown.golden, GoldenOrders.of(recorder)
     orders = _golden_orders(golden, profiles, lambda _: recorder)
@@ -296,13 +295,13 @@ def struck_nodes(
 
 
 def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
-    """Draw one invocation of a kernel uniformly from the entries up to each order.
+    """Draw one invocation of a kernel uniformly, given the entries up to the end of each request.
 
     Every entry is an invocation, except for a planner node: it is entered whenever it builds an
     obstacle grid, at least once per request, and the request is the invocation.
 
     Args:
-        counts: cumulative entries at the end of every order of the golden run; not empty.
+        counts: cumulative entries at the end of every request of the golden run; not empty.
     """
     before = np.array([0, *counts[:-1]])
     if node != "planner":
@@ -368,8 +367,8 @@ class InstructionInjection(NoInjection):
         self._spawned = ServedProcess.of(PROGRAM)
         self._path: Path | None = None
         self._tracer: TracerThread[LiveAttack] | None = None
-        self._reached = threading.Event()  # the trigger, or the end of the attack without it
-        self._struck = False  # in an invocation whose answer is there
+        self._reached = threading.Event()  # set at the trigger, or when the attack ends without it
+        self._struck = False  # True once the struck invocation was answered
         self._reported = False
 
     @classmethod
@@ -384,7 +383,7 @@ class InstructionInjection(NoInjection):
 
         Args:
             profiles: Folder of golden flights and profiles.
-            fly_golden: Flies the golden mission, if its orders are not kept yet.
+            fly_golden: Flies the golden mission if its requests are not kept yet.
 
         Raises:
             FaultError: The flight is not repeatable, or nothing in it can be struck.
@@ -466,10 +465,10 @@ class InstructionInjection(NoInjection):
         return None if ended is None else ended.describe()
 
     def _note_strike(self) -> None:
-        """Check for a strike between two inputs, so that its tick does not depend on speed.
+        """Check for a strike between two inputs, so that its tick does not depend on host speed.
 
-        If a detector changed the flight before the fault, the trigger comes in another invocation
-        than planned, or never.
+        If a detector changed the flight before the fault, the trigger comes in a different
+        invocation than planned, or never.
         """
         self._struck = self._struck or self._reached.is_set()
 

@@ -1,9 +1,9 @@
-"""Rehearses a node: it works through the orders of a golden flight, without the flight.
+"""Rehearses a node: replays the requests of a golden flight to it, without the flight.
 
-Before an order the node is stopped and forked, as often as needed. A fork is the node just before
-this invocation, with the same memory. One fork after the other receives the order, because all
-share the socket of the node: forks that are stepped for a profile, one with a fault, and
-two without it, with which the struck one is compared.
+Before a request the node is stopped and forked, as often as needed. A fork is a copy of the node
+just before this invocation, with the same memory. The forks receive the request one after another,
+because all share the node's socket: forks that are stepped for a profile, one with a fault, and two
+without it, which are compared with the struck one.
 """
 
 from __future__ import annotations
@@ -61,15 +61,15 @@ class KernelInvocation:
 
     number: int  # number of the kernel's invocation, from 1
     of: int
-    order: int  # number of the node's order that contains it, from 1
+    order: int  # number of the node's request that contains it, from 1
     entry: int  # number of the kernel's entry with which it begins, from 1
-    earlier: int  # entries in the earlier orders
+    earlier: int  # entries in the earlier requests
 
 
 class NodeEffect(Enum):
-    """The effect of a fault on a node until its answer."""
+    """The effect of a fault on a node up to its answer."""
 
-    MASKED = "masked"  # it answers, and remembers, what it does without the fault
+    MASKED = "masked"  # answer and memory are as without the fault
     CHANGED = "changed"
     ENDED = "ended"
     HUNG = "hung"
@@ -80,8 +80,8 @@ class Struck:
     """A struck node.
 
     Attributes:
-        record: as of a fault in a flight.
-        process: the node from this order on; None if the fault is masked.
+        record: fault record, as from a flight.
+        process: serves the node starting with this request; None if the fault is masked.
         how: how the node ended or hung; empty if it answers.
     """
 
@@ -98,15 +98,15 @@ class Rehearsal:
 
     Args:
         setup: the first message to the node's program.
-        orders: those of all nodes of its process, in the order of their starts.
+        orders: requests to all nodes of its process, in order of start.
     """
 
     kind = "node"
 
     def __init__(self, setup: object, node: str, orders: Sequence[Order]) -> None:
         self._node, self._orders = node, orders
-        self._done, self._entry = 0, 1  # finished orders; entry of the awaited invocation in its
-        self._stopped: Tracee | None = None  # the node, in front of an order
+        self._done, self._entry = 0, 1  # finished requests; awaited entry in the next one
+        self._stopped: Tracee | None = None  # the node, stopped before a request
         self._sender = threading.Thread()
         self._sender.start()
         self._spawned = ServedProcess.of(PROGRAM)
@@ -129,7 +129,7 @@ class Rehearsal:
     # Orders
 
     def count_entries(self) -> list[int]:
-        """Count the kernel's entries up to the end of each order of the node, in a fork.
+        """Count the kernel's entries up to the end of each request to the node, using a fork.
 
         Raises:
             TracingForbidden: the operating system allows neither counting nor tracing.
@@ -151,7 +151,7 @@ class Rehearsal:
         return counts
 
     def go_to(self, invocation: KernelInvocation) -> None:
-        """Work through the orders up to an invocation, which must not precede the present one.
+        """Process the requests before an invocation, which must not precede the current one.
 
         The node and its forks stay on one processor: switching between two doubles the time of
         stepping, and the C library keeps the processor's number in the memory of each thread.
@@ -168,17 +168,17 @@ class Rehearsal:
             self._done += 1
 
     def _stop(self) -> Tracee:
-        """Stop the node where it waits for an order."""
+        """Stop the node where it waits for a request."""
         if self._stopped is None:
             self._stopped = Tracee.attach(self._spawned.pid, alone=True)
             self._stopped.await_call()
         return self._stopped
 
     def _fork(self) -> Tracee:
-        """Fork the node, and give the fork the next order."""
+        """Fork the node, and send the fork the next request."""
         self._sender.join()
         fork, order = self._stop().fork(), self._orders[self._done]
-        # A long message needs a reader: the fork, which runs later.
+        # Sending a long message blocks until the fork, which runs later, reads it.
         self._sender = threading.Thread(target=self._process.rehearse, args=order, daemon=True)
         self._sender.start()
         return fork
@@ -194,11 +194,11 @@ class Rehearsal:
         return tracee
 
     def image(self, _: Tracee) -> Image:
-        """The memory image of the node and of each fork."""
+        """Return the memory image of the node and of each fork."""
         return self._image
 
     def scope(self, image: Image) -> Scope:
-        """The code in scope."""
+        """Return the code in scope."""
         return image.scope(self.scope_of_node.objects)
 
     def profile(self, invocation: KernelInvocation, rng: np.random.Generator) -> TargetProfile:
@@ -242,7 +242,7 @@ class Rehearsal:
     ) -> Struck:
         """Strike an invocation in a fork, and compare the fork with two unstruck ones.
 
-        If they differ, the struck fork remains, and goes on for a flight.
+        If they differ, the struck fork is kept, to continue in a flight.
 
         Args:
             context: further entries of the record.
@@ -292,14 +292,14 @@ class Rehearsal:
             return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
 
     def _let_go(self, fork: Tracee) -> NodeProcess:
-        """Give a fork that is about to answer a connection of its own, and let it go on."""
+        """Connect a fork, which is about to answer, to a socket of its own, and let it continue."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind("")  # an address that the operating system chooses
             listener.listen()
             fork.step_back()
             fork.connect(CHANNEL, listener.getsockname())
             connection, _ = listener.accept()
-            while _process_at(connection) != fork.pid:  # anybody can connect
+            while _process_at(connection) != fork.pid:  # any process can connect
                 connection.close()
                 connection, _ = listener.accept()
         os.sched_setaffinity(fork.pid, os.sched_getaffinity(os.getpid()))
@@ -334,7 +334,7 @@ def _limited(tracee: Tracee) -> ProcessTimer:
 
 
 def _time_of(memory: linux.Memory, address: int, size: int) -> bytes:
-    """Return the host time in an answer as its pickle has it; nothing if it is corrupted."""
+    """Return the pickled host time in an answer; empty if the answer is corrupted."""
     try:
         return struct.pack(">d", value_of(memory.read(address, size)).host_s)
     except Exception:  # a corrupted pickle can raise any error

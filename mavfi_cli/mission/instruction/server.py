@@ -51,7 +51,7 @@ class Setup:
 
 
 def main() -> None:
-    """Load every kernel, receive the node's setup, and work until the connection closes."""
+    """Load every kernel, receive the node's setup, and serve until the connection closes."""
     connection = socket.socket(fileno=CHANNEL)
     warm_up()
     try:
