@@ -18,8 +18,8 @@ from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.terminal import exit_code, leave
 
-# name -> (module, what it does); the help page must not import the modules. A command of the
-# vehicle's side replaces this process.
+# name -> (module, what it does); the help page must not import the modules. A vehicle-side command
+# replaces this process.
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
     "companion": ("mavfi_cli.cli.companion", "Fly a vehicle as a program, for fly --companion."),
@@ -50,7 +50,7 @@ class _LazyGroup(click.Group):
     """A group that imports a command's module when the command or its help is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The names, in the order of the help."""
+        """Return the names in the order of the help."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -87,10 +87,10 @@ class _LazyGroup(click.Group):
 
 
 class _VehicleSide(click.Command):
-    """A command of the vehicle's side. Its program completes the words after `mavfi world`."""
+    """A vehicle-side command. For `mavfi world`, its program completes the words that follow."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Run the program to complete; `mavfi sitl` completes nothing, as it would start to fly."""
+        """Run the program for completions; `mavfi sitl` has none, because it would start to fly."""
         from mavfi_cli.core.processes import PYTHON
 
         if self.name != "world":
@@ -108,7 +108,7 @@ class _VehicleSide(click.Command):
 
 
 def _vehicle_side(name: str, module: str) -> click.Command:
-    """A command that becomes `python -m module`, with its streams, signals and exit code."""
+    """Return a command that becomes `python -m module`, with its streams, signals and exit code."""
 
     def become(arguments: tuple[str, ...]) -> None:
         from mavfi_cli.core.processes import PYTHON
@@ -138,7 +138,7 @@ def main() -> NoReturn:
     usage error.
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # our arrays are small; threads would only cost start-up
+        os.environ.setdefault(name, "1")  # our arrays are small; threads would only slow the start
     choose_caches()
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGTERM, _interrupt)

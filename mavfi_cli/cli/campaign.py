@@ -328,7 +328,7 @@ def keys(folder: Path) -> None:
 def _planned(
     what: str, scale: float | None, changes: Sequence[str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """The missions of a campaign, as a dict for JSON and as lines of text."""
+    """Return the missions of a campaign as a dict for JSON and as lines of text."""
     from collections import Counter
 
     from mavfi_cli.campaigns.begin import chosen_spec, flyable

@@ -1,4 +1,4 @@
-"""`mavfi companion`: mavfi's own companion as a program of its own."""
+"""`mavfi companion`: mavfi's own companion as a separate program."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def companion(
 
     mission = MissionConfig() if config is None else load_toml(config, MissionConfig)
     given: dict[str, Any] = {name: options[name] for name in set(options) & set(given_options())}
-    given |= {"companion": None, "speed": 1.0, "realtime": False}  # of the vehicle's side
+    given |= {"companion": None, "speed": 1.0, "realtime": False}  # settings of the vehicle's side
     mission = replace(mission, **given)
-    CompanionParts.of(mission)  # unknown names end here
+    CompanionParts.of(mission)  # rejects unknown names
     if (goal is None) == (briefing is None):
         raise click.UsageError("give --goal, or --lockstep with a briefing")
     launch: StartVehicle = Vehicle.start

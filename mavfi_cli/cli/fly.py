@@ -35,7 +35,7 @@ _EITHER = {"bits", "field", "fault_seed"}
 _OF_PROGRAM = {"objects", "function"}
 _INSTRUCTION = {"sites", "roles", "compat", *_OF_PROGRAM}
 _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
-_SMALL = 1.0e-3  # change of a value, of the value itself or of 1 in its unit
+_SMALL = 1.0e-3  # largest small change, relative to the value or to 1 unit if that is more
 _LARGE = [
     "--inject", "waypoint_position", "--all-components", "--field", "exponent",
     "--fault-seed", "20",
@@ -251,7 +251,7 @@ def fly(
 
 
 def _hint(run: Run) -> list[str]:
-    """Suggest a fault that moves a waypoint far, if the flown one hardly changed its state."""
+    """Suggest a fault that moves a waypoint far, if this fault hardly changed its state."""
     record = run.record
     changes = [change for strike in record.strikes for change in strike.changes]
     small = (
@@ -277,7 +277,7 @@ def _hint(run: Run) -> list[str]:
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
-    """The mission of the file, with the options applied.
+    """Return the mission of the file, with the options applied.
 
     Raises:
         ConfigError: the file or an option is not valid.
@@ -291,7 +291,7 @@ def _mission_of(path: Path | None) -> MissionConfig:
         return _replaced(base, given_options())
     except FaultSpecError as error:
         raise click.UsageError(str(error)) from None
-    except ConfigError as error:  # the command itself names an option
+    except ConfigError as error:  # for an option, the command itself adds its name
         if error.path is not None or spelling(error.key) != error.key:
             raise
         raise click.UsageError(str(error)) from None
@@ -334,7 +334,7 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
 def _faults(
     base: MissionConfig, given: Given
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
-    """The mission's fault at source or instruction level, checked."""
+    """Check and return the mission's fault, at source or instruction level."""
     from mavfi_cli.attack.live import mission_strategy
     from mavfi_cli.mission.companion_faults import check_companion_fault
     from mavfi_cli.spec.companion import CompanionConfig

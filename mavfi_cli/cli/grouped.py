@@ -26,11 +26,11 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any] | click.Command)
 
 
 def section(title: str) -> Callable[..., Callable[[Decorated], Decorated]]:
-    """`click.option` for the options of a section of the help, which show their defaults."""
+    """Return `click.option` for options in a section of the help, which show their defaults."""
     return partial(click.option, cls=_GroupedOption, group=title, show_default=True)
 
 
-option = section("Options")  # of a command without sections
+option = section("Options")  # for commands without sections
 
 
 class GroupedCommand(click.Command):
@@ -79,7 +79,7 @@ class GroupOfCommands(click.Group):
 
 
 def _blamed(error: MavfiError) -> tuple[str, str]:
-    """The option or argument that caused an error, and the problem; both may be empty."""
+    """Return the option or argument that caused an error, and the problem; both may be empty."""
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
     if isinstance(error, PlaceError):  # it names the world, which is not at fault
@@ -95,7 +95,7 @@ def _blamed(error: MavfiError) -> tuple[str, str]:
 
 
 def given_options() -> Given:
-    """The options that the user gave to the current command, by parameter name."""
+    """Return the options that the user gave to the current command, by parameter name."""
     context = click.get_current_context()
     return {
         name: value
@@ -105,7 +105,7 @@ def given_options() -> Given:
 
 
 def given_fields(kind: type, **others: Any) -> Given:
-    """The options that the user gave, as fields of a plan with the defaults of the command.
+    """Return the options that the user gave and that are fields of a plan.
 
     Args:
         kind: the dataclass of the plan.
@@ -116,7 +116,7 @@ def given_fields(kind: type, **others: Any) -> Given:
 
 
 def spelling(name: str) -> str:
-    """Return a parameter's option of the current command, such as `--v-max`; else the name."""
+    """Return the current command's option for a parameter, such as `--v-max`, or the name."""
     for param in click.get_current_context().command.params:
         if param.name == name or f"--{name}" in param.opts:
             return param.opts[0]
@@ -131,5 +131,5 @@ def refuse_given(names: Collection[str], why: str) -> None:
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """The names in a comma-separated list."""
+    """Return the names in a comma-separated list."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -67,7 +67,7 @@ def doctor(as_json: bool) -> None:
 
 # Platforms ----------------------------------------------------------------------------------------
 
-_P95 = 1.6449  # standard normal: 90 % lie within
+_P95 = 1.6449  # 95 % quantile of the standard normal distribution
 _MORE_PLATFORMS = """\
 measured:FACTOR  this host's own kernel times while it flies, times FACTOR; for `mavfi fly \
 --realtime` only
@@ -108,7 +108,7 @@ def _all_s(profile: PlatformProfile) -> float:
 
 
 def _kernel_lines(profile: PlatformProfile) -> Iterator[str]:
-    """The computer and each kernel, with the source of each number."""
+    """Yield lines on the computer and each kernel, with the source of each number."""
     if profile.measured_factor is not None:
         yield _title(profile)
         yield _MEASURED.format(
@@ -161,7 +161,7 @@ _GROUPS = {  # all keys, in the order of the output
     "Nodes": ("owns_sequence_numbers", "restores_counters", "standby", "processes"),
 }  # fmt: skip
 _KEY = max(len(key) for keys in _GROUPS.values() for key in keys) + 2
-_VALUE = 8  # columns of a truth value, a number or a short word
+_VALUE = 8  # columns for a boolean, a number or a short word
 _MORE_STACKS = """
 `mavfi stacks NAME` explains every key, `mavfi stacks NAME NAME` shows where stacks differ.
 NAME:KEY=VALUE,KEY=VALUE names a variant, such as mavbench:guards_tracking=true."""
@@ -204,7 +204,7 @@ def _explained(stack: Stack) -> Iterator[str]:
 
 
 def _compared(stacks: Sequence[Stack]) -> Iterator[str]:
-    """The keys in which stacks differ, one column per stack."""
+    """Yield the keys in which stacks differ, one column per stack."""
     for number, stack in enumerate(stacks, start=1):
         yield from textwrap.wrap(f"{number}  {_title(stack)}", WIDTH, subsequent_indent="   ",
                                  break_long_words=True)  # fmt: skip

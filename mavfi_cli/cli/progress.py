@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 PLAIN_EVERY_S, _REDRAW_S = 10.0, 0.05
 _NOTED = ("phase", "autopilot", "plan", "stop", "fault", "alarm", "node", "outcome")
-_MOST_SETTINGS = 6  # more settings have no rates here; `campaign status` shows all
+_MOST_SETTINGS = 6  # with more, rates are left out here; `campaign status` shows all
 _Part = str | tuple[str, str]  # text, or text and its style on a terminal
 
 
@@ -35,7 +35,7 @@ class _Lines:
         note("".join(p if isinstance(p, str) else p[0] for p in parts))
 
     def update(self, text: str, at_s: float, *, last: bool = False) -> None:
-        if at_s < self._last_s:  # the next campaign
+        if at_s < self._last_s:  # the next campaign has begun
             self._next_s = 0.0
         self._last_s = at_s
         if at_s >= self._next_s or last:
@@ -202,7 +202,7 @@ def missions_view(*, quiet: bool) -> Iterator[Spectator]:
 
 @contextmanager
 def steps_view() -> Iterator[Callable[[str], None]]:
-    """Show the current step of a computation on stderr; takes the name of each step."""
+    """Show the current step of a computation on stderr. Yields a function that takes its name."""
     begun_s = time.monotonic()
     with _screen(PLAIN_EVERY_S) as screen:
         yield lambda name: screen.update(f"{name} ...", time.monotonic() - begun_s)

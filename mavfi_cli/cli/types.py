@@ -1,4 +1,4 @@
-"""Types of options: bounded numbers, names that the shell completes, and run folders."""
+"""Option types: bounded numbers, names that the shell completes, and run folders."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from mavfi_cli.core.option_types import Number, OutFolder
 
 
 JOBS = click.IntRange(1, 1024)
-MISSIONS = click.IntRange(1, 1_000_000)  # flights or runs; a campaign has no more
+MISSIONS = click.IntRange(1, 1_000_000)  # flights or runs; also the limit of a campaign
 SEED = click.IntRange(0, 2**31 - 1)
 FIRST_SEED = click.IntRange(0, 2**31 - 1_000_001)  # each further mission adds 1
 BITS, BIT = click.IntRange(1, 64), click.IntRange(0, 63)  # of a state
 ABOVE_ZERO = Number(min=1.0e-6, max=1.0e6)
 CONFIDENCE = Number(0.0, 1.0, min_open=True, max_open=True)
 SHARE, SCALE = Number(0.0, 1.0), Number(0.0, 1000.0, min_open=True)
-NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its list
+NUMBER = click.IntRange(0, MISSIONS.max)  # of a mission in its campaign
 UPSETS = Number(0.0, 1.0e12)
 
 
@@ -90,7 +90,7 @@ class Name(click.ParamType[Any]):
 
 
 def _loaded(place: str) -> Iterable[str]:
-    """Names from MODULE:ATTRIBUTE: an enumeration, shipped files, plug-ins, or a container."""
+    """Return the names in MODULE:ATTRIBUTE: an enum, shipped files, plug-ins, or a container."""
     module, _, attribute = place.partition(":")
     container: Any = getattr(importlib.import_module(module), attribute)
     if isinstance(container, EnumType):
@@ -100,7 +100,7 @@ def _loaded(place: str) -> Iterable[str]:
 
 
 def _worlds(_ctx: click.Context) -> Iterable[str]:
-    """The worlds' names from the vehicle's side, which this side does not import."""
+    """Return the worlds' names from the vehicle's side, which this side does not import."""
     from mavfi_cli.core.processes import PYTHON
 
     line = [*PYTHON, "-m", "sitl.world", "list", "--json"]
@@ -153,7 +153,7 @@ CAMPAIGN = Name(
 
 # Files --------------------------------------------------------------------------------------------
 
-_MOST = 1000  # entries of a folder that completion reads
+_MOST = 1000  # maximum entries of a folder that completion reads
 
 
 class RunPath(click.Path):
@@ -165,7 +165,7 @@ class RunPath(click.Path):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the run folders, down to one level below, whose paths start with the text."""
+        """Return the run folders, at most one level down, whose paths start with the text."""
         matches = [CompletionItem(str(path)) for path in sorted(_runs(incomplete))]
         return matches or super().shell_complete(ctx, param, incomplete)
 

@@ -135,7 +135,7 @@ def vpm(
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
-    """Overhead in per cent and its source for each detector; the last option of one wins.
+    """Return each detector's overhead in per cent and its source; its last option wins.
 
     Args:
         platform: name of the modelled platform; flights on others are ignored. None uses all.
@@ -147,7 +147,7 @@ def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str,
     overheads: dict[str, tuple[float, str]] = {}
     for text in texts:
         name, _, number = text.partition("=")
-        if os.path.exists(text):  # false also of a text that is too long for a path
+        if os.path.exists(text):  # also false if the text is too long for a path
             from mavfi_cli.analysis.overhead import recorded_overheads
             from mavfi_cli.vpm.model import DETECTORS
 

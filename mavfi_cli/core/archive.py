@@ -1,4 +1,4 @@
-"""Archives: dataclasses with arrays as bytes, in numpy's `.npz`; reading one executes nothing.
+"""Packs dataclasses with arrays into bytes, as numpy's `.npz`; reading them executes no code.
 
 An archive has two arrays of bytes. `value` is JSON, in which an array is given by its offset in
 `data`, dtype, shape, order and writeability. An array that occurs twice is stored once. Equal
@@ -42,11 +42,11 @@ _SHAPES: Mapping[str, tuple[int | None, ...]] = {
 
 
 def pack(value: Any) -> bytes:
-    """Return an archive of a dataclass of numbers, texts, arrays, bytes and further dataclasses."""
+    """Return an archive of a dataclass of numbers, strings, arrays, bytes and other dataclasses."""
     data, places = bytearray(), dict[int, dict[str, Any]]()
 
     def place(item: Any) -> Any:
-        """Convert what JSON lacks."""
+        """Convert a value that JSON lacks."""
         if isinstance(item, np.generic):
             return item.item()
         if id(item) not in places:
@@ -65,7 +65,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(archive: bytes, kind: type[T]) -> T:
-    """Return the dataclass of an archive.
+    """Return the dataclass in an archive.
 
     Raises:
         ValueError: The bytes are not an archive of this dataclass.

@@ -1,7 +1,7 @@
 """Compile Python functions with numba, which is imported on first use only, into a cache on disk.
 
-The machine code is that of x86-64-v3 on every processor that has it. An instruction-level fault
-then strikes the same instruction on a processor with AVX-512 and on one without.
+The code targets x86-64-v3 on every processor that supports it, so an instruction-level fault
+strikes the same instruction on a processor with AVX-512 and on one without.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).parents[1]
 _BLAS = "scipy.linalg.cython_blas"
-_LEVELS = {  # what each level of x86-64 adds, as Linux names it: System V ABI, section 3.1.1
+_LEVELS = {  # features that each level of x86-64 adds, in Linux's names: System V ABI, 3.1.1
     "x86-64-v2": "cx16 lahf_lm popcnt pni sse4_1 sse4_2 ssse3",
     "x86-64-v3": "abm avx avx2 bmi1 bmi2 f16c fma movbe xsave",
     "x86-64-v4": "avx512f avx512bw avx512cd avx512dq avx512vl",
@@ -54,7 +54,7 @@ def compiled(function: F) -> F:
 
 @functools.cache
 def processor_level() -> str:
-    """Return the level of x86-64 that this processor has, such as "x86-64-v3", or "" if unknown."""
+    """Return this processor's level of x86-64, such as "x86-64-v3", or "" if it is unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -71,7 +71,7 @@ def processor_level() -> str:
 def in_cache(kernel: Callable[..., Any]) -> bool:
     """Return True if a call of a compiled function would load its machine code from disk.
 
-    It is also True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call takes long.
+    Also return True if compilation is disabled (NUMBA_DISABLE_JIT), because then no call compiles.
     """
     cache_file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
     try:
@@ -83,8 +83,8 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 def _load_without_compiler(cache: Any) -> None:
     """Make numba load machine code without its compiler, and recompile damaged cache entries.
 
-    numba would load all that its compiler knows before it looks into the cache, which takes 0.4 s.
-    Machine code needs the runtime only, and the compiler loads what it needs itself.
+    numba would load its whole compiler before it checks the cache, which takes 0.4 s.
+    Machine code needs only the runtime, and the compiler loads what it needs itself.
     """
     from numba.core.runtime import rtsys
 
@@ -126,7 +126,7 @@ def _callees(function: Any) -> list[Any]:
 
 @functools.cache
 def folder_digest(folder: Path, *, deep: bool = False) -> str:
-    """Return the SHA-256 of names and contents of all Python sources in a folder.
+    """Return the SHA-256 of the names and contents of all Python sources in a folder.
 
     `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
     """
@@ -149,11 +149,11 @@ def own_digest() -> str:
 
 @functools.cache
 def choose_caches() -> None:
-    """Choose other caches where the defaults cannot be written, as in another user's installation.
+    """Choose other caches if the defaults are not writable, as in another user's installation.
 
-    Machine code stays beside the sources if they are writable. Otherwise it goes to
-    XDG_CACHE_HOME/mavfi, or else to a private folder for temporary files, which a line on stderr
-    names when it is made. Child processes inherit the choice through NUMBA_CACHE_DIR and
+    Machine code stays next to the sources if their folder is writable. Otherwise it goes to
+    XDG_CACHE_HOME/mavfi, or else to a private temporary folder, whose path is printed to stderr
+    when it is created. Child processes inherit the choice through NUMBA_CACHE_DIR and
     MPLCONFIGDIR. Writable folders that the user chose with these variables are kept.
     """
     beside = PACKAGE / "core" / "__pycache__"
@@ -168,13 +168,13 @@ def choose_caches() -> None:
 
 
 def _home(variable: str, name: str) -> Path:
-    """The user's cache folder by the XDG specification; relative if there is no home."""
+    """Return the user's folder for an XDG variable; relative if there is no home."""
     given = Path(os.environ.get(variable, ""))
     return given if given.is_absolute() else Path(os.path.expanduser("~"), name)
 
 
 def _folder() -> Path:
-    """The folder for both caches: the first that can be written."""
+    """Return the folder for both caches: the first candidate that is writable."""
     home = _home("XDG_CACHE_HOME", ".cache") / "mavfi"
     if home.is_absolute() and can_write(home):
         return home

@@ -23,9 +23,9 @@ def load_toml(path: Path, cls: type[T]) -> T:
     """Read a TOML file into the frozen dataclass `cls`.
 
     Raises:
-        ConfigError: The file cannot be read or parsed, a key is missing or has the wrong type, or
-            `cls` rejects a value (a ValueError from `__post_init__`) or has no such key. The
-            message names file, line and key, and the nearest key.
+        ConfigError: The file cannot be read or parsed, a key is missing or unknown, a value has the
+            wrong type, or `cls` rejects a value (a ValueError from `__post_init__`). The message
+            names file, line and key, and suggests the nearest known key.
     """
     data, text = read_toml(path)
     return structure(data, cls, path=path, text=text)
@@ -59,7 +59,7 @@ def toml_text(values: Mapping[str, Any]) -> str:
     """Write TOML that reads back as equal values; empty tables are left out.
 
     Args:
-        values: Texts, finite numbers, truth values, arrays of them, tables, and arrays of tables.
+        values: Strings, finite numbers, booleans, arrays of them, tables, and arrays of tables.
     """
     import tomli_w
 
@@ -87,7 +87,7 @@ class Shipped:
         return sorted(path.stem for path in self.folder.glob("*.toml"))
 
     def path(self, name_or_path: str) -> Path:
-        """Return the path of a shipped file by its name, or of a user's own file by its path.
+        """Return the path of a shipped file, given by name, or of a user's file, given by path.
 
         Raises:
             UnknownName: No shipped file has this name, and it is not a path to a TOML file.
@@ -106,7 +106,7 @@ class Shipped:
         """Return the `base` of a file if it names another shipped file.
 
         Raises:
-            ConfigError: It names no shipped file. The message suggests the nearest name.
+            ConfigError: It names no other shipped file. The message suggests the nearest name.
         """
         if name not in self.names or path == self.folder / f"{name}.toml":
             error = UnknownName(self.kind, str(name), set(self.names) - {path.stem})
@@ -133,10 +133,10 @@ def structure(
 def structure_record(data: Mapping[str, Any], cls: type[T]) -> T:
     """Build the dataclass `cls` from a section of a record.
 
-    Keys of other versions are ignored, and missing ones have their defaults.
+    Keys of other versions are ignored, and missing ones get their defaults.
 
     Raises:
-        ValueError: A value has the wrong type, or a field without default is missing.
+        ValueError: A value has the wrong type, or a field without a default is missing.
     """
     try:
         return _RECORDS.structure(data, cls)
@@ -179,7 +179,7 @@ def _strict(kind: type, *accepted: type) -> Any:
 
 def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = None) -> Any:
     def hook(value: Any, cls: Any) -> Any:
-        """Raise TypeError for the wrong type or length. A text is not an array of letters."""
+        """Raise TypeError for the wrong type or length. A string does not count as an array."""
         if not isinstance(value, accepted):
             raise TypeError(f"must be {wanted}, got {value!r}")
         if length is not None and len(value) != length:
@@ -196,7 +196,7 @@ def _converter(*, forbids_others: bool) -> cattrs.Converter:
     converter = cattrs.Converter()
     for kind, *accepted in ((float, int), (int,), (bool,), (str,)):
         converter.register_structure_hook(kind, _strict(kind, *accepted))
-    arrays: set[Any] = set()  # types of arrays whose hook is being made
+    arrays: set[Any] = set()  # array types whose hook is being made
 
     @converter.register_structure_hook_factory(dataclasses.is_dataclass)
     def table(cls: Any) -> Any:
@@ -240,11 +240,11 @@ def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
 
 
 def _line_of(text: str, key: str) -> int | None:
-    """Find the line that sets a dotted key, or the head of its table, by a search of the text."""
+    """Find the line that sets a dotted key, or the header of its table, by searching the text."""
     section, _, last = key.rpartition(".")
     last = last.partition("[")[0]
     current, head = "", None
-    counts: dict[str, int] = {}  # tables so far of each array of tables
+    counts: dict[str, int] = {}  # index of the newest table in each array of tables
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
         if stripped.startswith("["):
@@ -258,7 +258,7 @@ def _line_of(text: str, key: str) -> int | None:
 
 
 def _table_of(head: str, counts: dict[str, int]) -> str:
-    """Return the name of the table that a head opens, with its place in an array of tables."""
+    """Return the name of the table that a header opens, with its index in an array of tables."""
     parts = head.strip("[ ").split("]")[0].split(".")
     names = [".".join(parts[: end + 1]).strip() for end in range(len(parts))]
     if head.startswith("[["):

@@ -18,17 +18,17 @@ class MavfiError(Exception):
 
 
 def described(error: BaseException) -> str:
-    """Return type and message of an error. A lone surrogate, which no file can hold, is escaped."""
+    """Return an error's type and message. A lone surrogate, which UTF-8 lacks, is escaped."""
     return f"{type(error).__name__}: {error}".encode(errors="backslashreplace").decode()
 
 
 def printable(text: str) -> str:
-    """Return a line without control characters, which a terminal could obey."""
+    """Return a line with its control characters, which a terminal could obey, replaced."""
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lack_of(error: Exception) -> str:
-    """Describe what is wrong with a file's contents, from the error that their use raised."""
+    """Describe what is wrong with a file's contents, from the error that using them raised."""
     match error:
         case KeyError():
             return f"it has no {error}"
@@ -61,7 +61,7 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """An unknown name, which is wrong usage. The message suggests the nearest known name."""
+    """An unknown name, a usage error. The message suggests the nearest known name."""
 
     exit_code = 2
 
@@ -70,7 +70,7 @@ class UnknownName(MavfiError):
 
 
 def named_member(kind: type[E], what: str, name: str | E) -> E:
-    """Return the member of an enumeration that has this value.
+    """Return the enumeration member with this value.
 
     Raises:
         UnknownName: No member has this value. The message suggests the nearest.
@@ -108,13 +108,13 @@ class WorldError(MavfiError):
 
 
 class PlaceError(WorldError):
-    """Start or goal is blocked or outside the world, which is wrong usage."""
+    """Start or goal is blocked or outside the world, a usage error."""
 
     exit_code = 2
 
 
 class LinkError(MavfiError):
-    """The MAVLink connection failed, cannot be opened, or leads to no usable vehicle."""
+    """The MAVLink connection failed, cannot be opened, or has no usable vehicle."""
 
 
 class NoAutopilot(LinkError):
@@ -175,7 +175,7 @@ class TargetError(FaultError):
 
 
 class BuildMismatch(FaultError):
-    """A fault record of another build. The message names every object that differs."""
+    """A fault record from another build. The message names every object that differs."""
 
     def __init__(self, differences: Iterable[str]) -> None:
         super().__init__(f"the record comes from another build: {'; '.join(differences)}")

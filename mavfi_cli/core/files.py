@@ -1,7 +1,7 @@
 """Files: atomic writes, bounded reads and scratch folders.
 
 A kill leaves the old file or the new one, never a partial one. A folder of results is untrusted:
-nothing is written through a link in it, and everything read from it has bounds.
+nothing is written through a link in it, and every read from it is bounded.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from typing import Any, BinaryIO
 from mavfi_cli.core.compiled import can_write
 from mavfi_cli.core.errors import RecordError, lack_of
 
-Json = dict[str, Any]  # an object of JSON, as plain values
-_LARGEST = 1 << 32  # bytes of a table
+Json = dict[str, Any]  # a JSON object, as plain values
+_LARGEST = 1 << 32  # largest table, bytes
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -43,7 +43,7 @@ def file_digest(name: str | Path) -> str:
 
 @contextlib.contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Turn an OSError of the block into a RecordError that names the path."""
+    """Turn an OSError in the block into a RecordError that names the path."""
     try:
         yield
     except OSError as error:
@@ -53,7 +53,7 @@ def writing(place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(place: Path) -> Iterator[None]:
-    """Turn the errors that damaged contents of a file cause into RecordError."""
+    """Turn errors that a file's damaged contents cause into RecordError."""
     try:
         yield
     except (
@@ -81,7 +81,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def read_json(path: Path, limit: int) -> Json:
-    """Read a JSON object from a file. Raises as `read_bounded`; RecordError if it is damaged."""
+    """Read a JSON object. Raises RecordError as `read_bounded` does, or if it is damaged."""
     with reading(path):
         value = json.loads(read_bounded(path, limit))
     if not isinstance(value, dict):
@@ -95,7 +95,7 @@ def open_own(path: Path, flags: int) -> int:
 
 
 def own_folder(path: Path) -> Path:
-    """Make a folder that mavfi owns unless it exists, and return its path.
+    """Create a folder that mavfi owns, unless it exists, and return its path.
 
     Raises:
         RecordError: It cannot be made, or something else has its name. A link to a folder is
@@ -131,8 +131,8 @@ _unsynced: set[Path] = set()
 def leave_unsynced(folder: Path) -> None:
     """Let this process and its forks write files below a folder without syncing them.
 
-    Use it if a power failure may damage the folder, because its files are removed, or kept after
-    `sync_folder`. A sync takes 10 to 300 ms, and nobody else works in this time.
+    Use it if the folder need not survive a power failure, because its files are removed, or kept
+    only after `sync_folder`. A sync takes 10 to 300 ms, and all other work waits for it.
     """
     _unsynced.add(folder.absolute())
 
@@ -157,7 +157,7 @@ def sync_folder(folder: Path) -> None:
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write to a temporary file in the same folder, sync it to disk, then rename it to `path`.
 
-    Files below a folder of `leave_unsynced` are not synced.
+    Files below a folder that was passed to `leave_unsynced` are not synced.
 
     Several processes may write the same file. Each uses a temporary file of its own, and the last
     rename wins.
@@ -183,21 +183,21 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 _SCRATCH, _OWNED = "mavfi-", ".mavfi-scratch"
 
-_TRIES = 10  # to remove a folder in which a program that is being killed may still write
+_TRIES = 10  # attempts to remove a folder, in which a dying program may still create files
 
 
 class ScratchFolder:
     """A private temporary folder that is removed however the process ends.
 
-    `close`, the end of the object or the end of the process removes it. A killed process leaves
-    it behind; the next process that makes a scratch folder in the same place removes it. A
+    It is removed by `close`, with the object, or when the process exits. A killed process leaves
+    it behind, and the next process that makes a scratch folder in the same place removes it. A
     lock on a file in the folder shows that the process, or a fork of it, is still running. A fork
     never removes the folder of its parent.
 
     As a context manager it returns the path.
 
     Args:
-        what: A word of its name, `mavfi-WHAT-...`.
+        what: A word in its name, `mavfi-WHAT-...`.
         parent: Folder to make it in, by default the temporary directory. Elsewhere its name begins
             with a dot.
 
@@ -224,7 +224,7 @@ class ScratchFolder:
 
 
 def _locked_folder(place: Path, prefix: str) -> tuple[Path, int]:
-    """Make a scratch folder; return it with the locked descriptor of the file in it."""
+    """Make a scratch folder; return it and the descriptor of the locked file in it."""
     while True:
         path = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
         lock = os.open(path / _OWNED, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -245,7 +245,7 @@ def _remove_scratch(path: Path, lock: int, owner: int) -> None:
 
 @cache
 def _remove_abandoned(place: Path) -> None:
-    """Remove this user's scratch folders of killed processes, once per process."""
+    """Remove this user's scratch folders that killed processes left, once per process."""
     for path in [*place.glob(f"{_SCRATCH}*"), *place.glob(f".{_SCRATCH}*")]:
         with contextlib.suppress(OSError):  # not ours, or its process is running
             about = path.lstat()

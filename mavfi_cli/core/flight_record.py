@@ -1,7 +1,7 @@
 """The sections of a result.json: a flight writes these types, and everything else reads them.
 
-A record of a mission that was cut off, or of an earlier version, lacks some of the fields, so every
-field has a default. docs/reference/records.md describes all of them.
+A record of a mission that was cut off, or from an earlier version, lacks some of the fields, so
+every field has a default. docs/reference/records.md describes all of them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from mavfi_cli.core.files import Json
 
-SCHEMA = 1  # of a result.json and of its fault
+SCHEMA = 1  # schema version of result.json and of its fault
 Point = tuple[float, float, float]  # ENU, m
 
 
@@ -45,7 +45,7 @@ class RecordedPlan:
     """The waypoints of a plan."""
 
     stamp_s: float = 0.0
-    points_enu_m: Any = ()  # (n, 3) lists; None stands for infinite or NaN
+    points_enu_m: Any = ()  # (n, 3) lists; None stands for infinity or NaN
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +62,7 @@ class ResponseTime:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelUse:
-    """Invocations of a kernel, inputs that a newer one replaced, and the time that it was busy."""
+    """Invocations of a kernel, inputs replaced by newer ones, and the time that it was busy."""
 
     invocations: int = 0
     dropped_inputs: int = 0
@@ -121,8 +121,8 @@ class Change:
 
     Attributes:
         index: Waypoint; 0 for messages without rows.
-        before, after: None in a record stands for infinite or NaN, which JSON lacks; the bits
-            `before_hex` and `after_hex` give it.
+        before, after: None in a record stands for infinity or NaN, which JSON lacks; `before_hex`
+            and `after_hex` have the bits.
     """
 
     state: str = ""
@@ -156,7 +156,7 @@ class Reader:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedTrigger:
-    """The trigger of a fault, with the time that was drawn for it, s after the take-over."""
+    """The trigger of a fault, and the time that was drawn for it, s after the take-over."""
 
     when: str = ""
     number: float = 0.0
@@ -174,7 +174,7 @@ class RecordedActivation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateFault:
-    """The record of a fault in a state, in the detector, or of a killed process.
+    """The record of a fault in a state or in the detector, or of a killed process.
 
     Attributes:
         reason: Why it was not injected.
@@ -203,7 +203,7 @@ class RecordedAlarm:
 
     Attributes:
         message: Kind of the message that raised it: report, plan, ahead (active plan) or tick.
-        recomputes: Recomputed stage if it is another than `stage`; else None, which is not written.
+        recomputes: Recomputed stage if it differs from `stage`; else None, which is not written.
     """
 
     stamp_s: float = 0.0
@@ -225,7 +225,7 @@ class RecordedRecovery:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
-    """The work of a detector in one flight.
+    """What a detector did in one flight.
 
     Attributes:
         checks: Number by kind of message.

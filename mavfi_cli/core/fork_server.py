@@ -1,29 +1,28 @@
-"""A process that loads everything once and forks a fresh worker for every order.
+"""A process that loads everything once and forks a fresh worker for every request.
 
     python -m mavfi_cli.core.fork_server FD MODULE
 
-    client ──► server: loads MODULE, never works
+    client ──► server: loads MODULE, performs no task
                   ├─ guard: parent, watch and reaper of one worker
                   │     └─ worker: MODULE.perform(task, folder)
                   └─ guard ...
 
 A worker is forked from a single-threaded process that has only loaded modules. It dies with its
 guard. When it ends or its time runs out, the guard kills every process that it started, and only
-then reports. When the client dies or closes the channel of an order, the guard kills the worker.
+then reports. When the client dies or closes the channel of a request, the guard kills the worker.
 Killing any process leaves no orphan and no blocked peer.
 
 The fork server of `multiprocessing` is not suitable: its children keep the server's pipe open, so a
 child that hangs outlives a killed client; every child imports the client's main module again;
-nothing reaps the processes that a child leaves; and daemonic processes, such as dask's workers, may
-not use it.
+nothing reaps the processes that a child leaves behind; and daemonic processes, such as dask's
+workers, may not use it.
 
-FD is a socket to the client. Every packet on it is an order in JSON, {"task", "folder", "limit_s",
-"forks", "cwd"}, with the descriptor of a channel. The worker works in the client's folder "cwd".
-The guard sends {"pid"} on this channel at the start, and {"exit" | "signal" | "timeout", "report",
-"wall_s"} at the end. A worker whose order has "forks"
-may fork itself in the middle of its task (`Forks`). The worker waits
-for its fork as a guard does, and sends the same message with the fork's {"key"}, or {"key",
-"unforked"} with the reason why it could not fork itself.
+FD is a socket to the client. Every packet on it is a JSON request, {"task", "folder", "limit_s",
+"forks", "cwd"}, with the descriptor of a channel. The worker runs in the client's working directory
+"cwd". The guard sends {"pid"} on this channel at the start, and {"exit" | "signal" | "timeout",
+"report", "wall_s"} at the end. A worker whose request sets "forks" may fork itself in the middle of
+its task (`Forks`). The worker waits for its fork as a guard does, and sends the same message with
+the fork's {"key"}, or {"key", "unforked"} with the reason why it could not fork.
 """
 
 from __future__ import annotations
@@ -65,11 +64,11 @@ ONE_THREAD = {
 """Environment of a process that forks itself, so that its libraries start no threads."""
 
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
-PACKET = 1 << 17  # largest order or report, bytes
+PACKET = 1 << 17  # largest request or report, bytes
 ERRORS, SCRATCH = "stderr.txt", "tmp"
-HALT = "halt"  # file in a worker's folder, after which it does not fork itself again
+HALT = "halt"  # file in a worker's folder that stops it from forking itself again
 _READY = b"ready"
-_STOP_S = 10.0  # time to end after `close`, before it is killed
+_STOP_S = 10.0  # time for the server to end after `close`, before it is killed
 _TRACEBACK = 8000  # trailing characters of a traceback that are reported
 _LONGEST_WAIT_S = 3600.0
 
@@ -79,10 +78,10 @@ class _Module(Protocol):
         """Load everything once, without starting a thread."""
 
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
-        """Do a task. Return the folder that it made in `folder`.
+        """Perform a task. Return the folder that it created in `folder`.
 
-        It gets its `Forks` as `forks` if the order allows it to fork itself. A fork returns the
-        folder that it made in its own.
+        It also gets the argument `forks`, a `Forks`, if the request allows it to fork itself. A
+        fork returns the folder that it created in the folder of the fork.
         """
 
 
@@ -103,7 +102,7 @@ class ForkServer:
         """Start a worker for a task. Return the channel on which its guard reports.
 
         Args:
-            folder: for the worker's results, its standard error and its temporary files.
+            folder: receives the worker's results, standard error and temporary files.
             forks: the worker may fork itself, and reports the ends of its forks too.
 
         Raises:
@@ -167,7 +166,7 @@ class ForkServer:
 
 
 def _serve() -> NoReturn:
-    """Load the module, then fork a guard for every order until the client closes its end."""
+    """Load the module, then fork a guard for every request until the client closes its end."""
     _call_this_process(SERVER)
     control = socket.socket(fileno=int(sys.argv[1]))
     gc.disable()  # imports leave few cycles, and collections took an eighth of the time
@@ -229,11 +228,11 @@ def _end_of(
     deadline_s: float,
     others: Sequence[int] = (),
 ) -> Json:
-    """Wait for the end of a worker and of its descendants. Return how it ended, and its report.
+    """Wait for a worker to end, and kill its descendants. Return how it ended, and its report.
 
     Args:
-        reading: end of the pipe from which its report is read.
-        others: children of this process that are not the worker's.
+        reading: read end of the pipe that carries its report.
+        others: children of this process that do not belong to the worker.
 
     Raises:
         ConnectionError: the client closed the channel.
@@ -293,7 +292,7 @@ def _report_of_worker(reading: int) -> Any:
 def _work(
     order: Mapping[str, Any], module: _Module, guard: int, writing: int, forks: Forks | None
 ) -> NoReturn:
-    """Run a worker, or the rest of the work of its fork."""
+    """Run a worker, or the rest of the task in its fork."""
     code, report = 1, {}
     try:
         _call_this_process(WORKER)
@@ -319,7 +318,7 @@ def _work(
 class Forks:
     """Lets a worker fork itself in the middle of its task, so that several tasks share a beginning.
 
-    The worker waits while its fork works: one process works at a time, and memory holds two.
+    The worker waits while its fork runs: only one process runs at a time, but both are in memory.
     """
 
     def __init__(self, folder: Path, channel: socket.socket, report: int) -> None:
@@ -327,14 +326,14 @@ class Forks:
         self._since_s = time.monotonic()
 
     def fork(self, key: int, folder: Path, limit_s: float) -> bool:
-        """Fork the worker. Return True in the fork; in the worker, return False after its end.
+        """Fork the worker. Return True in the fork, and False in the worker after the fork's end.
 
-        The fork ends by returning from `perform`. No fork is made after HALT, or if the system has
-        no memory or no process left, which the client learns from a message.
+        The fork ends by returning from `perform`. No fork is made if HALT exists, or if the system
+        has no memory or process left; a message reports the latter to the client.
 
         Args:
-            key: names the fork in the message about its end, which has the wall time since the
-                previous fork.
+            key: identifies the fork in the message about its end, which includes the wall time
+                since the previous fork.
             folder: as for `ForkServer.start`.
             limit_s: limit of the fork's wall time, s.
         """
@@ -371,7 +370,7 @@ class Forks:
 
 
 def _begin(folder: Path, parent: int) -> None:
-    """Make this process one that dies with its parent, in a process group of its own."""
+    """Give this process its own session and streams, and let it die with its parent."""
     os.setsid()
     die_with(parent)
     _isolate_streams(folder)
@@ -380,7 +379,7 @@ def _begin(folder: Path, parent: int) -> None:
 def _isolate_streams(folder: Path) -> None:
     """Give the worker its own streams and its own folder for temporary files.
 
-    It does not make `folder` again, which a client that ends may have removed.
+    It does not recreate `folder`, which a client that is exiting may have removed.
     """
     scratch = folder / SCRATCH
     scratch.mkdir(exist_ok=True)
@@ -399,7 +398,7 @@ def _isolate_streams(folder: Path) -> None:
 
 
 def die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends. Exit if it is already gone."""
+    """Have the kernel kill this process when its parent ends. Exit if that has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-# Limits along each axis of positions and velocities from a link. Maps end at 6.5 km.
+# Limits per axis for positions and velocities from a link. Maps end at 6.5 km.
 FARTHEST_M, FASTEST_MPS = 1e4, 1e3
 
 

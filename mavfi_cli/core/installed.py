@@ -34,10 +34,10 @@ def version_differences(recorded: Mapping[str, str], versions: Mapping[str, str]
 
 
 class PlugIns:
-    """The objects that mavfi and other packages register under an entry point.
+    """The objects that mavfi and other packages register in an entry-point group.
 
     Args:
-        group: Name of the entry point.
+        group: Name of the entry-point group.
         kind: Noun for such an object in error messages.
         ours: Names of mavfi's own objects, which need no entry point.
     """

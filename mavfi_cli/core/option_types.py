@@ -1,4 +1,4 @@
-"""Types of options: bounded numbers, and files and folders that a command writes."""
+"""Option types: bounded numbers, and files and folders that a command writes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Number(click.FloatRange):
 
 
 class _OutPath(click.Path):
-    """A path to write: not empty, which would mean the current folder.
+    """A path to write. It must not be empty, which would mean the current folder.
 
     Args:
-        require: rejects what cannot be written by a RecordError.
+        require: raises RecordError for a path that cannot be written.
     """
 
     def __init__(self, require: Callable[[Path], None], **kinds: bool) -> None:
@@ -47,14 +47,14 @@ class _OutPath(click.Path):
 
 
 class OutFolder(_OutPath):
-    """A folder for results, which is made if it does not exist."""
+    """A folder for results, which is created if it does not exist."""
 
     def __init__(self) -> None:
         super().__init__(require_folder, file_okay=False)
 
 
 class OutFile(_OutPath):
-    """A file to write, with one of some suffixes."""
+    """A file to write, with one of the given suffixes."""
 
     def __init__(self, suffixes: Sequence[str] = (), *, allow_dash: bool = False) -> None:
         def require(path: Path) -> None:

@@ -30,10 +30,10 @@ _libc = ctypes.CDLL(None)
 
 
 def fork(work: Callable[[], int] | None, *, exact: bool = False) -> int:
-    """Do work in a fork of this process. It exits with the returned code, or 1 on an error.
+    """Do work in a fork of this process. The fork exits with the returned code, or 1 on an error.
 
     Args:
-        work: Work of the fork. None lets the fork return from this call with the result 0.
+        work: What the fork runs. With None, this call returns 0 in the fork.
         exact: Skip Python's hooks, which draw new random numbers, so that every fork has the same
             memory. The process must have one thread.
 
@@ -57,7 +57,7 @@ def send(connection: socket.socket, value: Any) -> None:
 
 
 def value_of(message: bytes) -> Any:
-    """Return the value in the bytes that `send` has sent. Raises as `receive`."""
+    """Return the value in bytes that `send` has sent. Raises as `receive` does."""
     return _Values(io.BytesIO(message[_LENGTH:])).load()
 
 
@@ -66,7 +66,7 @@ def receive(connection: socket.socket) -> Any:
 
     Raises:
         EOFError: The other end has closed.
-        pickle.UnpicklingError: The value has a type that messages do not have.
+        pickle.UnpicklingError: The value has a type that messages do not contain.
     """
     size = int.from_bytes(_exactly(connection, _LENGTH), "little")
     return _Values(io.BytesIO(_exactly(connection, size))).load()
@@ -98,17 +98,17 @@ class _Values(pickle.Unpickler):
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, *axes: Any) -> Any:
     """Return an array with numpy's own object for a common dtype.
 
-    A pickle encodes which objects are identical. So the bytes of a message do not depend on
-    whether its arrays have been received.
+    A pickle encodes which objects are identical. Sharing numpy's object makes the bytes of a
+    message independent of whether its arrays have been received.
     """
     make = sys.modules["numpy._core.numeric"]._frombuffer
     return make(buffer, sys.modules["numpy"].dtype(dtype.str), shape, order, *axes)
 
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
-    """Receive into one buffer by one call, so that a node's memory is the same in every run.
+    """Receive into one buffer with one call, so that a node's memory is the same in every run.
 
-    Only a socket with a timeout, which no attacked node has, or a signal makes it several calls.
+    Only a signal, or a socket with a timeout, which no attacked node has, causes further calls.
     """
     data = bytearray(size)
     view, filled = memoryview(data), 0
@@ -155,7 +155,7 @@ def leave_network() -> bool:
         if _libc.unshare(_NEW_NETWORK | _NEW_USER) != 0:
             return False
         own = Path("/proc/self")
-        (own / "setgroups").write_text("deny")  # user_namespaces(7) asks for it
+        (own / "setgroups").write_text("deny")  # user_namespaces(7) requires it
         (own / "uid_map").write_text(f"{user} {user} 1")
         (own / "gid_map").write_text(f"{group} {group} 1")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:

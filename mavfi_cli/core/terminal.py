@@ -28,7 +28,7 @@ def echo(text: str, *, nl: bool = True) -> None:
 
 
 def echo_lines(lines: Iterable[str]) -> None:
-    """Print lines to stdout. A newline within a line is replaced as other control characters are.
+    """Print lines to stdout. Newlines within a line are replaced, like other control characters.
 
     Raises:
         OSError: Stdout cannot be written.
@@ -42,11 +42,11 @@ def note(text: str) -> None:
 
 
 def exit_code(program: Callable[[], object]) -> int:
-    """Call click's `main`, not standalone. Return its exit code.
+    """Call click's `main` in non-standalone mode. Return its exit code.
 
-    A known error, wrong usage (code 2) and output that cannot be written are printed in one line.
+    Known errors, usage errors (code 2) and failures to write output are each printed in one line.
     """
-    gc.set_threshold(100_000)  # imports leave few cycles, but the usual threshold looks for them
+    gc.set_threshold(100_000)  # imports leave few cycles, so frequent collections waste time
     try:
         code = program()
     except click.exceptions.Exit as left:
@@ -74,7 +74,7 @@ def exit_code(program: Callable[[], object]) -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process as `sys.exit` does, but free no objects, which would take a second."""
+    """End this process as `sys.exit` does, but without freeing objects, which takes a second."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

@@ -2,7 +2,8 @@
 
 Messages are frozen records in SI units, ENU world frame and FLU body frame. A state is a scalar, or
 one component of a vector, that one kernel passes to the next. fi, detect and report iterate over
-the table. All reads and writes of a state go through it, so only the table depends on its location.
+the table. All reads and writes of a state go through it, so only the table depends on where the
+state is stored.
 Source of the list: the paper, sections IV-C and V-A, and the messages of its released code
 (MAVBench/MAV_apps, branch mavfi).
 """
@@ -210,7 +211,7 @@ class State:
     source: str  # field of the message: a scalar, or an array with a row per waypoint or axis
     unit: str = "1"
     _: KW_ONLY
-    column: int | None = None  # of a waypoint, or of a vector
+    column: int | None = None  # index in a waypoint or vector
     dtype: DType = DType.FLOAT64
     group: str = ""  # states that the paper corrupts together, e.g. components of a velocity
     detected: bool = False  # True for the 13 inputs of the autoencoder
@@ -244,7 +245,7 @@ class State:
         return index if self.column is None else (index, self.column)
 
 
-_KINDS = [("position", "m")] * 3 + [("yaw", "rad")]  # of the columns of a waypoint
+_KINDS = [("position", "m")] * 3 + [("yaw", "rad")]  # kind and unit of each waypoint column
 _KINDS += [("velocity", "m/s")] * 3 + [("acceleration", "m/s^2")] * 3
 STATES: tuple[State, ...] = (
     State("time_to_collision", CollisionReport, "time_to_collision_s", "s", detected=True),

@@ -11,8 +11,8 @@ EVERY = 7  # ticks; coprime to the periods of camera and telemetry, so no phase 
 class WallClock:
     """Host seconds by name: the total and the newest measurement.
 
-    A stage that every tick has is sampled: it is measured in every seventh tick, which counts for
-    seven. Measuring all of them would take a twentieth of a flight.
+    A stage that runs in every tick is sampled: it is measured in every seventh tick, which counts
+    sevenfold. Measuring every tick would take a twentieth of a flight.
 
     Attributes:
         skipped_s: time that no measurement includes, because the whole flight waited.

@@ -1,8 +1,8 @@
-"""Encodes, decodes and signs MAVLink frames, on pymavlink's `common` dialect.
+"""Encodes, decodes and signs MAVLink frames, using pymavlink's `common` dialect.
 
 This module implements the frame layer (markers, lengths, checksum, signature), because pymavlink's
 generic parser is slower and loses the frames that follow a false marker in noise. Message classes,
-layouts and constructors are pymavlink's. The caller supplies the clock of signatures.
+layouts and constructors come from pymavlink. The caller supplies the clock for signatures.
 Sources: https://mavlink.io/en/guide/serialization.html for frames, and
 https://mavlink.io/en/guide/message_signing.html for signatures: a block of link id (1 byte),
 timestamp (6 bytes, 10 us units since 2015-01-01 UTC) and the first 6 bytes of
@@ -27,9 +27,9 @@ UNITS_PER_S = 100_000  # one unit is 10 us
 NEW_STREAM_SLACK = 60 * UNITS_PER_S  # maximum lag of a new stream's timestamp
 
 _TIMESTAMP_END = 2**48
-_LINK_ID = 0  # of our channel
+_LINK_ID = 0  # our channel's
 _RADIO_STATUS = (
-    109  # sent by telemetry radios, which hold no key; the guide recommends to accept it
+    109  # sent by telemetry radios, which hold no key; the guide recommends accepting it
 )
 
 MAX_FRAME_LENGTH = 10 + 255 + 2 + SIGNATURE_LENGTH
@@ -38,13 +38,13 @@ _MARKER = re.compile(rb"[\xfd\xfe]")
 _SIGNED = 0x01
 _INCOMPLETE = -1
 _OF_FRAME = ("_header", "_msgbuf", "_crc")  # attributes of a message that its frame determines
-_PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array is unpacked at once
+_PACKET = "ENCAPSULATED_DATA"  # half of all messages; its array is unpacked in one piece
 
 _KINDS: dict[int, _Kind] = {}
 
 
 def key_from_passphrase(passphrase: str) -> bytes:
-    """Return the 32-byte key of a passphrase, its SHA-256, as ground stations compute it."""
+    """Return the 32-byte key for a passphrase: its SHA-256, as ground stations compute it."""
     return hashlib.sha256(passphrase.encode()).digest()
 
 
@@ -53,7 +53,7 @@ class Signing:
 
     Args:
         key: 32 secret bytes, see `key_from_passphrase`.
-        clock: Function of seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
+        clock: Returns seconds since 1970 (`time.time`, or a fixed epoch plus simulated time).
     """
 
     def __init__(self, key: bytes, clock: Callable[[], float]) -> None:
@@ -70,7 +70,7 @@ class Signing:
         return block + self._digest(frame + block)
 
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
-        """Return True if a frame is authentic and not a replay, or a radio's report.
+        """Return True if a frame is authentic and not a replay, or is an unsigned RADIO_STATUS.
 
         Only authentic frames update the timestamps, so an attacker cannot block a stream.
         """
@@ -84,13 +84,13 @@ class Signing:
         return True
 
     def renew(self, frame: bytes, block: bytes) -> bytes:
-        """Return the signature block of a changed frame, with link id and time of the old block."""
+        """Return a changed frame's signature block, with the link id and timestamp of `block`."""
         return block[:7] + self._digest(frame + block[:7])
 
     def authenticates(self, data: bytes) -> bool:
         """Return True if data begins with a signed frame that is authentic and not a replay.
 
-        The frame is not remembered, so `accept` takes it afterwards.
+        The frame is not recorded, so a later `accept` does not reject it as a replay.
         """
         if len(data) < 3 or data[0] != _V2 or not data[2] & _SIGNED:
             return False
@@ -126,7 +126,7 @@ __all__ = ["MAX_FRAME_LENGTH", "Codec", "Message", "Signing", "dialect"]
 
 Message = Any  # an instance of one of pymavlink's generated message classes
 frame_of: Callable[[Message], bytes] = attrgetter("_msgbuf")
-"""Return the frame of a received message, as its `get_msgbuf`."""
+"""Return the frame of a received message, as its `get_msgbuf` does."""
 
 
 _MARKERS = _V1, _V2 = 0xFE, 0xFD
@@ -172,7 +172,7 @@ class _Kind:
             self._columns, self._arrays = lambda packet: (packet.seqnr, bytes(packet.data)), []
 
     def payload(self, message: Message) -> bytes:
-        """Return the payload of a message, without the zeros at its end."""
+        """Return the payload of a message without trailing zeros."""
         values = self._columns(message)
         if self._arrays:
             values = list(values)
@@ -199,11 +199,11 @@ class _Kind:
 
 
 def _received(cls: Any) -> Any:
-    """Return a subclass for received messages, which differs in its constructor only.
+    """Return a subclass for received messages that differs only in its constructor.
 
     The constructor takes _OF_FRAME and the fields in wire order. It is generated, like those of
-    dataclasses. With pymavlink's, a frame takes a third longer to decode, because every message
-    then gets an empty header and attributes that are equal in the whole class.
+    dataclasses. With pymavlink's constructor a frame takes a third longer to decode, because every
+    message gets an empty header and attributes that are the same for the whole class.
     """
     kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
     blank = vars(cls(*(b"" if kind == "char" else 0 for kind in cls.fieldtypes)))
@@ -260,7 +260,7 @@ class Codec:
 
         Raises:
             struct.error, OverflowError: A field does not fit its type.
-            ValueError: The message is not one of the dialect.
+            ValueError: The message does not belong to the dialect.
         """
         kind = _KINDS.get(type(message).id) or _kind(type(message).id)
         if kind is None:
@@ -280,7 +280,7 @@ class Codec:
         """Return the messages that `data` completes, oldest first. Never raises.
 
         A false marker costs one byte, but not the frames after it. A frame may continue in the next
-        call unless `datagram` is set, which means that frames end at the end of the data.
+        call unless `datagram` is set; then no frame extends beyond `data`.
         """
         buffer = self._rest + data if self._rest else bytes(data)
         messages: list[Message] = []
@@ -306,9 +306,9 @@ class Codec:
     def _take(self, buffer: bytes, start: int, end: int, messages: list[Message]) -> bool:
         """Append the message of a candidate frame. Return False if its checksum is wrong.
 
-        The checksum includes a byte that is unknown for an id that the dialect lacks, so noise
-        passes the check once in 256 times. Such a frame must also be followed by another frame or
-        the end.
+        The checksum includes a byte that depends on the message definition. It is unknown if the
+        dialect lacks the id, so noise passes the check once in 256 times. Such a frame must also be
+        followed by another frame or the end of the data.
         """
         frame = buffer[start:end]
         if frame[0] == _V2:
@@ -356,12 +356,13 @@ class Codec:
 
 
 def renewed(message: Message, signing: Signing | None = None) -> Message | None:
-    """Return a received message, whose fields were changed, with a frame that is valid again.
+    """Rebuild the frame of a received message whose fields were changed.
 
-    The header stays. Checksum and signature are recomputed. Fields that the dialect lacks are lost.
+    Length, checksum and signature are recomputed, and the rest of the header stays. Fields that the
+    dialect lacks are lost.
 
     Returns:
-        None if the frame is signed and there is no key.
+        The message, or None if its frame is signed and there is no key.
     """
     old, kind = frame_of(message), _kind(type(message).id)
     assert kind is not None
@@ -379,13 +380,13 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
 
 
 def begins_with_frame(data: bytes) -> bool:
-    """Return True if data begins with a whole frame of the dialect whose checksum is right."""
+    """Return True if data begins with a whole frame of the dialect with a correct checksum."""
     length = frame_length(data, 0, len(data)) if data[:1] in (b"\xfd", b"\xfe") else 0
     return length > 0 and bool(Codec(0, 0).decode(data[:length], datagram=True))
 
 
 def frame_length(buffer: bytes, position: int, end: int) -> int:
-    """Return the length of a frame that starts here, _INCOMPLETE, or 0 if none can start here."""
+    """Return the length of the frame at a position, _INCOMPLETE, or 0 if none can start there."""
     if end - position < 3:
         return _INCOMPLETE
     length = buffer[position + 1] + 8
@@ -397,8 +398,8 @@ def frame_length(buffer: bytes, position: int, end: int) -> int:
     return length if position + length <= end else _INCOMPLETE
 
 
-# Messages of MAVLink's newer definitions that pymavlink's `common` dialect lacks. Fields are those
-# of the wire, in its order. Source: https://mavlink.io/en/messages/common.html.
+# Messages from newer MAVLink definitions that pymavlink's `common` dialect lacks. Fields are in
+# wire order. Source: https://mavlink.io/en/messages/common.html.
 
 _TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "s": "char"}
 
@@ -406,7 +407,7 @@ _TYPES = {"B": "uint8_t", "H": "uint16_t", "I": "uint32_t", "s": "char"}
 def _message_class(number: int, name: str, crc_extra: int, **layout: str) -> Any:
     """Return a message class that the codec treats as one of the dialect's.
 
-    The layout has the fields with their codes of `struct`.
+    The layout maps each field to its `struct` code.
     """
     names = list(layout)
     types = [_TYPES[code[-1]] for code in layout.values()]
@@ -460,14 +461,14 @@ STATE_STREAMS = (
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
 )  # fmt: skip
 
-CHUNK_LENGTH = 50  # characters of a STATUSTEXT
+CHUNK_LENGTH = 50  # characters per STATUSTEXT
 
 
 def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Message]:
-    """Yield the STATUSTEXTs of a text in ASCII, with a MAV_SEVERITY and an id in 1 .. 65535.
+    """Yield the STATUSTEXTs of an ASCII text, with a MAV_SEVERITY and an id in 1 .. 65535.
 
-    A text that fits into one message has id 0. A longer one is sent in chunks with the id, the last
-    of which is shorter than CHUNK_LENGTH (https://mavlink.io/en/messages/common.html#STATUSTEXT).
+    A text that fits into one message has id 0. A longer one is sent in chunks that share the id;
+    the last is shorter than CHUNK_LENGTH (https://mavlink.io/en/messages/common.html#STATUSTEXT).
     """
     if len(data) <= CHUNK_LENGTH:
         yield dialect.MAVLink_statustext_message(severity, data)

@@ -72,7 +72,7 @@ class Commands:
         self._lanes: dict[tuple[int, int], deque[Ticket]] = {}
         self._requested: dict[
             int, tuple[Ticket, float]
-        ] = {}  # message id -> request, next one's time
+        ] = {}  # message id -> request, earliest time of the next
         self.begin()
 
     def submit(
@@ -85,7 +85,7 @@ class Commands:
     ) -> Ticket:
         """Queue a COMMAND_LONG with its first parameters; the others are set to `unused`.
 
-        After up to `refusals` temporary refusals the command is repeated, 1 s later.
+        After a temporary refusal the command is repeated 1 s later, at most `refusals` times.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(
@@ -99,7 +99,7 @@ class Commands:
         return ticket
 
     def acknowledge(self, message: Message) -> None:
-        """Handle a COMMAND_ACK. Acknowledgements of foreign commands are ignored."""
+        """Handle a COMMAND_ACK. Acknowledgements of other senders' commands are ignored."""
         if message.target_system not in (0, self._own[0]):
             return
         if message.target_component not in (0, self._own[1]):
@@ -140,7 +140,7 @@ class Commands:
     # Requests of the current phase
 
     def begin(self) -> None:
-        """Begin a phase and forget the requests of the last one."""
+        """Begin a phase and discard the requests of the previous one."""
         self._ticket: Ticket | None = None  # the command that the phase depends on
         self._decided_s: float | None = None
         self._mode_since_s, self._mode_tries = -math.inf, 0
@@ -186,7 +186,7 @@ class Commands:
     def request_mode(self, mode: str) -> bool:
         """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
 
-        Raises CommandRefused if it did not change after the maximum number of requests.
+        Raises CommandRefused if the mode has not changed after the maximum number of requests.
         """
         if self._telemetry.mode == mode:
             return True

@@ -44,9 +44,9 @@ class Endpoint:
     fd: int = -1
 
     def open_socket(self, *, beyond: bool) -> socket.socket:
-        """Open the bound or connected socket of a network URL, `beyond` this machine if allowed.
+        """Open a network URL's bound or connected socket. `beyond` allows leaving this machine.
 
-        Raises LinkError as `open_transport`.
+        Raises LinkError as `open_transport` does.
         """
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
@@ -158,11 +158,11 @@ class SenderSlot(Generic[Sender]):
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.holder: Sender | None = None  # the current sender
-        # A sender that sent while the place was taken, before the holder sent again. It is not the
-        # holder after a restart at another port.
+        # A sender that sent while the place was taken, if the holder has sent since. So it is not
+        # the holder itself, restarted on another port.
         self.rival: Sender | None = None
         self._challenger: Sender | None = None
-        self._silent_from_s = 0.0  # the holder has been silent for too long
+        self._silent_from_s = 0.0  # when the holder will have been silent for too long
 
     @property
     def is_free(self) -> bool:
@@ -175,7 +175,7 @@ class SenderSlot(Generic[Sender]):
         self.refresh(sender)
 
     def leave(self, sender: Sender) -> None:
-        """Free the place if a sender holds it."""
+        """Free the place if `sender` holds it."""
         if sender == self.holder:
             self.holder = None
 
@@ -189,5 +189,5 @@ class SenderSlot(Generic[Sender]):
         return True
 
     def challenge(self, sender: Sender) -> None:
-        """Record that a second sender uses the address of a known one."""
+        """Record that another sender has sent while the place is taken."""
         self._challenger = sender

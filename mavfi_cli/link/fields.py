@@ -1,7 +1,7 @@
 """The numeric fields of MAVLink messages as states that a fault can strike.
 
 A state is named MESSAGE.FIELD, or MESSAGE.FIELD[INDEX] for an element of an array. The elements of
-an array are a group, and so are the fields whose names differ in a last x, y or z only.
+an array form a group, and so do fields whose names differ only in a final x, y or z.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mavfi_cli.link.codec import ADDED, Message, dialect
 
 _TYPES = {"float": DType.FLOAT32, "double": DType.FLOAT64, "uint8_t_mavlink_version": DType.UINT8}
 _SETPOINTS = ("SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT")
-# Bits of their type_mask, which make the autopilot ignore a field; see POSITION_TARGET_TYPEMASK.
+# Bits of their type_mask that make the autopilot ignore a field; see POSITION_TARGET_TYPEMASK.
 _IGNORED = {
     "x": 1, "y": 2, "z": 4, "lat_int": 1, "lon_int": 2, "alt": 4, "vx": 8, "vy": 16, "vz": 32,
     "afx": 64, "afy": 128, "afz": 256, "yaw": 1024, "yaw_rate": 2048,
@@ -46,7 +46,7 @@ class _WireState(State):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireFields:
-    """A message of MAVLink, and its numeric fields as states by name."""
+    """A MAVLink message, and its numeric fields as states by name."""
 
     name: str
     number: int  # message id

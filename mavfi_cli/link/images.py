@@ -30,8 +30,8 @@ NOTHING = 255  # pixel value where nothing was in range
 _NARROWEST_RAD, _WIDEST_RAD = 0.005, 3.13  # accepted fields of view
 _OPEN_FRAMES = 3  # newest frames, by index, that may still be completed
 _FIRST_PLACES = 16  # places whose packets are kept before the size of a frame is known
-_COPY = 4  # largest number of messages from a packet to its copy
-_STRAY = 8  # messages of other frames among those of a frame
+_COPY = 4  # largest distance, in messages, from a packet to its duplicate
+_STRAY = 8  # maximum number of other frames' messages among those of a frame
 _TRIALS = 64  # combinations of packets that are tried against the checksum of one frame
 _LARGEST_GAP = 10_000  # a larger jump of the index means a restarted camera
 _REMEMBERED = 64  # indices of finished frames
@@ -53,9 +53,9 @@ class ImageFrame:
     def depth_frame(
         self, state: VehicleState, *, hfov_rad: float, mount_offset_flu_m: FloatArray
     ) -> DepthFrame:
-        """Convert to metres and add the pose of the camera at the capture.
+        """Convert to metres and add the camera's pose at the time of capture.
 
-        The state is that at the image's stamp. The field of view is used if the image has none. The
+        `state` is the state at the image's stamp. `hfov_rad` is used if the image has none. The
         offset (3,) is that of the optical centre; the camera looks along the vehicle's x axis.
         """
         offset_m = rotate(rotation_matrix(state.quaternion), mount_offset_flu_m)
@@ -93,13 +93,13 @@ _Packet = tuple[int, bytes]  # count of messages at its arrival, data
 class ImageReceiver:
     """Assembles frames from messages.
 
-    A lost packet loses only its own frame. A frame whose checksum never matches is dropped.
+    A lost packet costs only its own frame. A frame whose checksum never matches is dropped.
     Memory is bounded by a few frames of MAX_PIXELS for any input.
 
     Once there are packets for all places, two candidates are checked against the checksum of each
-    announced frame. The first takes for each place the packet nearest to its due time after the
-    announcement, which is right if neighbouring frames interleave slightly. The second takes the
-    newest packet of each place, which is right if one frame is reordered in any way.
+    announced frame. For each place, the first takes the packet nearest to its due time after the
+    announcement, which is correct if neighbouring frames interleave slightly. The second takes the
+    newest packet of each place, which is correct for any reordering within one frame.
     """
 
     def __init__(self) -> None:
@@ -129,11 +129,11 @@ class ImageReceiver:
         return self._lost_before + counted - whole - len(self._open)
 
     def feed(self, message: Message) -> list[ImageFrame]:
-        """Handle one of IMAGE_MESSAGES. Return the frames that it completes, mostly none."""
+        """Handle one of IMAGE_MESSAGES. Return the frames that it completes, usually none."""
         return _HANDLERS[type(message).id](self, message)
 
     def _field_of_view(self, message: Message) -> list[ImageFrame]:
-        """Set the field of view of a CAMERA_INFORMATION: 2 atan(sensor width / 2 focal length)."""
+        """Set the field of view from CAMERA_INFORMATION: 2 atan(sensor width/(2 focal length))."""
         if message.focal_length > 0.0:
             hfov_rad = 2.0 * math.atan(message.sensor_size_h / (2.0 * message.focal_length))
             if _NARROWEST_RAD <= hfov_rad <= _WIDEST_RAD:
@@ -222,7 +222,7 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
-        """Return the pixels of the nearest or newest packets that match the checksum, or None."""
+        """Return the nearest or newest packets' pixels if they match the checksum, else None."""
         newest = [self._packets[place][-1] for place in range(shape.packets)]
         nearby = [
             min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])
@@ -232,7 +232,7 @@ class ImageReceiver:
         early = frame.due <= self._count < end
         if early and frame.trials_left <= _TRIALS // 2 and max(off for off, _ in nearby) > _STRAY:
             frame.waits_until = end - _STRAY
-            return None  # half of the trials wait for packets that have not arrived
+            return None  # half of the trials are reserved for packets that have not arrived
         nearest = [packet for _, packet in nearby]
         for packets in (nearest,) if nearest == newest else (nearest, newest):
             frame.trials_left -= 1
@@ -249,9 +249,9 @@ class ImageReceiver:
         return None
 
     def _forget(self, frame: _Announced, packets: list[_Packet]) -> None:
-        """Keep packets of a completed frame that belong to another one by their due time.
+        """Remove a complete frame's packets, except those whose due time fits another frame better.
 
-        Frames may exchange packets with equal pixels, such as the sky.
+        Frames may be completed with each other's packets if the pixels are equal, as in the sky.
         """
         for place, packet in enumerate(packets):
             held, since = self._packets[place], packet[0] - place
@@ -271,7 +271,7 @@ _HANDLERS: dict[int, Callable[[ImageReceiver, Message], list[ImageFrame]]] = {
     dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED: ImageReceiver._captured,
     dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION: ImageReceiver._field_of_view,
 }
-IMAGE_MESSAGES = frozenset(_HANDLERS)  # ids of the messages that a receiver takes
+IMAGE_MESSAGES = frozenset(_HANDLERS)  # ids of the messages that a receiver handles
 
 
 def _shape_of(message: Message) -> _Shape | None:

@@ -1,9 +1,9 @@
-"""The peers at several endpoints: receives from and sends to them in turn, in bounded time.
+"""Serves the peers at several endpoints in turn, receiving and sending in bounded time.
 
 A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
-the number of peers and of their waiting bytes. The source address of a datagram may be forged, and
+the number of peers and their waiting bytes. The source address of a datagram may be forged, and
 replies then reach a host that has sent nothing. So a UDP peer gets all messages only for a short
-time after a valid frame, then fewer and fewer. It is forgotten after 30 s of silence.
+time after a valid frame, then fewer and fewer. It is removed after 30 s of silence.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Peer(ABC):
         """Handle received bytes. Return the valid messages among them."""
 
     def forward(self, *, frame: bytes, sender: Peer) -> bool:
-        """Send a frame of another peer unchanged. Return False for the peer's own."""
+        """Send another peer's frame unchanged. Return False for this peer's own frame."""
         if sender is self:
             return False
         self.transport.send(frame)
@@ -79,16 +79,16 @@ class Peers(Generic[P]):
         self._signing, self._allow_unsigned, self._clock = signing, allow_unsigned, clock
         self._endpoints: list[tuple[str, Listener, Callable[[Transport], P]]] = []
         self._peers: list[P] = []
-        self._receive_turn = self._send_turn = 0  # index of the peer that was last
+        self._receive_turn = self._send_turn = 0  # index of the peer served last
         self.over = False  # True once an inherited connection has closed
-        self.lost: LinkLost | None = None  # of the only peer of an endpoint that calls
+        self.lost: LinkLost | None = None  # loss of the only peer of an endpoint that connects
 
     def __iter__(self) -> Iterator[P]:
         """Iterate over the present peers. Peers may leave during the iteration."""
         return iter(list(self._peers))
 
     def open(self, endpoint: str | Transport, make: Callable[[Transport], P]) -> Listener:
-        """Open an endpoint, whose transports `make` turns into peers. On an error, close all.
+        """Open an endpoint. `make` turns its transports into peers. An error closes all endpoints.
 
         Args:
             endpoint: URL, or an open transport.
@@ -135,10 +135,10 @@ class Peers(Generic[P]):
             self._call(action, peer)
 
     def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
-        """Call a function that sends for every peer in turn, and for a silent UDP peer less often.
+        """Call a sending function for each peer in turn, but less often for a silent UDP peer.
 
-        The intervals of a silent peer double. Once the time is over, the remaining peers wait for
-        the next call, which begins with them. The function returns False if it had nothing to send.
+        The intervals of a silent peer double. After `until_s` the remaining peers wait for the next
+        call, which begins with them. The function returns False if it had nothing to send.
         """
         for _ in range(len(self._peers)):
             if not self._peers:
@@ -167,11 +167,11 @@ class Peers(Generic[P]):
                 fresh.append(peer)
         self._peers += fresh
         for peer in fresh:
-            self._receive(peer)  # at once, else a replay of its signed frame would be as new
+            self._receive(peer)  # now, or a replay of its signed frame would seem new
             peer.full_rate_s = _AFTER_FIRST_S
 
     def _receive(self, peer: P) -> bool:
-        """Handle a few waiting bytes of a peer. Return True if there were any."""
+        """Handle some of a peer's waiting bytes. Return True if there were any."""
         data = self._call(lambda peer: peer.transport.receive(0.0), peer)
         if data and self._call(lambda peer: peer.take(data), peer):
             peer.last_received_s, peer.full_rate_s = self._clock(), _AFTER_LATER_S
@@ -196,6 +196,6 @@ class Peers(Generic[P]):
 
 
 def _is_due(peer: Peer, now_s: float) -> bool:
-    """Return True unless a silent UDP peer has waited for less than half of its silence."""
+    """Return False if a silent UDP peer was sent a message in the last half of its silence."""
     silent_s, unsent_s = now_s - peer.last_received_s, now_s - peer.last_sent_s
     return peer.scheme != "udpin" or silent_s <= max(peer.full_rate_s, 2.0 * unsent_s)

@@ -1,7 +1,7 @@
 """Passes MAVLink frames between an autopilot and the programs of a companion, byte for byte.
 
-Every frame of one side reaches the other side. Frames of a program also reach the other programs of
-the companion, as on a real autopilot's link. An owner may replace frames on their way.
+Every frame from one side reaches the other side. Frames from a program also reach the companion's
+other programs, as on a real autopilot's link. The owner may replace frames in transit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Side(Enum):
 
 
 Pass = Callable[[Message, Side], Iterable[bytes]]
-"""Returns the frames that go on in place of a message: its own frame, others, or none."""
+"""Returns the frames to forward in place of a message: its own frame, others, or none."""
 
 
 class _Program(Peer):
@@ -51,7 +51,7 @@ class Router:
         companion: URL of the companion's link; a listening one takes several programs. An open
             transport takes one.
         passes: Decides which frames to pass on; None passes every frame.
-        signing: Refuses frames without a good signature, on both sides.
+        signing: Rejects frames without a valid signature, on both sides.
         allow_unsigned: Allow an unsigned link to reach beyond this machine.
 
     Attributes:
@@ -82,11 +82,11 @@ class Router:
         """Wait for frames, then pass on those that have arrived.
 
         Args:
-            timeout_s: Longest wait for a first frame, s.
+            timeout_s: Longest wait for the first frame, s.
             until_s: Monotonic time after which remaining frames wait for the next turn.
 
         Raises:
-            LinkLost: The autopilot, or a companion at an endpoint that calls, closed its link.
+            LinkLost: The autopilot, or a companion at an endpoint that connects, closed its link.
         """
         self.peers.wait(timeout_s)
         self.peers.serve(until_s)
@@ -101,7 +101,7 @@ class Router:
             self.send(frame, sender.side, sender)
 
     def send(self, frame: bytes, side: Side, sender: Any = None) -> None:
-        """Send a frame as if a side had sent it."""
+        """Send a frame as if it came from `side`."""
 
         def forward(peer: _Program) -> None:
             if peer is not sender and not side is peer.side is Side.AUTOPILOT:

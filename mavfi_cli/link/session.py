@@ -1,7 +1,7 @@
 """The companion's MAVLink session as a state machine without sockets or clock.
 
 Lockstep, real time and tests drive it the same way. Call `handle` with every received message, then
-`tick` with the stamp, and send the messages that `tick` returns in their order.
+`tick` with the stamp, and send the messages that `tick` returns, in order.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the 
 
 
 def _float32(vector: Sequence[float]) -> Sequence[float]:
-    """Return a vector's numbers, or infinity for those beyond float32; NaN stays NaN."""
+    """Return a vector with infinity in place of numbers beyond float32; NaN stays NaN."""
     if sum(map(abs, vector)) <= _LARGEST_FLOAT32:
         return vector
     return [
@@ -78,8 +78,8 @@ class SessionSettings:
     system: int = 1  # system id of the companion, equal to the vehicle's
     component: int = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
     takeoff_height_m: float = 2.5  # above the ground at take-off
-    request_streams: bool = True  # request message streams; lockstep sends them anyway
-    needs_camera: bool = False  # wait for a camera, and for the origin that it may know
+    request_streams: bool = True  # request message streams; a lockstep peer sends them anyway
+    needs_camera: bool = False  # wait for a camera, and for the origin that it may report
     state_rate_hz: float = 50.0
     connect_timeout_s: float = 10.0
     camera_timeout_s: float = 5.0
@@ -109,7 +109,7 @@ class OffboardSession:
         self.telemetry = telemetry or Telemetry()
         self.phase, self._step = Phase.CONNECTING, _STEPS[Phase.CONNECTING]
         self.failure: LinkError | None = None  # cause of the phase FAILED
-        # Why the autopilot no longer follows: it changed its mode or disarmed. Never reset.
+        # Why the autopilot no longer follows setpoints: mode change or disarming. Never reset.
         self.failsafe_text: str | None = None
         own = self._settings.system, self._settings.component
         self._commands = Commands(*own, self.telemetry)
@@ -148,7 +148,7 @@ class OffboardSession:
         yaw_enu_rad: float | None = None,
         acceleration_enu_mps2: Sequence[float] | None = None,
     ) -> None:
-        """Set velocity (3,), yaw and feed-forward acceleration (3,) from the next tick on.
+        """Set velocity (3,), yaw and feed-forward acceleration (3,), starting with the next tick.
 
         A value beyond float32 becomes infinity, as in a C++ companion, and NaN stays NaN. The
         autopilot decides how to handle a corrupted command. Without a yaw the heading is kept.
@@ -166,7 +166,7 @@ class OffboardSession:
         self._target = (mask, 0.0, 0.0, 0.0, north, east, -up, ax, ay, -az, yaw, 0.0)
 
     def hold(self) -> None:
-        """Hold position and heading from the next tick on."""
+        """Hold position and heading, starting with the next tick."""
         self.set_target((0.0, 0.0, 0.0))
 
     def announce(self, text: str) -> None:
@@ -176,21 +176,21 @@ class OffboardSession:
         self._answers += text_messages(dialect.MAV_SEVERITY_WARNING, data, self._texts)
 
     def start_camera(self, interval_s: float) -> None:
-        """Request a frame from the camera every `interval_s`, without end."""
+        """Request a frame from the camera every `interval_s`, indefinitely."""
         self._commands.submit(
             dialect.MAV_CMD_IMAGE_START_CAPTURE, 0.0, interval_s, 0.0, 0.0,
             component=CAMERA, unused=math.nan, refusals=3,
         )  # fmt: skip
 
     def request_land(self) -> None:
-        """Land at the current position and disarm. Before arming, end the session at once."""
+        """Land at the current position and disarm. Before arming, this ends the session at once."""
         if self.phase not in (Phase.LANDING, Phase.DONE):
             self._enter(Phase.LANDING)
 
     # Received messages --------------------------------------------------------------------------
 
     def handle(self, message: Message) -> None:
-        """Handle a message of the autopilot or its camera. Other senders are ignored."""
+        """Handle a message from the autopilot or its camera. Other senders are ignored."""
         telemetry, number = self.telemetry, type(message).id
         telemetry.handle(message)
         if number not in _HANDLED:
@@ -215,7 +215,7 @@ class OffboardSession:
             self._answers.append(reply)
 
     def _handle_camera(self, number: int, message: Message) -> None:
-        """Handle a message of the camera, which runs the referee of a foreign autopilot."""
+        """Handle a message from the camera, which runs the referee for a foreign autopilot."""
         if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET:
             if self.phase is Phase.CONNECTING:  # a later origin would displace a flying vehicle
                 origin = np.array([message.y, message.x, -message.z], dtype=np.float64)
@@ -229,7 +229,7 @@ class OffboardSession:
                 self._request_origin()
 
     def _request_origin(self) -> None:
-        """Request the origin, or the camera's information if positions are the world's."""
+        """Request the origin, or CAMERA_INFORMATION if positions are already in the world frame."""
         wanted = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
         if self._settings.needs_camera:
             wanted = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET
@@ -241,9 +241,9 @@ class OffboardSession:
     def tick(self, stamp_s: float) -> list[Message]:
         """Advance to a stamp. Return the messages to send; the setpoint of this stamp is the last.
 
-        Every tick has a setpoint, because OFFBOARD requires setpoints before its entry and a
-        lockstep peer waits for them. ArduCopter is the exception: it has no such handshake and
-        aborts a take-off at a setpoint, so it gets setpoints only in the OFFBOARD phase.
+        Every tick has a setpoint, because OFFBOARD requires setpoints before it is entered and a
+        lockstep peer waits for them. ArduCopter is the exception: it has no such handshake, and a
+        setpoint aborts its take-off, so it gets setpoints only in the OFFBOARD phase.
         """
         self._now_s = self.telemetry.now_s = self._commands.now_s = stamp_s
         if self._phase_since_s is None:

@@ -2,7 +2,7 @@
 
 Autopilots differ in mode numbers and take-off procedure. Sources: PX4's px4_custom_mode.h (main
 mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's mode numbers; both confirmed with
-messages of PX4 1.17 and ArduCopter 4.5.
+messages from PX4 1.17 and ArduCopter 4.5.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mavfi_cli.link.endpoint import TWO_AUTOPILOTS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _AutopilotProfile:
-    """Modes and command conventions of one autopilot, a table of `autopilots.toml`."""
+    """Modes and command conventions of one autopilot, from a table in `autopilots.toml`."""
 
     name: str
     modes: dict[str, int]  # mode name -> HEARTBEAT.custom_mode
@@ -46,7 +46,7 @@ class _AutopilotProfile:
     arming_modes: list[str]  # modes that allow arming; the session requests the first
     takeoff_amsl: bool  # NAV_TAKEOFF altitude is above sea level instead of above home
     unused: float  # value of an unused command parameter
-    early_setpoints: bool  # requires setpoints before the mode; False: they would abort take-off
+    early_setpoints: bool  # requires setpoints before offboard; False: they would abort take-off
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a HEARTBEAT.custom_mode, or "mode N" if it is unknown."""
@@ -75,7 +75,7 @@ _COPTERS = (
 AUTOPILOT: int = dialect.MAV_COMP_ID_AUTOPILOT1
 CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _KEPT = 512
-_REORDERED_MS = 1000  # a stamp older by less is a late packet, by more a restarted clock
+_REORDERED_MS = 1000  # a stamp older by less is a late packet; by more, a restarted clock
 
 
 class _StateHistory:
@@ -86,7 +86,7 @@ class _StateHistory:
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
-        """Append a state. Return False for one that arrives late. A restarted clock clears all."""
+        """Append a state; return False if it is late. A restarted clock clears the history."""
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -114,7 +114,7 @@ class _StateHistory:
 
 
 def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
-    """Interpolate position and velocity linearly, the quaternion by normalised shortest lerp."""
+    """Interpolate position and velocity linearly, the quaternion along the shorter arc (nlerp)."""
     share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
     sign = -1.0 if dot(before.quaternion, after.quaternion) < 0.0 else 1.0
     quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion
@@ -159,7 +159,7 @@ class _Open(NamedTuple):
 
 
 class _TextCollector:
-    """Collects the newest thousand texts and those with missing chunks, and counts all."""
+    """Keeps the newest thousand texts and the incomplete ones, and counts all finished texts."""
 
     def __init__(self) -> None:
         self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
@@ -167,14 +167,14 @@ class _TextCollector:
         self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[_Text]:
-        """Return the texts that arrived after the first `total` of them, oldest first."""
+        """Return the texts after the first `total`, oldest first."""
         if total == self.total:
             return []
         fresh = min(self.total - total, len(self.texts))
         return list(self.texts)[len(self.texts) - fresh :]
 
     def add(self, message: Message, stamp_s: float) -> list[_Text]:
-        """Handle a STATUSTEXT. Return the texts that are complete now."""
+        """Handle a STATUSTEXT. Return the texts that are now complete."""
         if message.id == 0:
             return [self._emit(message.severity, message.text)]
         done = []
@@ -191,7 +191,7 @@ class _TextCollector:
         return done
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
-        """Close and return texts whose chunks have been missing too long, with a gap."""
+        """Close texts whose chunks have been missing too long, and return them with a gap."""
         late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
         return [self._finish(key) for key in late]
 
@@ -218,22 +218,22 @@ class Telemetry:
     def __init__(self) -> None:
         self.now_s = 0.0  # receive time of handled messages, set by the owner
         self.system = 0  # id of the autopilot; 0 before its first message
-        self.unfit = ""  # why an autopilot on the link cannot be flown
+        self.unfit = ""  # why an autopilot on the link cannot be used
         self.autopilot: _AutopilotProfile = PX4
         self.state: VehicleState | None = None  # None before position and attitude are known
         self.origin_enu_m: FloatArray | None = (
-            None  # origin of its positions (3,); None: the world's
+            None  # origin of its positions (3,); None: the world's origin
         )
         self.armed = False
         self.mode = ""  # name of the flight mode; "" before the first HEARTBEAT
-        self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED  # a known one
+        self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED  # unknown values are ignored
         self.ready = False  # the pre-arm checks pass
         self.amsl_m: float | None = None  # altitude above sea level, here and at home
         self.home_amsl_m: float | None = None
         self.battery_remaining: float | None = None  # charge, 0..1
         self.battery_voltage_v: float | None = None
         self.texts = _TextCollector()
-        self.collision_text: str | None = None  # in which the referee reports a collision
+        self.collision_text: str | None = None  # the referee's report of a collision
         self.history = _StateHistory()
         self._quaternion: FloatArray | None = None  # body FLU -> ENU
 
@@ -248,7 +248,7 @@ class Telemetry:
         return self.landed_state in _IN_AIR
 
     def handle(self, message: Message) -> None:
-        """Handle a message of the autopilot. Others are ignored."""
+        """Handle a message from the autopilot. Others are ignored."""
         handler = _HANDLERS.get(type(message).id)
         if handler is None:
             return
@@ -258,12 +258,12 @@ class Telemetry:
             handler(self, message)
 
     def is_from(self, message: Message, component: int) -> bool:
-        """Return True if a component of the autopilot's system has sent a message."""
+        """Return True if the message comes from this component of the autopilot's system."""
         header = message.get_header()
         return bool(header.srcComponent == component and header.srcSystem == self.system != 0)
 
     def _adopt(self, message: Message) -> None:
-        """Follow the first autopilot that sends a HEARTBEAT and can be flown."""
+        """Follow the first supported autopilot that sends a HEARTBEAT."""
         system, profile = message.get_srcSystem(), _PROFILES.get(message.autopilot)
         if message.get_srcComponent() != AUTOPILOT or system == self.system:
             return
@@ -348,7 +348,7 @@ class Telemetry:
         self.state, self.history = None, _StateHistory()
 
     def take_text(self, message: Message) -> None:
-        """Handle a STATUSTEXT of the autopilot or of its system's components."""
+        """Handle a STATUSTEXT from the autopilot or another component of its system."""
         self._look_for_verdict(self.texts.add(message, self.now_s))
 
     def expire(self) -> None:

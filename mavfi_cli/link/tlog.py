@@ -1,4 +1,4 @@
-"""The .tlog of a flight: all frames of both directions in the format of ground stations.
+"""The .tlog of a flight: all frames in both directions, in the format of ground stations.
 
 A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame.
 Received frames of messages that the `common` dialect lacks are left out.
@@ -24,14 +24,14 @@ from mavfi_cli.link.transport import Transport
 
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
-_LARGEST = 1 << 30  # bytes of a log that is read
-_FLUSH_INTERVAL_S = 1.0  # of the stamps
+_LARGEST = 1 << 30  # largest log that is read, bytes
+_FLUSH_INTERVAL_S = 1.0  # by the stamps
 
 
 def unix_time_of_stamp_0(path: Path) -> float:
     """Return the Unix time, s, of stamp 0 of a foreign flight, from the first state in its tlog.
 
-    The time is EPOCH_UNIX_S without a state. Raises RecordError if the file cannot be read.
+    It is EPOCH_UNIX_S if there is no state. Raises RecordError if the file cannot be read.
     """
     for unix_s, message in tlog_messages(path):
         if isinstance(message, dialect.MAVLink_local_position_ned_message):
@@ -55,7 +55,7 @@ def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
 
 
 class TlogWriter:
-    """Writes a .tlog. A kill leaves whole records and loses the last second or 64 KiB at most.
+    """Writes a .tlog. A kill leaves whole records and loses at most the last second or 64 KiB.
 
     Records written before `open` are buffered. Every method may raise RecordError.
 
@@ -135,9 +135,9 @@ class RecordedLink:
     Traffic before `recording` is buffered and written first.
 
     Args:
-        transport: Open transport. Its opener closes it.
-        signing: Signs sent frames and refuses received ones without a good signature.
-        clock: Unix time, s, to record in place of the stamps.
+        transport: Open transport. The caller closes it.
+        signing: Signs sent frames and rejects received ones without a valid signature.
+        clock: Returns the Unix time, s, to record in place of the stamps.
     """
 
     def __init__(
@@ -165,12 +165,12 @@ class RecordedLink:
             yield
 
     def continue_in(self, path: Path) -> None:
-        """Continue the tlog in a copy, in a fork of the process. Raises as `recording`."""
+        """Continue the tlog in a copy, in a fork of the process. Raises as `recording` does."""
         self._tlog.continue_in(path)
 
     @property
     def rivals(self) -> str:
-        """Text about two autopilots that send to this end; "" without a second one."""
+        """Text about two autopilots that send to this end; "" if there is no second one."""
         rival = self._transport.rival_address
         return f"{TWO_AUTOPILOTS}, {self._transport.address} and {rival}" if rival else ""
 
@@ -185,7 +185,7 @@ class RecordedLink:
         return messages
 
     def send(self, messages: Sequence[Message], stamp_s: float) -> None:
-        """Send the messages in this order and record them at the stamp.
+        """Send the messages in order and record them at the stamp.
 
         Raises LinkLost if the other end closed the connection.
         """

@@ -24,34 +24,34 @@ from mavfi_cli.link.codec import (
 )
 from mavfi_cli.link.endpoint import LISTENING, Endpoint, SenderSlot, parse_endpoint
 
-MAX_PEERS = 16  # of one listener
+MAX_PEERS = 16  # per listener
 _CHUNK = 1 << 16  # largest read, bytes
-_SMALL_CHUNK = 2048  # largest read from a client of a listener, bytes; at most a datagram
+_SMALL_CHUNK = 2048  # largest read from a client of a listener, bytes; one datagram at most
 _SEND_TIMEOUT_S = 10.0  # time without reading after which a peer counts as lost
 _BACKLOG = 1 << 16  # buffer for a slow client of a listener, bytes
 _MAX_WAITING = 128  # maximum unread datagrams per peer; the oldest are dropped first
-_JUDGED = 16  # datagrams of unknown senders that one pass examines; further ones are lost
-_PUMPED = 1000  # datagrams that one pass reads
+_JUDGED = 16  # maximum datagrams from unknown senders that one pass examines; others are lost
+_PUMPED = 1000  # maximum datagrams that one pass reads
 _MTU_PAYLOAD = 1400  # maximum bytes per datagram when frames are combined
 
 
 class Transport(ABC):
     """Carries bytes to and from one peer."""
 
-    url: str  # of the endpoint, for error messages
-    datagram = False  # every `receive` returns whole frames; an argument of `Codec.decode`
-    address = ""  # of a network peer, for error messages; "" if unknown
+    url: str  # endpoint URL, for error messages
+    datagram = False  # True if `receive` returns whole frames; an argument of `Codec.decode`
+    address = ""  # network peer's address, for error messages; "" if unknown
 
     @property
     def rival_address(self) -> str:
-        """Address of a second autopilot that sends to this end; "" without one."""
+        """Address of a second autopilot that sends to this end; "" if there is none."""
         return ""
 
     @abstractmethod
     def send(self, data: bytes) -> None:
-        """Send whole frames. Datagrams may be lost. Raises LinkLost if the peer has closed.
+        """Send whole frames. Datagrams may be lost. Raises LinkLost if the connection is lost.
 
-        No bytes continue a send to a slow client of a listener.
+        Empty `data` continues an earlier send to a slow client of a listener.
         """
 
     def receive(self, timeout_s: float) -> bytes:
@@ -70,12 +70,12 @@ class Transport(ABC):
         return data
 
     def await_peer(self, timeout_s: float) -> bool:
-        """Wait for a peer at most `timeout_s`. Return True if there is one."""
+        """Wait at most `timeout_s` for a peer. Return True if there is one."""
         return timeout_s >= 0.0
 
     @abstractmethod
     def fileno(self) -> int:
-        """Return the descriptor that is readable when `receive` would return data; -1: none."""
+        """Return the descriptor that is readable when `receive` has data; -1 if there is none."""
 
     @abstractmethod
     def close(self) -> None:
@@ -149,13 +149,13 @@ def open_listener(
     admits: Callable[[bytes], bool] = begins_with_frame,
     buffer: int = _BACKLOG,
 ) -> Listener:
-    """Open an endpoint that serves several peers, with the arguments and errors of a transport.
+    """Open an endpoint for several peers. Errors are those of `open_transport`.
 
     Args:
-        url, signed, allow_unsigned: As in `open_transport`. An open transport is the single peer.
-            A listening stream socket is an endpoint of its own.
+        url, signed, allow_unsigned: As in `open_transport`. `url` may also be an open transport,
+            which is then the single peer, or a listening stream socket.
         admits: Returns True if the sender of this first datagram may become a peer.
-        buffer: Bytes that wait for a slow client of a listening stream socket.
+        buffer: Bytes to buffer for a slow client of a listening stream socket.
     """
     if isinstance(url, Transport):
         return _OnePeer(url)
@@ -215,8 +215,8 @@ def _text_of(address: Any) -> str:
 class _Stream(_SocketOwner, Transport):
     """A connected stream socket with one peer.
 
-    A patient stream waits for a slow reader. Any other buffers a number of bytes for it and drops
-    the oldest sends first, so that the reader gets recent data.
+    A patient stream waits for a slow reader. Any other buffers up to `buffer` bytes for it and
+    drops the oldest sends first, so that the reader gets recent data.
     """
 
     def __init__(
@@ -273,9 +273,9 @@ class _Stream(_SocketOwner, Transport):
 
 
 class _StreamListener(_SocketOwner):
-    """A stream socket whose every client becomes a peer. Slow readers among them lose frames.
+    """A listening stream socket. Every client becomes a peer, and slow readers lose frames.
 
-    There are at most MAX_PEERS. The connection of a further client is closed.
+    There are at most MAX_PEERS peers. Further connections are closed.
     """
 
     def __init__(self, opened: socket.socket, url: str, buffer: int = _BACKLOG) -> None:
@@ -284,7 +284,7 @@ class _StreamListener(_SocketOwner):
         self._peers: list[_Stream] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
-        """Return the new clients. The stream of a patient one waits for its reader."""
+        """Return the new clients. Patient ones wait for a slow reader."""
         clients: list[_Stream] = []
         while True:
             try:
@@ -403,8 +403,8 @@ class _Udp(_SocketOwner, Transport):
     peer, and replaces it after some silence. Data sent before the first peer appears is lost.
 
     Args:
-        admits: Returns True if the sender of this datagram may become the peer. None connects
-            the socket.
+        admits: Returns True if the sender of this datagram may become the peer. None for a
+            connected socket.
     """
 
     datagram = True
@@ -447,7 +447,7 @@ class _Udp(_SocketOwner, Transport):
 
 
 def _receive_datagram(opened: socket.socket, limit: int) -> tuple[bytes, Any]:
-    """Return a datagram, up to a number of bytes, and its sender; b"" and None without one.
+    """Return a datagram of up to `limit` bytes and its sender; b"" and None if there is none.
 
     ECONNREFUSED means that no process listens at the other end of a connected socket. It is not an
     error for UDP, because the peer may start later.
@@ -505,7 +505,7 @@ class _UdpListener(_SocketOwner):
         return fresh
 
     def pump(self) -> None:
-        """Sort waiting datagrams by their sender; an admitted new sender becomes a peer."""
+        """Sort waiting datagrams by sender; an admitted new sender becomes a peer."""
         judged = 0
         for _ in range(_MAX_WAITING):
             data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
@@ -567,7 +567,7 @@ class _UdpPeer(Transport):
 
 
 def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
-    """Return both ends of a new link in memory; error messages name it by its URL."""
+    """Return both ends of a new link in memory. Error messages name the URL."""
     ours, theirs = _MemoryTransport(url), _MemoryTransport(url)
     ours._peer, theirs._peer = theirs, ours
     return ours, theirs
@@ -576,8 +576,8 @@ def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
 class _MemoryTransport(Transport):
     """One end of a link in memory; made in pairs by `memory_pair`.
 
-    Both ends run in one thread. So an end that has nothing to receive calls its `on_wait`, in
-    which the other end can act, and never sleeps.
+    Both ends run in one thread, so an end that has nothing to receive never sleeps. It calls its
+    `on_wait`, in which the other end can act.
     """
 
     def __init__(self, url: str) -> None:
@@ -613,10 +613,10 @@ class _MemoryTransport(Transport):
 
 
 def signing_from_file(path: str | Path | None) -> Signing | None:
-    """Return the signing with the passphrase in a file, on this host's clock; None without a file.
+    """Set up signing with the passphrase stored in `path`, using the host clock.
 
-    White space around the passphrase is ignored. Raises ConfigError if the file cannot be read or
-    is empty.
+    Return None if `path` is None. White space around the passphrase is ignored. Raises ConfigError
+    if the file cannot be read or is empty.
     """
     if path is None:
         return None
