@@ -55,14 +55,14 @@ COSTS = ("check_share", *(f"recovery_share_{stage}" for stage in RECOMPUTED))
 EXPORTED = (
     "number", "pair", *CONFIG, "level", *(f"fault_{name}" for name in FAULT), *STRUCK, "detector",
     "protect", "state", "outcome", "reason", "injected", *QUALITY, "replans", "simulated_s",
-    "wall_s", *COSTS, "attempts", "path", STRATUM, WEIGHT, "changes",
+    "wall_s", "alarm_count", *COSTS, "attempts", "path", STRATUM, WEIGHT, "changes",
 )  # fmt: skip
 BITS = pa.list_(pa.list_(pa.int64()))  # a list of bits for each struck component
 _TYPES = {  # types of the columns that are not text, in case they hold no value
     "struck_bits": BITS,
     **dict.fromkeys(
         ("number", "seed", "world_seed", "fault_seed", "fault_bits", "strikes", "strike_invocation",
-         "strike_tick", "struck_execution", "replans", "attempts"), pa.int64()),
+         "strike_tick", "struck_execution", "replans", "alarm_count", "attempts"), pa.int64()),
     **dict.fromkeys(
         (*QUALITY, *COSTS, WEIGHT, "strike_s", "first_read_s", "simulated_s", "wall_s"),
         pa.float64()),
