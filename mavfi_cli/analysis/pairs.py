@@ -103,8 +103,8 @@ class Flights:
         lost: whether the mission did not end in success.
         ended: whether the fault made a node crash or hang.
         restart_s: time after which a dead node is restarted.
-        repeats: whether the flight is repeatable; one of a user's companion is not, and has no
-            partner.
+        repeats: whether the flight is repeatable. A flight of a user's companion is not, so it is
+            not paired with a golden flight.
     Columns about its golden flight:
         own_lost: whether it is lost; empty without a golden flight.
         own_flight_time_s: its flight time.

@@ -233,7 +233,10 @@ class Group:
 
     @staticmethod
     def parts(groups: Iterable[Group], *, repeats: bool) -> list[Group]:
-        """Return the repeatable or the other flights of each setting, without empty settings."""
+        """Return each setting with only its repeatable flights, or with only the others.
+
+        Settings that have none are left out.
+        """
         chosen = [(group, group.repeats == repeats) for group in groups]
         return [
             group if own.all() else replace(group, flights=group.flights.filter(pa.array(own)))

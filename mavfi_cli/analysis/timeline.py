@@ -137,9 +137,9 @@ def _typical(reactions: Sequence[Reaction], answers: Collection[float]) -> React
 
 
 def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Invocation]:
-    """Return the invocations through which a frame reached its setpoint, in order, control last.
+    """Return the chain of invocations from a frame to its setpoint, in order, control last.
 
-    The list is shorter if the time table lacks some.
+    The chain is shorter if some are missing from the timetable.
     """
     chain: list[Invocation] = []
     before_s = reaction.setpoint_stamp_s

@@ -301,7 +301,7 @@ class _Search:
             return 0
 
     def _steps(self, most: int) -> int:
-        """Execute at most `most` instructions in scope, in a compiled loop. Return their number."""
+        """Execute at most `most` instructions in scope, in a compiled loop. Return how many."""
         from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
 
         begun_s, tracee = time.perf_counter(), self.tracee

@@ -74,8 +74,8 @@ def chosen(
         sampling: how faults are drawn; None means as specified. It becomes part of the name too.
 
     Raises:
-        ConfigError: the specification or the scale is invalid, or a preset without `out` has the
-            same name as a campaign here.
+        ConfigError: the specification or the scale is invalid, or `out` is None and the name is
+            that of both a preset and a campaign's folder in the working directory.
         UnknownName: no preset, file or folder has this name.
     """
     spec = chosen_spec(what, scale, changes, out, programs, sampling)

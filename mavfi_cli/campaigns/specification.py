@@ -276,7 +276,7 @@ class Spec:
             ConfigError: the scale is not above 0.
         """
         if not (math.isfinite(scale) and scale > 0.0):
-            raise ConfigError(f"must be above 0, got {scale:g}", key="scale")
+            raise ConfigError(f"must be finite and above 0, got {scale:g}", key="scale")
 
         settings = tuple(
             replace(

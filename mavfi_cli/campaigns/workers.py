@@ -387,7 +387,7 @@ class Cluster:
             return [AttemptEnd(number=number, lost=lost) for number in outs]
         answer = future.result()
         if isinstance(answer, str):
-            raise CampaignStopped(f"a worker has other versions: {answer}")
+            raise CampaignStopped(f"a worker has different versions: {answer}")
         return [_unpacked(ended, files, outs[ended.number]) for ended, files in answer]
 
     def close(self) -> None:
@@ -429,8 +429,9 @@ def _connect(address: str, keys: Path | None) -> Client:
         return Client(address, timeout=CONNECT_S, set_as_default=False, **secure)
     except (OSError, ValueError, TimeoutError) as error:
         first = str(error).partition("\n")[0]
-        others = "" if keys is None else f" with the keys of {keys}"
-        raise CampaignStopped(f"no scheduler{others} at {address}: {first}") from None
+        secured = "" if keys is None else f" with the keys in {keys}"
+        text = f"cannot connect to a scheduler at {address}{secured}: {first}"
+        raise CampaignStopped(text) from None
 
 
 def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> None:
@@ -444,7 +445,7 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
             raise CampaignStopped(f"worker {worker} cannot fly missions: {versions!r}")
         differing = version_differences(ours, versions)
         if differing:
-            raise CampaignStopped(f"worker {worker} has other versions: {'; '.join(differing)}")
+            raise CampaignStopped(f"worker {worker} has different versions: {'; '.join(differing)}")
 
 
 _SMALL = (RESULT, FAULT)  # files that the runner reads from a run folder that is not kept

@@ -108,7 +108,7 @@ class WorldError(MavfiError):
 
 
 class PlaceError(WorldError):
-    """Start or goal is blocked or outside the world, a usage error."""
+    """The start or goal is blocked or outside the world, which is a usage error."""
 
     exit_code = 2
 

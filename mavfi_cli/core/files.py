@@ -104,7 +104,7 @@ def own_folder(path: Path) -> Path:
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
     if path.is_symlink():
-        raise RecordError(f"{path}: is a link; mavfi removes files in this folder")
+        raise RecordError(f"{path}: is a link, but mavfi deletes files in this folder")
     return path
 
 

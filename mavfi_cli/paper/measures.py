@@ -162,7 +162,7 @@ def _longer(flights: Flights, **where: Any) -> Finding:
 
 
 def _longer_difference(flights: Flights, groups: Mapping[str, Where]) -> Finding:
-    """Share of longer flights among successes in the first of two groups minus in the second."""
+    """Difference between two groups in the share of successes that exceed LONGER."""
     timed = {name: flights.struck(**where).timed for name, where in groups.items()}
     return _harm_gap(timed, "over 10 % longer")
 

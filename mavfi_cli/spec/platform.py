@@ -1,7 +1,7 @@
 """Compute platforms: the latency of each kernel in simulated time. One TOML file per platform.
 
-A file either gives the latency of every kernel, or names a shipped platform as its `base` and a
-factor `scale` for single kernels or for all.
+A file either gives the latency of every kernel, or names a shipped platform as its `base` and
+gives a factor, `scale`, for individual kernels or for all of them.
 
 `measured:FACTOR` needs no file. Its latencies are the kernel times measured on the host in
 flight, times the factor. Such a flight is not repeatable.

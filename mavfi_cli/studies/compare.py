@@ -48,11 +48,12 @@ class ComparePlan:
 
     Attributes:
         platforms: names or files; the others are compared with the first.
-        inject: stages, states or groups to corrupt, one per flight; empty flies golden ones only.
+        inject: stages, states or groups to corrupt, one per flight; if empty, only
+            golden flights are flown.
         detectors: names; `none` is always flown, named or not.
         missions: number per platform, setting and target of `inject`.
         seed: root of the faults' seeds.
-        field: bit field to strike; None draws any bit.
+        field: bit field to strike; if None, any bit may be drawn.
     """
 
     platforms: tuple[str, ...] = ("x86", "tx2")

@@ -332,7 +332,7 @@ def _turn(out: Setpoint, heading_rad: float) -> None:
 
 
 def _set_mode_message(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Handle SET_MODE, the predecessor of DO_SET_MODE, with one answer."""
+    """Handle SET_MODE, the predecessor of DO_SET_MODE, and acknowledge it once."""
     if message.target_system != autopilot.system_id:
         return
     mode, custom = None, message.custom_mode

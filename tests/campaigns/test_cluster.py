@@ -171,10 +171,10 @@ def test_only_the_key_opens_a_cluster_with_keys(locked_cluster, tmp_path):
     assert runner.returncode == 0, err
     assert len(results_of(tmp_path / "remote")) == 1
     make_keys(tmp_path / "others")
-    with pytest.raises(CampaignStopped, match=r"keys of .*others at tls://"):
+    with pytest.raises(CampaignStopped, match=r"scheduler at tls://.* with the keys in .*others"):
         Cluster(locked_cluster.address, Keep.NONE, keys=tmp_path / "others")
     plain = locked_cluster.address.replace("tls:", "tcp:")
-    with pytest.raises(CampaignStopped, match="no scheduler at tcp://"):
+    with pytest.raises(CampaignStopped, match="cannot connect to a scheduler at tcp://"):
         Cluster(plain, Keep.NONE)
     with pytest.raises((OSError, TypeError)):  # what any program of another user could do
         Client(locked_cluster.address, timeout=5.0, set_as_default=False)
@@ -274,7 +274,7 @@ def test_a_scheduler_that_is_not_there_gets_one_line(mavfi, tmp_path, free_port,
     assert (run.returncode, run.stdout) == (1, "")
     warning, line = run.stderr.splitlines()
     assert warning.startswith(f"warning: {address} has no TLS")
-    assert line.startswith(f"error: no scheduler at {address}: ")
+    assert line.startswith(f"error: cannot connect to a scheduler at {address}: ")
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,10 @@ def require_viewer(path: Path | None) -> None:
 def save(flights: Sequence[ViewedFlight], path: Path | None) -> None:
     """Write flights for a viewer, atomically, in the format of the file's suffix.
 
-    None opens rerun's viewer, which stays open.
+    If `path` is None, open rerun's viewer and leave it open.
 
     Raises:
-        ConfigError: the name has another suffix.
+        ConfigError: the suffix is neither .rrd nor .mcap.
         RecordError: the file cannot be written.
         MavfiError: a package is not installed.
     """
