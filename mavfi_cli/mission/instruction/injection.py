@@ -237,7 +237,7 @@ class _GoldenNode:
         return replace(fault, corruption=None) if request.null else fault, context
 
     def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
-        """Return True if another flight sent the process the same requests up to this invocation."""
+        """Return True if another flight sent the process the same requests up to an invocation."""
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
         until = own[drawn.order - 1] + 1
         theirs = flown.of_process(self.process)[:until]
