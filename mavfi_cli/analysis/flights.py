@@ -68,7 +68,7 @@ _TYPES = {  # types of the columns that are not text, in case they hold no value
         pa.float64()),
 }  # fmt: skip
 # Labels in which protected flights differ from unprotected ones.
-TREATMENT = ("setting", "detector", "protect", "any_stack", "watch")
+TREATMENT = ("setting", "detector", "model", "threshold", "protect", "any_stack", "watch")
 SETTLING = "settling"  # metadata of a reproduction that settled claims (`reproduce --settle`)
 _HOST = ("machine", "cores", "started")
 BoolArray = NDArray[np.bool_]

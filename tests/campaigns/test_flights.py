@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from mavfi_cli.analysis.flights import untreated
 from mavfi_cli.campaigns.missions import Injected, PlannedMission
 from mavfi_cli.campaigns.run import Options, run_campaign
 from mavfi_cli.campaigns.specification import Keep
@@ -76,3 +77,9 @@ def test_nothing_is_left_of_the_flights(flown):
     campaign = flown[0].path.parents[1]
     assert not (campaign / "work").exists()
     assert not list(campaign.glob("runs/*/.*"))
+
+
+def test_a_model_and_a_threshold_are_part_of_the_treatment():
+    bare = {"setting": "FI", "site": "fly/mavsdk_server"}
+    guarded = {**bare, "setting": "D&R(G)", "detector": "gad", "model": "m.json", "threshold": 9.0}
+    assert untreated(guarded) == untreated(bare) != untreated({**bare, "site": "fly"})
