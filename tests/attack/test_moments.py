@@ -13,7 +13,7 @@ from live_processes import LONG_S
 from mavfi_cli.attack.live import _Search, attack_moment
 from mavfi_cli.attack.tracer_thread import TracerThread
 from mavfi_cli.core.errors import TargetError, UnknownName
-from mavfi_cli.fi.tracer import record
+from mavfi_cli.fi.tracer import record, stepper
 from mavfi_cli.fi.tracer.fault import Strategy
 from mavfi_cli.fi.tracer.image import Image
 
@@ -154,6 +154,17 @@ def test_a_waiting_thread_is_struck_once_it_goes_on_and_nothing_else_waits(
     assert done["not_injected_reason"] == ""
     assert 0 < done["k"] <= 50
     assert calls(workers) > 0
+
+
+def test_loading_the_steps_waits_for_no_child_of_this_process():
+    faulthandler.dump_traceback_later(LONG_S, exit=True)
+    with subprocess.Popen(["sleep", "600"]) as child:
+        try:
+            stepper.load()
+            assert child.poll() is None
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            child.kill()
 
 
 def test_a_program_that_is_killed_while_its_main_thread_is_stepped(workers, tmp_path, monkeypatch):
