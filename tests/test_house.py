@@ -17,7 +17,7 @@ SOURCES = {
 }
 LONGEST_CHAIN = 14  # modules, each of which imports the next, wherever the import stands
 MOST_FILES = 264
-MOST_NAMES = 994  # public classes and functions at the top level; a row of results is a class
+MOST_NAMES = 995  # public classes and functions at the top level; a row of results is a class
 # Functions that nothing in the product calls by name, with the reason to keep them.
 UNCALLED = {
     "__getattr__": "Python calls it: names of the library are imported when they are first used",

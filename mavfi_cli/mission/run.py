@@ -176,8 +176,8 @@ def _fly_companion(
     guarded = {} if flight.detection is None else {"detection": flight.detection}
     ends = {name: asdict(program) for name, program in flight.programs.items()}
     result |= {"pilot": {}, "plans": [], "programs": ends, **guarded}
-    if injection.ends:
-        result["nodes"] = {name: asdict(end) for name, end in injection.ends.items()}
+    if deaths := {name: asdict(end) for name, end in injection.ends.items()}:
+        result |= {"nodes": deaths}
     result |= {"in_lockstep": True} if programs.in_lockstep else {}
     log = None if vehicle.truth is None else vehicle.truth.log
     write_parquet(folder.trace, flight.trace.table(log))
