@@ -35,6 +35,7 @@ _MODE_PATIENCE_S = 1.5  # wait for a mode change; HEARTBEAT arrives once a secon
 _LOOK_INTERVAL_S = 0.2
 _HOME_INTERVAL_S = 1.0
 _WARNING = dialect.MAV_SEVERITY_WARNING
+_MOST_TEXTS = 5  # of the autopilot, in an error
 
 
 @dataclass(slots=True, kw_only=True)
@@ -152,11 +153,11 @@ class Commands:
         return self._ticket is not None
 
     def refuse(self, command: str, result: str) -> NoReturn:
-        """Raise CommandRefused with the autopilot's texts since the start of the phase."""
+        """Raise CommandRefused with the autopilot's newest texts since the start of the phase."""
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
         warnings = (text for text in texts.since(self._texts_before) if text.severity <= _WARNING)
-        words = "; ".join(dict.fromkeys(text.text for text in warnings))
+        words = "; ".join([*dict.fromkeys(text.text for text in warnings)][-_MOST_TEXTS:])
         quoted = f" ({words})" if words else ""
         raise CommandRefused(f"autopilot refused {command}: {result}{quoted}")
 

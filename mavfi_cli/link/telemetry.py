@@ -141,6 +141,7 @@ _MAX_OPEN = 16
 _MAX_TEXTS = 1000
 _PATIENCE_S = 1.0  # maximum wait for missing chunks
 _GAP = "[...]"
+_LONGEST = 1000  # characters of a text
 
 
 class _Text(NamedTuple):
@@ -197,15 +198,17 @@ class _TextCollector:
 
     def _finish(self, key: tuple[int, int, int]) -> _Text:
         part = self.open.pop(key)
-        last = max(part.chunks)
-        text = "".join(part.chunks.get(index, _GAP) for index in range(last + 1))
-        if len(part.chunks[last]) >= CHUNK_LENGTH:
+        text, expected = "", 0
+        for index, chunk in sorted(part.chunks.items()):
+            text += chunk if index == expected else _GAP + chunk
+            expected = index + 1
+        if len(part.chunks[expected - 1]) >= CHUNK_LENGTH:
             text += _GAP
         return self._emit(part.severity, text)
 
     def _emit(self, severity: int, text: str) -> _Text:
         self.total += 1
-        self.texts.append(_Text(severity, printable(text.strip())))
+        self.texts.append(_Text(severity, printable(text.strip())[:_LONGEST]))
         return self.texts[-1]
 
 

@@ -5,7 +5,10 @@ import json
 import os
 import pickle
 import shutil
+import socket
 import sqlite3
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -76,7 +79,8 @@ def hostile(faulty_flight, precious, tmp_path):
     for name in names:
         (folder / name).symlink_to(precious)
     os.unlink(folder / LOCK)
-    for name in (LOCK, "runs.jsonl", "kernels.json", f".{RESULT}.{os.getpid()}.partial"):
+    written = ("dataset.parquet", "gad.json", "vpm.json", "vpm.csv", "flights.csv", "host.json")
+    for name in (LOCK, *written, "runs.jsonl", "kernels.json", f".{RESULT}.{os.getpid()}.partial"):
         (folder / name).symlink_to(precious / "file")
     for name in ("mavbench", "bare", "kernels"):
         shutil.copytree(folder, folder / name, symlinks=True)
@@ -129,8 +133,11 @@ COMMANDS = [
     "reproduce --settle --hours 0.001 --out HOSTILE",
     "train --flown HOSTILE --out models",
     "train --flown . --out models",
+    "train --kind gad --world farm --flights 2 --quiet --out HOSTILE",
+    "train --from HOSTILE/flight.tlog --kind gad --out HOSTILE",
     "vpm --overhead HOSTILE",
     "vpm --out HOSTILE",
+    pytest.param("vpm --fly --missions 1 --quiet --out HOSTILE", marks=pytest.mark.slow),
     "detect evaluate --world farm --flights 1 --golden-flights 1 --quiet --out HOSTILE",
     "compare --world farm --missions 1 --quiet --out HOSTILE",
     "fly --world farm --start=2,2,0 --goal=10,6,5 --quiet --out HOSTILE",
@@ -150,6 +157,23 @@ def test_a_command_neither_executes_nor_removes_what_a_folder_names(
     assert "Traceback" not in err
     assert not (hostile.parent / "struck").exists()
     assert sorted(path.relative_to(precious) for path in precious.rglob("*")) == before
+    assert {path.read_text() for path in precious.rglob("file")} == {_TEXT}
+
+
+def test_the_truth_of_a_vehicle_overwrites_nothing_behind_a_link(hostile, precious):
+    for name in ("truth.json", "truth.parquet", "briefing.json"):
+        (hostile / name).unlink(missing_ok=True)
+        (hostile / name).symlink_to(precious / "file")
+    ours, theirs = socket.socketpair()
+    ours.close()
+    with theirs:
+        line = f"sitl --world farm --lockstep --fd {theirs.fileno()} --truth {hostile}"
+        run = subprocess.run(
+            [sys.executable, "-m", "mavfi_cli", *line.split()],
+            pass_fds=[theirs.fileno()], capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    assert (run.returncode, run.stderr) == (0, "")
+    assert json.loads((hostile / "truth.json").read_text())["collision"] is None
     assert {path.read_text() for path in precious.rglob("file")} == {_TEXT}
 
 

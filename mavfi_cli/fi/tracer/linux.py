@@ -43,6 +43,7 @@ _personality = _libc.personality
 _personality.restype = ctypes.c_int
 _personality.argtypes = [ctypes.c_ulong]
 
+_SHORTEST_WAIT_S = 0.001  # of a timer
 SUPPORTED = platform.system() == "Linux" and platform.machine() == "x86_64"
 _REMEDY = (
     "run as the parent of the target, set kernel.yama.ptrace_scope to 0 or 1, or start the "
@@ -239,8 +240,9 @@ class ProcessTimer:
         self.fired = False
         self._signal = number
         self._process = os.pidfd_open(pid)
-        clocks = ((functools.partial(cpu_time_s, pid), cpu_s), (time.monotonic, wall_s))
-        self._ends = [(clock, clock() + left) for clock, left in clocks if left is not None]
+        used = functools.partial(cpu_time_s, pid)  # with threads, faster than the wall clock
+        clocks = ((used, cpu_s, os.cpu_count() or 1), (time.monotonic, wall_s, 1))
+        self._ends = [(clock, clock() + s, rate) for clock, s, rate in clocks if s is not None]
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -261,7 +263,7 @@ class ProcessTimer:
 
     def _watch(self) -> None:
         while (left := self._left_s()) > 0:
-            if self._cancelled.wait(left):
+            if self._cancelled.wait(max(left, _SHORTEST_WAIT_S)):
                 return
         self.fired = True
         try:
@@ -270,5 +272,5 @@ class ProcessTimer:
             self.fired = False  # the process has ended
 
     def _left_s(self) -> float:
-        """Return a lower bound on the remaining time. CPU time is never faster than the clock."""
-        return min(end_s - clock() for clock, end_s in self._ends)
+        """Return a lower bound on the remaining wall-clock time, s; 0 or less if it is over."""
+        return min((end_s - clock()) / rate for clock, end_s, rate in self._ends)

@@ -92,6 +92,13 @@ def test_a_timer_may_kill_a_program_that_is_stopped(start):
     assert tracee.resume() == Ended(exit_code=None, signal=signal.SIGKILL)
 
 
+def test_a_limit_of_cpu_time_allows_for_threads_on_every_processor(start, monkeypatch):
+    monkeypatch.setattr(linux.os, "cpu_count", lambda: 4)
+    tracee = start("counting")  # stopped, so it uses no CPU time
+    with ProcessTimer(tracee.pid, signal.SIGKILL, cpu_s=80.0, wall_s=None) as alarm:
+        assert alarm._left_s() == pytest.approx(20.0)
+
+
 def test_an_interrupt_stops_and_resumes(start, tmp_path):
     tracee = start("sleeper")
     for _ in range(5):
