@@ -52,7 +52,7 @@ def fly(
     require_folder(Path(out))
     if (
         mission.instruction is not None and mission.companion is None
-    ):  # the attacked node loads in parallel
+    ):  # start the attacked node's process now, so that it loads in parallel
         from mavfi_cli.attack.served import ServedProcess
         from mavfi_cli.mission.instruction import PROGRAM
 

@@ -1,4 +1,4 @@
-"""Conversion between the local NED frame and latitude, longitude and altitude; air pressure.
+"""Converts between the local NED frame and geographic coordinates, and computes air pressure.
 
 The conversion is an azimuthal equidistant projection on a sphere of 6,371,000 m (Snyder, Map
 Projections: A Working Manual, 1987, equations 25-15 and 20-14), as in PX4.

@@ -1,4 +1,4 @@
-"""The command line of `python -m sitl`."""
+"""Parses the command line of `python -m sitl`."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Collision:
 
 
 class Referee:
-    """Collision, clearance, flown distance and truth log of one flight.
+    """Judges one flight: finds collision, clearance and flown distance, and logs the truth.
 
     Args:
         body_box_m: Length, width and height of the vehicle's body box, centred on its position.

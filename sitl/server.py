@@ -125,14 +125,14 @@ class Client(Peer):
             return self._send(due, self._simulation.autopilot.collect(self.link))
 
     def send_between(self, stamp_us: int) -> bool:
-        """Send the streams faster than the tick rate, at a stamp between two ticks."""
+        """Send the fast streams' messages due at a stamp, us, between ticks; False if none is."""
         autopilot = self._simulation.autopilot
         if not (self.link.is_fast and isinstance(autopilot, Autopilot)):
             return False
         return self._send([], autopilot.collect_between(self.link, stamp_us))
 
     def send_answers(self) -> bool:
-        """Send answers without waiting for the tick."""
+        """Send answers without waiting for the next tick. Return False if there are none."""
         return self._send([], self.link.take())
 
     def _send(self, of_camera: list[Any], of_autopilot: list[Any]) -> bool:
@@ -228,13 +228,13 @@ def _answers(messages: Sequence[Any], stamp_ms: int) -> bool:
 
 
 class EmbeddedVehicle:
-    """The vehicle inside its companion's process, which waits while the vehicle is simulated.
+    """Runs the vehicle inside the process of its companion.
 
     Once the companion has answered a tick and waits for messages, the next tick is simulated.
 
     Attributes:
         link: The companion's end of the link.
-        briefing: Data that the companion gets before the first message.
+        briefing: Data that the companion gets before its first message.
         error: The error that ended the vehicle before its companion, if any.
 
     Raises:
@@ -272,7 +272,7 @@ class EmbeddedVehicle:
         return True
 
     def end(self) -> None:
-        """Simulate the tick that was answered last, and close. May be called repeatedly."""
+        """Simulate the last tick if the companion answered it, and close. May be repeated."""
         if self._ended:
             return
         self._ended = True
@@ -290,7 +290,7 @@ class EmbeddedVehicle:
 
 
 class _Realtime:
-    """Any number of clients of a simulation that is paced by the wall clock."""
+    """Serves a simulation, paced by the wall clock, to any number of clients."""
 
     def __init__(self, options: ServerOptions, simulation: Simulation) -> None:
         self._options = options

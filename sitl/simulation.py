@@ -1,4 +1,4 @@
-"""Vehicle, autopilot, camera and referee, advanced together one control tick at a time."""
+"""Advances vehicle, autopilot, camera and referee together, one control tick at a time."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Simulation:
         """Simulate one control tick under the autopilot's command, then have the referee judge it.
 
         Args:
-            between: Called with the stamp of every physics step within the tick, us.
+            between: Called with the stamp of every physics step before the end of the tick, us.
         """
         self.wall.begin_tick()
         self._fly(between)
@@ -129,7 +129,7 @@ class Simulation:
         """Release everything outside this process. May be called repeatedly."""
 
     def truth(self) -> FlightTruth:
-        """Return the referee's log and verdict, and the time and memory of this machine."""
+        """Return the referee's log and verdict, and this process's wall time and peak memory."""
         return FlightTruth(
             log=self.referee.log(),
             report=self.referee.report(self._energies_j()),
@@ -177,7 +177,7 @@ class Simulation:
         if self._wreck is None and commander.terminated and is_down:
             self._wreck = truth.wreck()
         if not (dot(place, place) < _FARTHEST_M**2 and dot(rates, rates) < _FASTEST_RADPS**2):
-            raise VehicleProcessError(f"physics diverged at {self.stamp_us * 1e-6:.2f} s")
+            raise VehicleProcessError(f"the physics diverged at {self.stamp_us * 1e-6:.2f} s")
 
 
 def _memory_mb() -> float:

@@ -1,8 +1,9 @@
-"""First contact and nearest approach of the moving body to all boxes between two poses, compiled.
+"""Computes a body's first contact with boxes, and its nearest approach to them, between two poses.
 
-Distance: the shortest distance of two separate convex boxes is between a corner of one and the
-other box, or between an edge of each. A separating-axis test with six face normals and nine cross
-products of edges decides whether they overlap (S. Gottschalk, M. Lin, D. Manocha, "OBBTree", 1996).
+Distance: the shortest distance between two disjoint boxes is between a corner of one and the other
+box, or between an edge of one and an edge of the other. A separating-axis test with six face
+normals and nine cross products of edges decides whether they overlap (S. Gottschalk, M. Lin,
+D. Manocha, "OBBTree", 1996).
 
 Motion: between two poses the body's centre moves in a straight line, and its attitude turns about
 one axis at a constant rate. No point of the body then moves further than
@@ -142,9 +143,9 @@ def _edges_squared(
     """Return the squared distance from one body edge (along body `axis`) to one box edge.
 
     With r the offset of the edges' midpoints, u and v their directions and h, k their half
-    lengths, |r + s u - t v| is minimal where both derivatives vanish. A solution beyond the end of
-    an edge, or for parallel edges, counts as infinity: the ends of edges are corners, which are
-    handled separately.
+    lengths, |r + s u - t v| is minimal where both derivatives vanish. The result is infinity if the
+    edges are parallel or the minimum is beyond the end of an edge: the ends of edges are corners,
+    which are handled separately.
     """
     one, two = (axis + 1) % 3, (axis + 2) % 3
     sign_one = half[one] if edge & 1 else -half[one]

@@ -43,7 +43,7 @@ class FlightSetup:
         braking_velocity_mps: safe velocity with the deceleration that the companion assumes.
         rotors_w: electrical hover power with all boards.
         boards_w: power of all boards.
-        cut: phrases for the model's values that were cut to the limits of a mission.
+        cut: phrases about those of the model's values that were clipped to a mission's limits.
     """
 
     v_max_mps: float
@@ -84,7 +84,7 @@ class ModelAndFlights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownNumbers:
-    """Numbers of a scheme's successful flights, and the model's for the same missions.
+    """Numbers from a scheme's successful flights, and from the model for the same missions.
 
     Attributes:
         outcomes: number of flights by outcome, the most frequent first.
@@ -114,7 +114,7 @@ class FlownNumbers:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _FlownRatios:
-    """Geometric means over the missions in which both schemes succeeded."""
+    """Ratios of two schemes: geometric means over the missions in which both succeeded."""
 
     pairs: int
     velocity_ratio: ModelAndFlights
@@ -127,7 +127,7 @@ class FlownScheme:
     """The flights of a scheme.
 
     Attributes:
-        problem: why there are no flights, and so no numbers; None if there are.
+        problem: reason why the scheme was not flown; None if it was.
         over_none, over_aad: ratios to the scheme `none` or `aad`; None if that was not flown.
     """
 

@@ -1,10 +1,11 @@
 """Evaluate detectors with and without faults: counts of pairs, each with its interval.
 
 A pair holds the flights of one mission: golden, faulty, and faulty with a detector. Faults that
-were not injected or not read are counted separately and enter no other number. The same holds for
-faults in missions whose golden flight fails, because no fault can harm those. All harmful faults
-are repeated with every detector; harmless ones only in `complete` missions. The effect of a fault
-is taken from the unprotected flight, because a detector may withhold the value before it is read.
+were not injected or not read are counted separately; the only other number that they enter is
+`detected_inactive`. Faults in missions whose golden flight fails are counted separately too,
+because they can do no harm. All harmful faults are repeated with every detector, harmless ones only
+in `complete` missions. The effect of a fault is taken from the unprotected flight, because a
+detector may withhold the value before it is read.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from mavfi_cli.stats.shares import Interval, Share, mixture, wilson
 
 NONE = "none"  # no detector: the reference for all others
 ERROR_FREE, FAULT = "error-free", "fault"  # kinds of missions
-KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; golden flights have only two
+KEY = ("world", "seed", "level", "stage", "target", "field")  # labels; golden flights: first two
 # Columns used to form pairs, in addition to the labels: KEY, kind and detector.
 WANTED = (
     "outcome", "succeeded", "flight_time_s", "injected", "struck_s", "struck_sites", "first_bits",
@@ -84,9 +85,11 @@ class ErrorFreeRow:
         by, value: label by which the flights are grouped, and its value.
         hours: flight time with the detector, from take-over to the end of the mission.
         alarms, episodes: number of alarms, and of runs of consecutive alarms.
-        alarms_per_hour: its interval is a bootstrap over flights, or Poisson without any alarm.
+        alarms_per_hour: its interval comes from a bootstrap over flights or, if there is no alarm,
+            from the Poisson distribution.
         with_alarm: share of flights with at least one alarm.
-        lost, gained: golden successes that fail with the detector; failures that succeed with it.
+        lost: share of golden successes that fail with the detector.
+        gained: number of golden failures that succeed with the detector.
         success: counts of pairs by success; the golden flight is the first.
         lengthening: median of flight time / golden flight time - 1, where both succeed.
     """
@@ -108,19 +111,19 @@ class ErrorFreeRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _WorstFlight:
-    """The worst successful flight time and its recovery, as in the paper's section VII-A.
+    """The largest increase of flight time, and the part that the detector recovers.
 
-    The paper uses one world with one seed. Here every mission has its own seed, so every flight is
-    compared with its own golden flight.
+    It follows the paper's section VII-A, which uses one world with one seed. Here every mission has
+    its own seed, so every successful flight is compared with its own golden flight.
 
     Attributes:
-        faulty, protected: the largest flight time / golden flight time - 1, without and with
+        faulty, protected: largest value of (flight time / golden flight time - 1), without and with
             the detector.
-        recovered: `faulty` minus `protected`, each at least 0. Resampled missions never contain a
-            worse case than the worst observed one, so the interval shows how much the value depends
-            on single flights, not how bad the worst case can become.
+        recovered: `faulty` minus `protected`, each at least 0. A resample never contains a worse
+            flight than the worst observed one, so the interval shows how much the value depends on
+            single flights, not how bad the worst case can become.
         recovered_share: recovered share of the increase; NaN if no unprotected flight took more
-            than LONGER times as long.
+            than LONGER times as long as its golden flight.
     """
 
     faulty: float
@@ -131,14 +134,14 @@ class _WorstFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultRow:
-    """Results on flights with faults. All shares but `detected_inactive` cover active faults only.
+    """Results on flights with faults. Shares cover only active faults, except `detected_inactive`.
 
     Attributes:
         by, value: label by which the faults are grouped, and its value.
         planned: number of faults, divided into `not_injected`, `not_activated` (never read),
             `golden_failed` (the mission fails even without the fault) and `active`.
-        crashed: faults that killed a node, which is noticed even without a detector.
-        harmful: `lost` or `longer`.
+        crashed: number of faults that killed a node; this is noticed even without a detector.
+        harmful: share of faults that count as `lost` or `longer`.
         flown: number of faults repeated with this detector: all harmful ones, and the harmless
             ones of complete missions.
         not_struck: how many of these never struck because the protected flight had diverged; no
@@ -148,15 +151,15 @@ class FaultRow:
         detected_harmful: harmful faults with an alarm at or after the strike.
         detected_active: the same for all faults of complete missions.
         detected_inactive: the same for faults that struck but were not activated.
-        by_chance: flights of complete missions in which, even without the fault, the detector
-            raises an alarm at or after the time of the strike.
+        by_chance: faults of complete missions for which, even in the flight without the fault, the
+            detector raises an alarm at or after the time of the strike.
         recovered: lost missions that succeed with the detector.
         undone: harmful faults that do no harm with the detector.
         added: harmless faults that do harm with the detector.
         unprotected: success rate of all missions with an active fault, without the detector.
         protected: the same with the detector, as `share`, `low` and `high`: the rates for harmful
             and for harmless faults, weighted by the numbers of these faults.
-        success: counts of pairs on complete missions by success; the unprotected flight is first.
+        success: counts of pairs in complete missions by success; the unprotected flight is first.
         worst: worst case over the faults in `flown`.
     """
 
@@ -206,7 +209,7 @@ class _CorrectedTest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorComparison:
-    """Two detectors on the same harmful faults: lost missions recovered, and harm undone."""
+    """A comparison of two detectors on the same harmful faults: missions recovered, harm undone."""
 
     first: str
     second: str
@@ -270,7 +273,7 @@ class Evaluation:
 def pairs_of(
     flights: Iterable[pa.Table], detectors: Collection[str], complete: Callable[[int], bool]
 ) -> tuple[pa.Table, pa.Table]:
-    """Return all complete pairs: those without a fault, and those with one.
+    """Match flights into pairs; return the pairs without a fault, and those with one.
 
     Args:
         flights: ended flights with labels for kind, detector and KEY, in the order of the pairs.
@@ -278,10 +281,10 @@ def pairs_of(
 
     Returns:
         Two tables with the columns of SCHEMA. `active`: the unprotected flight was struck, and a
-        node read the value or may have read it. `judged`: also, the golden flight succeeds.
-        `struck`: the protected flight was struck too; otherwise there was nothing to detect.
-        `seen`: it had an alarm at or after the strike. `by_chance`: the detector raises an alarm at
-        or after that time even without the fault.
+        node read the value or may have read it. `judged`: the fault is active, and the golden
+        flight succeeds. `struck`: the protected flight was struck too; otherwise there was nothing
+        to detect. `seen`: the protected flight had an alarm at or after the strike. `by_chance`:
+        the detector raises an alarm at or after that time even without the fault.
     """
     rows = [row for table in flights for row in _rows_of(table)]
     alarms = [row.pop("all_alarms") for row in rows]
@@ -363,7 +366,7 @@ def _first_alarm(
 
 
 def _against(golden: pa.Table, flown: pa.Table) -> dict[str, Any]:
-    """Return the columns of SCHEMA, with `harm`, that follow from flights and their golden ones."""
+    """Compare flights with their golden flights row by row; return `harm` and related columns."""
     lost = pc.invert(flown["won"])
     over, harmed = against_golden(pc.invert(golden["won"]), golden["time_s"], lost, flown["time_s"])
     harm = pc.if_else(harmed, pc.if_else(lost, LOST, LATE), HARMLESS)

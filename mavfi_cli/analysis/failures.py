@@ -1,10 +1,10 @@
-"""Failures caused by faults, across the layers and per flight hour.
+"""Mission failures caused by faults: per fault, per SDC of a kernel, and per flight hour.
 
-Every injected fault counts if the golden flight of its mission succeeds, even if nothing read it.
-`mavfi kernels` counts such a flip as a benign run, so both count the same population.
+Every injected fault counts if the golden flight of its mission succeeds, even if nothing read the
+struck value. `mavfi kernels` counts such a flip as a benign run, so both count the same population.
 
-The flights of a user's companion are not repeatable. There every injected fault counts, and the
-failures of all golden flights are given for comparison.
+The flights of a user's companion are not repeatable. For these, every injected fault counts, and
+the failures of all golden flights are given for comparison.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class SettingFailures:
         failure: share of injected faults whose mission fails; only missions whose golden flight
             succeeds count, unless flights are not repeatable.
         golden: share of golden flights that fail, if flights are not repeatable; None for pairs.
-        kernel: the only kernel that its faults strike at instruction level; None if there are
-            several.
+        kernel: the kernel that all its faults strike at instruction level; None if there is no
+            such kernel, or without a summary of isolated kernels.
         layers: comparison with the SDCs of the isolated kernel; None without runs of that kernel.
         per_hour: failures per flight hour with the ends of the interval; None unless requested.
             If flights are not repeatable, only failures in excess of those of golden flights.
@@ -66,8 +66,8 @@ def setting_failures(
 
     Raises:
         RecordError: the folder does not exist or cannot be read.
-        ConfigError: the kernels were attacked with other faults or the sample is stratified, both
-            only with `kernels`; or the rate is negative.
+        ConfigError: `kernels` is given, and its faults differ from the campaign's or the sample is
+            stratified; or the rate is negative.
     """
     alone = None if kernels is None else KernelSummary.read(kernels / KERNELS)
     silent = {own.name: own.outcomes["sdc"] for own in alone.kernels} if alone else {}
@@ -153,7 +153,7 @@ def _require_same_faults(config: MissionConfig, alone: KernelSummary) -> None:
     ours = {"rule": drawn.rule.value, "compat": fault.compat, "model": drawn.model.to_json()}
     if ours != alone.faults:
         raise ConfigError(
-            f"faults must be drawn as in the campaign, by {canonical(ours)}, "
-            f"got {canonical(alone.faults)}",
+            f"its faults must be drawn as in the campaign, by {canonical(ours)}, "
+            f"but were drawn by {canonical(alone.faults)}",
             path=alone.path,
         )

@@ -78,12 +78,12 @@ IntArray = NDArray[np.int64]
 def flights(ledger: Ledger, among: Sequence[int] | None = None) -> pa.Table:
     """Return the finished missions. Missions that could not begin have the state `error`.
 
-    The columns are the measures of `mission.measures`, the values requested for CONFIG and for the
-    fault's FAULT, each label as `label_NAME`, and all labels as text in `labels`. `succeeded` means
-    that the mission reached its goal. `counted` means that it is golden, or that its fault struck
-    something that was read or caught. `check_share` and `recovery_share_STAGE` are the shares of
-    the flight time that detection and recovery take. `weight` is the number of uniformly drawn
-    missions that a mission of a `stratum` stands for.
+    The columns are the measures of `mission.measures`, the requested values of CONFIG, those of the
+    fault's FAULT as `fault_NAME`, each label as `label_NAME`, and all labels as text in `labels`.
+    `succeeded` means that the mission reached its goal. `counted` means that it is golden, or that
+    its fault struck something that was read or caught. `check_share` and `recovery_share_STAGE` are
+    the shares of the flight time that detection and recovery take. `weight` is the number of
+    uniformly drawn missions that a mission of a `stratum` stands for.
 
     Args:
         among: numbers of the missions to choose from; None means all.
@@ -279,7 +279,7 @@ def changed(
     ratio: bool = True,
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Return the geometric mean of second / first, with the interval of the mean logarithm.
+    """Return the geometric mean of second / first, with an interval from the logarithms.
 
     Pairs with a value that is not positive are left out. Several pairs of one mission are not
     independent, so their mean counts as one value.
@@ -311,7 +311,7 @@ def mission_of(ledger: Ledger, number: int) -> tuple[MissionConfig, Mapping[str,
 
     Raises:
         RecordError: the campaign cannot be read.
-        ConfigError: no such mission has flown.
+        ConfigError: no mission with this number has been flown.
     """
     for row in flights(ledger, [number]).to_pylist():
         if row["outcome"] is not None:
@@ -328,7 +328,10 @@ def number_span(ledger: Ledger) -> str:
 
 
 def differing(row: Mapping[str, Any], flight: FlightRecord) -> list[str]:
-    """Return the columns in which a repetition differs. Exports store mixed columns as text."""
+    """Return the columns in which a repeated flight differs from its row.
+
+    Values with equal texts count as equal, because exports store mixed columns as text.
+    """
     again = {**measures_of(flight), "outcome": flight.outcome}
     return [
         name

@@ -1,4 +1,4 @@
-"""The summary that `mavfi kernels` writes, `kernels.json`."""
+"""Reads `kernels.json`, the summary that `mavfi kernels` writes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class KernelSummary:
     Attributes:
         faults: how the faults were drawn: `rule`, `compat` and `model`.
         seed: seed of the faults.
-        flight: the flight that the kernels' inputs come from.
+        flight: the flight from which the kernels' inputs were taken.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class KernelSummary:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a summary; RecordError if the file is missing or is not a summary."""
+        """Read a summary. Raise RecordError if the file is missing or is not a summary."""
         try:
             data = json.loads(read_bounded(path, _LARGEST))
             plan = data["plan"]

@@ -3,7 +3,7 @@
 Relative to flight time, each number of a setting is the mean over the missions that count for the
 success rate, with its bootstrap interval. Relative to kernel time, each number covers all
 error-free flights of a detector. Kernels and recomputations have the latencies of the flight's
-platform. Checks take the time measured on the host.
+platform. Checks have the times measured on the host.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval
 from mavfi_cli.stats.shares import Interval
 
 MEASURED = "measured"  # first word of the source of a measured overhead
-TIMES = " x "  # separates a platform's name from its latency factor in a file name
+TIMES = " x "  # separates the name of a platform from the factor in the name of its variant
 NEAR = 0.1  # with a latency factor this close to 1, a variant counts as the platform itself
 _STAGES = tuple(stage.value for stage in Stage)
 # Paths of ledgers: a campaign, an evaluation of detectors, flights of `mavfi vpm --fly`.
@@ -48,10 +48,10 @@ class FlightOverhead:
         flights: number of flights with checks.
         checks_per_s: checks per second of flight.
         check_host_s: mean time of a check on the host of the flight.
-        detection_host_share: time of all checks on that host, as a share.
+        detection_host_share: time of all checks on that host, divided by the flight time.
         recomputations: number in all flights, by stage.
-        recovery_share: simulated latency of recomputations, by stage.
-        recovery_share_in_all: its sum over the stages.
+        recovery_share: simulated latency of recomputations, divided by the flight time, by stage.
+        recovery_share_in_all: sum of `recovery_share` over the stages.
         share_in_all: detection plus recovery; adds host time and simulated time, as the paper does.
     """
 
@@ -72,7 +72,7 @@ class FlightOverhead:
         weighted: Sequence[tuple[DetectionCost, float]],
         confidence: float,
     ) -> Self:
-        """Average the costs of one detector over its weighted flights, which must not be empty."""
+        """Average the costs of one detector over its weighted flights; at least one is required."""
         costs = [cost for cost, _ in weighted]
         weights = np.array([weight for _, weight in weighted])
 
@@ -215,7 +215,7 @@ class ComputeOverhead:
 
 
 def _platform_name(called: str) -> str:
-    """Return the name in a platform's file if the file still exists, else the recorded name."""
+    """Return the recorded name; for a file, the name in it, or its stem if it cannot be loaded."""
     if not called.endswith(".toml"):
         return called
     try:
@@ -225,7 +225,7 @@ def _platform_name(called: str) -> str:
 
 
 def _same(name: str, platform: str) -> bool:
-    """Return whether `name` is the platform, or a variant of it made by `mavfi vpm --fly`."""
+    """Return whether `name` is the platform, or its variant with a latency factor near 1."""
     base, times, factor = name.rpartition(TIMES)
     if name == platform or not times or base != platform:
         return name == platform

@@ -33,7 +33,7 @@ PERCENT = 100.0
 EVERY_STAGE = "+".join(STAGES)
 LONGER = 1.10  # a flight is longer if its time is above this multiple of its golden flight's
 _COLUMNS: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("number", "seed", "fault_seed", "fault_bits"), pa.int64()),
+    **dict.fromkeys(("number", "seed", "world_seed", "fault_seed", "fault_bits"), pa.int64()),
     **dict.fromkeys((
         "pair", "world", "planner", "platform", "stack", "level", "fault_target", "fault_field",
         "detector", "protect", "state", "outcome", "injected", "activation",
@@ -47,6 +47,7 @@ _COLUMNS: Mapping[str, pa.DataType] = {
     ), pa.float64()),
     "counted": pa.bool_(),
 }  # fmt: skip
+_MOST_NAMED = 8  # worlds that a line lists
 _STRUCK = (Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT, Injected.NOT_ACTIVATED)
 _FAULTS = ("fault", "instruction")
 # A mission is one of the paper's if it differs from the defaults only in these, and its fault only
@@ -106,10 +107,10 @@ class Flights:
         repeats: whether the flight is repeatable. A flight of a user's companion is not, so it is
             not paired with a golden flight.
     Columns about its golden flight:
-        own_lost: whether it is lost; empty without a golden flight.
-        own_flight_time_s: its flight time.
-        over_own: flight time / its flight time; empty if either flight is lost.
-        added_s: flight time - its flight time; empty if either flight is lost.
+        own_lost: whether the golden flight is lost; empty without a golden flight.
+        own_flight_time_s: golden flight time.
+        over_own: flight time / golden flight time; empty if either flight is lost.
+        added_s: flight time - golden flight time; empty if either flight is lost.
         harmed: whether the flight is lost, or takes more than LONGER times as long; empty unless
             the golden flight succeeds.
     Columns about the flight with the same fault and no detector, empty without such a flight:
@@ -123,13 +124,13 @@ class Flights:
         """Take the flights from a table of `analysis.flights.flights`, or from an export.
 
         Raises:
-            ConfigError: they are a stratified sample, whose missions cannot be counted.
+            ConfigError: the flights are a stratified sample, whose missions have unequal weights.
         """
         there = set(table.column_names)
         if STRATUM in there and table[STRATUM].null_count < table.num_rows:
             raise ConfigError(
-                "the paper's tables and claims count missions, and those of a stratified sample "
-                "have weights: `mavfi campaign status --full` shows its settings"
+                "the paper's tables and claims count all missions equally, but missions of a "
+                "stratified sample have weights: see `mavfi campaign status --full`"
             )
         return cls(_beside_golden(_flown(pa.table({
             name: table[name].cast(kind) if name in there else pa.nulls(table.num_rows, kind)
@@ -138,7 +139,7 @@ class Flights:
 
     @classmethod
     def pooled(cls, several: Iterable[Flights], stack: str | None = None) -> Flights:
-        """Return the missions of several tables without duplicates; None means all stacks."""
+        """Merge the missions of several tables without duplicates, for one stack or for all."""
         own = [flights.table.select(_NOTHING_FLOWN.column_names) for flights in several]
         whole = cls(pa.concat_tables([_NOTHING_FLOWN, *own]).combine_chunks())
         whole = whole if stack is None else whole.chosen(stack=stack)
@@ -148,7 +149,7 @@ class Flights:
         return cls(_beside_golden(whole.table.take(pa.array(first.values(), pa.int64()))))
 
     def without(self, left_out: Iterable[bool]) -> Flights:
-        """Return the flights for which `left_out` (n,) is false, compared only with each other."""
+        """Leave out the flights for which `left_out` (n,) is true; pair the others anew."""
         kept = pa.array([not own for own in left_out], pa.bool_())
         return Flights(_beside_golden(self.table.select(_NOTHING_FLOWN.column_names).filter(kept)))
 
@@ -186,23 +187,23 @@ class Flights:
         return Flights(tables.chosen(self.table, **values))
 
     def faulty(self, detector: str | None = None, **values: object) -> Flights:
-        """Return the flights with a fault, and without a detector or with this one."""
+        """Return the flights with a fault and with this detector; None means without a detector."""
         struck = Flights(self.table.filter(pc.is_valid(self.table["level"])))
         return struck.chosen(detector=detector, **values)
 
     def struck(self, **values: object) -> Flights:
-        """Return the flights with a flipped bit, and without a detector or with the named one."""
+        """Return the flights whose fault flipped a bit, by default those without a detector."""
         return self.chosen(**{"struck": True, "detector": None, **values})
 
     def protected(self, detector: str, protect: str = EVERY_STAGE, **values: object) -> Flights:
-        """Return protected flights with a successful golden flight and a struck unprotected one."""
+        """Return protected flights with a successful golden and a struck unprotected flight."""
         seen = {"detector": detector, "protect": protect, "own_lost": False, "bare_struck": True}
         return self.chosen(**seen, **values)
 
     def of_fate(self, fate: Fate) -> Flights:
         """Return flights without a fault, and those whose fault has this fate without a detector.
 
-        A fault that has no flight without a detector has no fate.
+        A fault without an unprotected flight has no fate, so it belongs only to ALL.
         """
         if fate is Fate.ALL:
             return self
@@ -210,6 +211,23 @@ class Flights:
         ended = pc.if_else(bare, self.table["ended"], self.table["bare_ended"])
         same = pc.fill_null(pc.equal(ended, fate is Fate.DEAD), _NO)
         return Flights(self.table.filter(pc.or_(pc.is_null(self.table["level"]), same)))
+
+    @property
+    def population(self) -> str:
+        """The worlds for which intervals of these flights hold."""
+        places = [*zip(self["world"], self["world_seed"], strict=True)]
+        named = sorted({place for place in places if place[1] is not None})
+        each = ", ".join(f"{world} {seed}" for world, seed in named)
+        fixed = each if len(named) <= _MOST_NAMED else f"{len(named)} of them"
+        many = sum(seed is None for _, seed in places)
+        if not fixed:
+            return "worlds: another one for each seed; intervals hold for such worlds"
+        if not many:
+            return f"worlds: fixed ({fixed}); intervals hold for these worlds only"
+        return (
+            f"worlds: fixed ({fixed}) in {len(self) - many:,} flights, another one for each seed "
+            f"in {many:,}; intervals hold for neither kind alone"
+        )
 
     @property
     def seeds(self) -> list[tuple[str, int]]:
@@ -272,7 +290,7 @@ class Flights:
         return self.grouped(zip(*map(self.__getitem__, names), strict=True))
 
     def grouped(self, keys: Iterable[Any]) -> dict[Any, Flights]:
-        """Group the flights by a key for each, in the order of the groups' first flights."""
+        """Group the flights by one key per flight, in the order of the groups' first flights."""
         places: dict[Any, list[int]] = {}
         for place, key in enumerate(keys):
             places.setdefault(key, []).append(place)
@@ -284,7 +302,7 @@ class Flights:
         """Return the share of flights whose column equals `value`, among those with a value.
 
         Args:
-            clustered: whether the interval includes the design effect of missions with one seed.
+            clustered: whether the interval includes the design effect of a shared seed.
         """
         there = Flights(self.table.filter(pc.is_valid(self.table[column])))
         hits = [cell is value for cell in there[column]]
@@ -304,16 +322,15 @@ class Flights:
 
     @property
     def worst(self) -> WorstCase:
-        """The largest `ratios` of the same faults without and with a detector.
+        """The largest ratios of these protected flights, and of the same faults without a detector.
 
-        Only faults with a flight in both arms count, because the maximum grows with the number of
-        flights.
+        No other unprotected flights count, because a maximum grows with the number of flights.
         """
         return WorstCase.of(OWN, self.known("bare_over_own").tolist(), self.ratios.tolist())
 
     @property
     def faults(self) -> list[tuple[str, str]]:
-        """Mission and fault of each flight; flights with one fault differ in their detector."""
+        """Mission and fault of each flight; flights with equal entries differ in their detector."""
         return list(zip(self["pair"], self["fault"], strict=True))
 
     @property
@@ -393,7 +410,7 @@ def against_golden(
     own_lost: pa.ChunkedArray, own_time_s: pa.ChunkedArray, lost: pa.ChunkedArray,
     time_s: pa.ChunkedArray,
 ) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:  # fmt: skip
-    """Compare flights with their golden flights, which may be empty; all columns are (n,).
+    """Compare flights with their golden flights, whose cells may be empty; all columns are (n,).
 
     Returns:
         Flight time / golden flight time, empty if either flight is lost; and whether the flight is
@@ -459,7 +476,7 @@ def paired(rows: pa.Table, others: pa.Table, on: Sequence[str]) -> tuple[pa.Tabl
 
 
 def _repeat(keys: IntArray) -> IntArray:
-    """Return the number of earlier equal keys, (n,)."""
+    """Return the number of earlier equal keys for each key, (n,)."""
     order = np.argsort(keys, kind="stable")
     _, begins, counts = np.unique(keys[order], return_index=True, return_counts=True)
     earlier = np.empty(len(keys), dtype=np.int64)

@@ -2,12 +2,13 @@
 
 Flight time, distance, energy and replans are computed over the counted flights that succeeded.
 Response times are computed over all counted flights. A faulty flight counts if its fault struck,
-unless the struck value expired before anything read it. It counts if a detector withheld the value.
+unless the struck value expired before anything read it. It also counts if a detector withheld the
+value.
 
 The cost of a fault (Fig. 16 of the paper) is the flight time divided by that of the golden flight
 of the same mission on the same platform, if both reached the goal. The paper measures this in one
-fixed world; here it covers several. The ratio of the longest flight to the mean
-golden flight is also given. It depends on the length of the mission.
+fixed world; here it covers several. The ratio of the longest flight to the mean golden flight is
+also given, although it depends on the lengths of the missions.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from mavfi_cli.stats.bootstrap import TABLE_RESAMPLES, interval, interval_of_row
 from mavfi_cli.stats.paired import McNemar, WorstCase, sign_flips
 from mavfi_cli.stats.shares import Interval, Share
 
-LATE = 0.95  # quantile given with the worst case, which has no interval
+LATE = 0.95  # quantile given with the worst case, because that has no interval
 MISSION = ("seed", "target")  # columns that identify a mission on all platforms
 _SAME_S = 1e-6  # flight times this close are equal: a tick is 20 ms
 GOLDEN, NONE = "golden", "none"  # without fault; with fault and without detector
@@ -134,7 +135,7 @@ class SettingFlights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangedQuantity(Interval):
-    """A quantity on two platforms: mean `ratio` or mean `difference`, with its interval."""
+    """The change of a quantity between platforms: mean `ratio` or `difference`, with interval."""
 
     kind: str
     unit: str
@@ -162,7 +163,7 @@ class RatioRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CostInSeconds:
-    """Flight time beyond that of the golden flight; several faults of a mission count as one."""
+    """Flight time minus golden flight time; the interval resamples missions, not faults."""
 
     mean: Interval
     largest: float
@@ -184,7 +185,7 @@ class _CostRatio:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstFault:
-    """The fault of a flight."""
+    """The seed and the fault of a flight, with which it can be repeated."""
 
     seed: int
     target: str
@@ -196,9 +197,9 @@ class CostRow:
     """The cost of the faults of a setting on a platform.
 
     Attributes:
-        pairs: faulty flights that reached the goal as their golden flights did.
-        lost: flights that failed where the golden one reached the goal.
-        worst_flight: the one with the largest ratio, with the lowest seed if several are equal.
+        pairs: number of faulty flights that reached the goal, as did their golden flights.
+        lost: number of faulty flights that failed although their golden flights reached the goal.
+        worst_flight: the one with the largest ratio; among equals, the one with the lowest seed.
     """
 
     platform: str
@@ -211,7 +212,7 @@ class CostRow:
 
     @property
     def compared(self) -> int:
-        """Faulty flights whose golden flights reached the goal."""
+        """Number of faulty flights whose golden flights reached the goal."""
         return self.pairs + self.lost
 
 
@@ -245,8 +246,9 @@ class LongestFlight:
     """The longest successful flight of a setting, and its ratio to the mean golden one.
 
     Attributes:
-        over_mean_recovered_share: NaN if the longest flight with faults is no longer than the
-            longest golden one.
+        over_mean_recovered_share: share of the increase over the mean golden flight that the
+            detector recovers; NaN if the longest flight with faults is no longer than the longest
+            golden one.
     """
 
     platform: str
@@ -260,7 +262,7 @@ class LongestFlight:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedTimelines:
-    """Timelines of one mission on all platforms that reacted to a frame."""
+    """Timelines of one mission: one for each platform whose flight reacted to a frame."""
 
     seed: int
     platforms: list[Timeline]
@@ -293,7 +295,7 @@ class PlatformComparison:
 
 
 def figures(plan: ComparedPlan, flights: Flights, **about: Any) -> PlatformComparison:
-    """Compute all numbers of the flights.
+    """Compute all numbers of a comparison.
 
     Args:
         flights: flights with the columns of SCHEMA.
@@ -395,7 +397,7 @@ class FaultCosts:
 
     @property
     def costs(self) -> pa.Table:
-        """The flights that reached the goal as their golden flights did."""
+        """The faulty flights that reached the goal, as did their golden flights."""
         return self.counted.timed.table
 
     @property
@@ -490,7 +492,7 @@ def _by_mission(costs: pa.Table, measure: str) -> FloatArray:
 
 
 def _over(count: int, statistic: Callable[[IntArray], FloatArray]) -> Interval:
-    """Return `statistic` over missions, with its interval; it takes (..., missions) indices."""
+    """Return a statistic of mission indices (..., missions), with its interval over missions."""
     return interval_of_rows(count, statistic, resamples=TABLE_RESAMPLES)
 
 
@@ -502,7 +504,7 @@ def _mean(values: FloatArray) -> FloatArray:
 def _late(values: FloatArray) -> FloatArray:
     """Return the LATE quantile over the last two axes, ignoring NaN.
 
-    `numpy.nanquantile` with several axes loops over rows; here sorting puts NaN at the end.
+    It sorts, which puts NaN last, because `numpy.nanquantile` would loop over rows.
     """
     flat = np.sort(values.reshape((*values.shape[:-2], -1)), axis=-1)
     place = LATE * (np.count_nonzero(~np.isnan(flat), axis=-1) - 1)
@@ -517,7 +519,7 @@ def _late(values: FloatArray) -> FloatArray:
 
 
 def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
-    """Describe platforms, which are names or files."""
+    """Describe platforms, given by name or file."""
     names, profiles = titles(platforms), {name: load_platform(name) for name in platforms}
     return tuple(
         PlatformSummary(
@@ -533,7 +535,7 @@ def summaries(platforms: Sequence[str]) -> tuple[PlatformSummary, ...]:
 
 
 def titles(platforms: Sequence[str]) -> dict[str, str]:
-    """Return names of platforms for tables and pictures: the stem of a file, if that is unique."""
+    """Return platform names for tables and pictures: a file's stem, if that is unique."""
     short = [name.removesuffix(".toml").rpartition("/")[2] for name in platforms]
     return {
         name: stem if short.count(stem) == 1 else name

@@ -1,8 +1,9 @@
 """Recorded flights as seen by detectors: samples for fitting, and one score per replayed flight.
 
 The score of an unprotected flight is the highest score of its messages, in units of the detector's
-threshold. Above 1 the gate would have raised an alarm. Nothing is withheld during the replay, so
-the scores do not depend on the threshold. They include the checks of the active plan.
+threshold. With a score above 1, the gate would have raised an alarm. Nothing is withheld during the
+replay, so a message's score does not depend on the threshold. Steps of the active plan are scored
+too.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ def scored(
 
     Args:
         detectors: all except `none`.
-        folder: stores the scores by the name of the run folder; only missing ones are computed.
-        pairs: without faults and with one, as `detectors.pairs_of` returns them.
+        folder: its file SCORES holds the scores by run folder; only missing scores are computed.
+        pairs: tables without faults and with one, as `detectors.pairs_of` returns them.
         note: receives a text with the number of replayed flights.
     """
     store = folder / SCORES
@@ -82,7 +83,7 @@ def scored(
         write_json(store, kept)
 
     def known(path: str | None, detector: str) -> float | None:
-        """Return a flight's score; None without a run folder. A NaN score counts as an alarm."""
+        """Return a flight's score, infinite for a NaN; None if the flight was not replayed."""
         if path is None or Path(path).name not in scores[detector]:
             return None
         score = scores[detector][Path(path).name]
@@ -121,9 +122,9 @@ def _value(state: str, pattern: str) -> float | int | bool:
 
 
 def _score(seen: _Seen, struck_s: float | None, detector: DetectorConfig, stack: str) -> float:
-    """Return the highest score at or after the strike, or of the whole flight without a strike."""
+    """Return the highest score, since the strike if there is one, in units of the threshold."""
     columns, plans, strikes = seen
-    if not columns:  # it ended before the first tick
+    if not columns:  # the flight ended before the first tick
         return 0.0
     path, fresh = detector.model_path(stack), detector.build(stack)
     from_s = -math.inf if struck_s is None else struck_s - 1e-9
@@ -144,8 +145,12 @@ def flown_samples(flown: Path, stack: StackMark) -> tuple[list[FlightSamples], i
     """Collect the samples of the error-free flights among the run folders in `flown`.
 
     Returns:
-        The samples, the number of other flights, and the autopilots used. A flight has the name of
-        its world, or that of its run folder if an earlier flight has the same world and seed.
+        The samples, the number of flights that are not error-free, and the autopilots of the
+        others. A flight is named after its world, or after its run folder if an earlier flight has
+        the same world and seed.
+
+    Raises:
+        ModelError: no flight is error-free.
     """
     runs = [load_run(path) for path in sorted(flown.glob(f"*/{RESULT}"))]
     usable = [run for run in runs if _is_error_free(run, stack)]

@@ -80,7 +80,8 @@ class Comparison:
         over_own: largest ratio of a flight time to that of the golden flight of the same mission,
             if both succeeded.
         over_mean: ratio of the longest of these flights to the mean of their golden flights, as in
-            the paper. If the second setting is protected, both include what protection recovers.
+            the paper. If the second setting is protected, `over_own` and `over_mean` include what
+            protection recovers.
     """
 
     first: Labels
@@ -208,7 +209,7 @@ class Group:
 
     @cached_property
     def metrics(self) -> Mapping[str, FloatArray]:
-        """METRICS, (n,) each; NaN if a mission has none."""
+        """The values of METRICS, (n,) each; NaN where a mission has none."""
         return {name: numbers(self.flights, name) for name in METRICS}
 
     @cached_property
@@ -223,7 +224,7 @@ class Group:
 
     @cached_property
     def golden(self) -> bool:
-        """Whether the missions have no fault."""
+        """Whether none of the missions has a fault."""
         return bool(self.among("injected", (Injected.GOLDEN.value,)).all())
 
     @cached_property
@@ -275,16 +276,16 @@ class Group:
 
     @cached_property
     def clusters(self) -> IntArray | None:
-        """The cluster of each mission, (n,), if several faults of a uniform sample strike one pair.
+        """The cluster of each mission, (n,), if a uniform sample has several faults per pair.
 
-        They strike the same invocation of a node, so their effects are correlated.
+        Such faults strike the same invocation of a node, so their effects are correlated.
         """
         places = np.column_stack([self.codes("cell"), self.codes("pair")])
         alone = self.golden or self.stratified or len(np.unique(places, axis=0)) == len(places)
         return None if alone else self.codes("pair")
 
     def share(self, hits: BoolArray, chosen: BoolArray, confidence: float = 0.95) -> Share:
-        """Return the share of hits among the chosen missions, both (n,), by weight and cluster."""
+        """Return the share of `hits` among `chosen` missions, (n,) each, by weight and cluster."""
         if self.clusters is not None:
             own, places = hits[chosen].tolist(), self.clusters[chosen].tolist()
             effect = design_effect(own, [("", place) for place in places])
@@ -320,7 +321,7 @@ class Group:
         return float(np.std(values - values[0], ddof=1)) if len(values) > 1 else np.nan
 
     def golden_among(self, groups: Sequence[Group]) -> Group | None:
-        """Return the golden setting that shares the most pairs; None if golden or without any."""
+        """Return the golden setting that shares the most pairs, if any; None if this is golden."""
         if self.golden:
             return None
         shared = [
@@ -332,11 +333,11 @@ class Group:
         return groups[-most[1]] if most[0] else None
 
     def matched(self, other: Group) -> tuple[IntArray, IntArray]:
-        """Return the rows of counted missions with equal pairs, in this and the other, (m,) each.
+        """Return the row indices (m,) of matching counted missions, in this group and the other.
 
-        They are in the other's order. Missions with faults match if they have the same faults.
-        If a pair was flown several times, the first flights match, then the second ones, and so on.
-        A golden flight matches every flight of its pair.
+        They are in the other's order. Missions of a pair match if this group is golden, or if they
+        have the same fault. If a pair was flown several times, the first flights match, then the
+        second ones, and so on. A golden flight matches every flight of its pair.
         """
         there = np.flatnonzero(other.counted)
         here = partners(
@@ -350,7 +351,7 @@ class Group:
 
 
 def groups(ledger: Ledger, by: Sequence[str] = ()) -> list[Group]:
-    """Merge settings whose labels `by` are equal; UnknownName if no setting has such a label."""
+    """Merge settings with equal labels `by`. Raise UnknownName if no setting has such a label."""
     labels = ledger.cells()
     names = {name for setting in labels for name in setting}
     for name in by:
@@ -460,7 +461,7 @@ class _Match(_Arms):
         return _interval(change[there], confidence, weights, clusters)
 
     def worst(self) -> tuple[WorstCase, WorstCase]:
-        """Return worst cases relative to each pair's own golden flight, and to their mean.
+        """Return worst cases relative to each pair's golden flight, and to the mean of these.
 
         A pair counts only if its golden flight succeeded.
         """
@@ -585,7 +586,7 @@ def _interval(
     weights: FloatArray | None,
     clusters: IntArray | None,
 ) -> Interval:
-    """Return the mean; with clusters, the mean of their means, which are independent."""
+    """Return the mean with its interval; with clusters, that of the independent cluster means."""
     if clusters is not None and len(values):
         _, which = np.unique(clusters, return_inverse=True)
         values = np.bincount(which, values) / np.bincount(which)

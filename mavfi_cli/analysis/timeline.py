@@ -1,7 +1,7 @@
-"""Kernel invocations from a depth frame to its setpoint, from a recorded time table.
+"""Kernel invocations from a depth frame to the first setpoint that depends on it.
 
-The input of an invocation is the newest output of the preceding kernel at its start, because the
-queues keep only the newest message.
+They are taken from a recorded time table. When an invocation starts, its input is the newest output
+of the preceding kernel, because the queues keep only the newest message.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Span = tuple[float, float]  # begin and end, s after the frame's stamp
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeline:
-    """At least a second of a flight after a typical depth frame, in s after the frame's stamp.
+    """At least one second of a flight; times are in s after the stamp of a typical depth frame.
 
     Attributes:
-        platform: its name.
+        platform: name of the platform.
         frame_stamp_s: simulated time of the frame.
         response_s: time of the first setpoint that depends on the frame.
         answer: the pilot's reaction.
@@ -72,8 +72,8 @@ def timelines(runs: Mapping[str, Run]) -> list[Timeline]:
 def _timeline_of(platform: str, run: Run, least_s: float = LEAST_S + _MARGIN_S) -> Timeline | None:
     """Return the timeline of a flight, at least `least_s` long; None without a reaction.
 
-    If a verdict made the vehicle slow down or stop, a frame with such a verdict is used, and the
-    timeline ends with the first setpoint of the new plan.
+    If a verdict made the vehicle slow down or stop, the timeline is that of a frame with such a
+    verdict, and lasts at least until the first setpoint of the new plan.
     """
     ran, reactions = run.folder.read_timetable()
     answers = {event.stamp_s: event.text for event in run.record.events if event.kind in _ANSWERS}
@@ -155,7 +155,7 @@ def _chain_of(invocations: Sequence[Invocation], reaction: Reaction) -> list[Inv
 
 
 def _planned(invocations: Sequence[Invocation], answer_s: float) -> Invocation | None:
-    """Return the planner's first invocation after a reaction, in motion or at rest, or None."""
+    """Return the planner's first invocation after a reaction; None after _PLAN_WITHIN_S."""
     for invocation in invocations:
         if invocation.node == "planner" and invocation.start_s >= answer_s - _SAME_S:
             return invocation if invocation.start_s <= answer_s + _PLAN_WITHIN_S else None
@@ -177,7 +177,7 @@ def _answered(
 def timeline_seed(flights: pa.Table, platforms: Sequence[str]) -> int | None:
     """Return the seed of the first mission that succeeds and replans on all platforms.
 
-    If none replans, it is the first that succeeds on all platforms; None without such a mission.
+    If none does both, return that of the first mission that succeeds on all platforms, or None.
 
     Args:
         flights: golden and other flights, with the columns of `platforms.SCHEMA`.

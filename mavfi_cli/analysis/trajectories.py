@@ -23,7 +23,7 @@ class _DrawnFlight:
 
     Attributes:
         number: number of its mission.
-        name: name of its setting, only as long as it takes to be distinct in the panel.
+        name: name of its setting, with details only where the panel has several of that name.
         flight_time_s: None if the flight has none.
         path: its run folder.
     """
@@ -77,7 +77,7 @@ class _Flown:
 
     @property
     def cut_off(self) -> bool:
-        """Whether its process ended before it wrote the trace."""
+        """Whether its process ended before it wrote the record."""
         return self.path is not None and self.path.is_dir() and not (self.path / RESULT).is_file()
 
     @property
@@ -91,7 +91,7 @@ class _Flown:
 
     @property
     def treatment(self) -> list[str]:
-        """The labels other than the name that distinguish its setting from others of that name."""
+        """Values of the labels that distinguish its setting from others of the same name."""
         values = (self.labels.get(name) for name in TREATMENT[1:])
         return [
             "no detector" if value == "none" else str(value)
@@ -107,8 +107,8 @@ def pair(
 
     Args:
         number: number of the mission. None selects, among the pairs with all run folders, the one
-            in which a fault prolongs a successful flight most, relative to the golden flight time;
-            the first such pair on the list if no fault does.
+            in which a fault prolongs a successful flight most, relative to the golden flight time.
+            If no fault does, it selects the first of these pairs.
         among: numbers of the missions to choose from and to draw; None means all.
 
     Raises:
@@ -135,7 +135,9 @@ def pair(
         if row["state"] == ResultState.FLOWN.value
     ]
     if not flown:
-        raise RecordError(f"{ledger.folder}: no flight of mission {number}'s pair has been flown")
+        raise RecordError(
+            f"{ledger.folder}: no mission in the pair of mission {number} has been flown"
+        )
     lost = [flight.number for flight in flown if flight.path is None]
     if lost:
         raise RecordError(f"{ledger.folder}: no run folder of {_missions(lost)} was kept; {_KEPT}")

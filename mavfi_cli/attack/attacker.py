@@ -1,4 +1,4 @@
-"""Runs one fault: reach the location, flip, follow, run to the end, judge."""
+"""Runs one fault: reaches its location, flips and follows bits, runs to the end and judges."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from mavfi_cli.fi.tracer.tracee import Ended, Tracee
 
 GOLDEN_RUNS = 3
 _HIT_LIMIT_S = 1e-3  # allowed for one counted execution, about a hundred times what it takes
-Task = tuple[int, InstructionFault | None]  # number, and the fault; None: drawn when it strikes
+Task = tuple[int, InstructionFault | None]  # number and fault; None: drawn when it strikes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunResult:
-    """One faulty run."""
+    """The result of one faulty run."""
 
     outcome: RunOutcome
     signal: int | None
@@ -64,10 +64,10 @@ class RunResult:
 
 
 def golden_run(place: JudgedPlace) -> Golden:
-    """Run several times without a fault, and require equal results.
+    """Make fault-free runs and require equal results. Return the first, with the longest times.
 
     Raises:
-        TargetError: the target fails, or its outputs differ.
+        TargetError: a run fails, or the outputs differ.
     """
     runs = [place.fault_free() for _ in range(GOLDEN_RUNS)]
     for again in runs[1:]:
@@ -86,7 +86,7 @@ class Attacker:
     golden: Golden
 
     def run(self, fault: InstructionFault) -> RunResult:
-        """Run once with a fault at an exact execution of an instruction.
+        """Run once, with a fault at an exact execution of an instruction.
 
         Raises:
             FaultError: the location holds an instruction other than the drawn one.
@@ -111,7 +111,7 @@ class Attacker:
     def run_timed(
         self, plan: Strategy, rng: np.random.Generator, *, null: bool = False
     ) -> RunResult:
-        """Run once with a fault at a random moment of the golden run's CPU time or duration.
+        """Run once, with a fault at a random moment of the golden run's CPU time or duration.
 
         Args:
             null: leave out the flip.

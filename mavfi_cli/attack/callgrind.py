@@ -2,7 +2,8 @@
 
 Callgrind takes 10 to 60 times as long as the program. It writes a file of counts after every
 `_BLOCKS` basic blocks and one at the end; their sum covers the whole run. The finished files give
-the counting rate. The native CPU time up to the same counts gives the remaining time.
+the counting rate. The remaining time is estimated from the CPU time that a native run takes to
+reach the same counts.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from mavfi_cli.fi.tracer.spawn import Program
 
 # Execution counts by object path (or UNNAMED), then by linked address.
 Executions = Mapping[str, Mapping[int, int]]
-UNNAMED = "???"  # objects that valgrind does not recognise; their addresses are addresses in memory
+UNNAMED = "???"  # code that valgrind assigns to no object; its addresses are those in memory
 
 _SLOWER = 200.0
 _START_S = 60.0
 _REPORT_EVERY_S = 1.0
-_LAST_BYTES = 64  # at the end of a file, which include its last line
+_LAST_BYTES = 64  # bytes at the end of a file; they include its last line
 _BLOCKS = 200_000_000  # basic blocks between two files: 10 to 20 s
 
 
@@ -53,13 +54,13 @@ def count_executions(
     """Run a program under callgrind; return its exit code and its execution counts.
 
     Args:
-        counts: path of callgrind's output; it also writes numbered files with this prefix.
+        counts: path of callgrind's output. Callgrind also writes numbered files with this prefix.
         native_s: maps the execution counts so far to the CPU time of a native run up to that
             point, s; returns None if that is unknown.
         report: called every second with a description of the progress.
 
     Raises:
-        TargetError: it does not end in time, or a signal kills it.
+        TargetError: the program does not end in time, or a signal kills it.
     """
     name = Path(command.argv[0]).name
     tool = [

@@ -69,7 +69,7 @@ class Plan:
         return Strategy.of(self.rule, self.model, compat=self.compat)
 
     def to_json(self, target: AttackTarget) -> Json:
-        """Return the entries that determine a target's results, except the number of runs."""
+        """Return the settings that determine a target's results, except the number of runs."""
         return {
             "seed": self.seed,
             "rule": self.rule,
@@ -127,7 +127,7 @@ def run_campaign(
     stage: Stage = lambda _: None,
     notice: Stage = lambda _: None,
 ) -> list[TargetRuns]:
-    """For every target, make the golden run, profile it, draw the faults and run them.
+    """For every target, make its golden run, profile the target, draw the faults and run them.
 
     Args:
         targets: one or more targets; several need distinct streams.
@@ -135,6 +135,7 @@ def run_campaign(
             as it ends. Runs that it already holds are not repeated.
         progress: called with the target's name and its number of completed runs, first with 0
             before the golden run.
+        stage: called with a description of each step.
         notice: called with each warning about a golden run.
 
     Raises:
@@ -267,7 +268,7 @@ def _draw(plan: Plan, setup: _TargetSetup, prepared: TargetRuns) -> list[FaultRe
 
 _CHUNK = 32  # tasks that are sent to a worker at once
 _TERMINATED = 128 + signal.SIGTERM
-_RECHECKED = 1000  # runs after which a null run is repeated
+_RECHECKED = 1000  # number of runs after which a null run is repeated
 
 
 _claims: list[socket.socket] = []  # of this process
@@ -321,7 +322,7 @@ class _TargetSetup:
         return tuple(Attacker(place=part, golden=golden) for part, golden in pairs)
 
     def generator(self, *what: str | int) -> np.random.Generator:
-        """Return a generator of the target's stream for one purpose, such as one fault number."""
+        """Return a generator of the target's stream for one purpose, such as drawing one fault."""
         return Stream.FAULT.generator(self.plan.seed, *self.target.stream, *what)
 
     def draw(self, profiles: Profiles, index: int) -> InstructionFault | None:
@@ -474,17 +475,18 @@ def replay_runs(
     runs: int = 0,
     program: ProgramTarget | None = None,
 ) -> Iterator[_Replay]:
-    """Repeat the runs of a campaign's folder.
+    """Repeat the runs that a campaign's folder holds.
 
     Args:
         kernels: names of the kernels; empty for all built-in ones.
         runs: number of runs to repeat per kernel, or of the program; 0 for all.
-        program: the program that the user named. The folder may come from somebody else, so its
-            program is executed only if it is this one.
+        program: the program that the user named. The folder may come from somebody else, so the
+            program recorded there is executed only if it is the same.
 
     Raises:
         RecordError: the folder holds no repeatable runs.
-        ConfigError: the folder holds runs of another program.
+        ConfigError: the folder holds runs of a program that the user did not name, or no runs of
+            the named one.
         BuildMismatch: a record comes from another build.
     """
     plan, repeated = read_plan(folder), False
@@ -537,7 +539,7 @@ def _targets(
     if "inputs_sha256" not in plan:
         raise RecordError(f"{folder}: holds no runs of kernels or of a program")
     if plan.get("sources") != own_digest():  # other code has another memory layout
-        raise BuildMismatch(["our own code"])
+        raise BuildMismatch(["mavfi's own code differs"])
     for kernel in catalogue.select(kernels):
         tolerance = float(plan["tolerance"])
         yield KernelTarget(kernel=kernel, inputs=folder / INPUTS, tolerance=tolerance)

@@ -1,7 +1,7 @@
 """Compares outputs with those of the golden run.
 
-Kernel templates import this module, so it must not load the tracer: every run copies what they
-load.
+Kernel templates import this module, so it must not load the tracer: every run copies everything
+that its template has loaded.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Difference:
 
     Attributes:
         relative: the value to compare with a tolerance; inf if the outputs cannot be compared
-            number by number (another shape, another kind of answer, not a number).
+            number by number (different shapes, different kinds of answer, not a number).
         absolute: the same in `unit`, or inf.
         unit: unit of `absolute`.
         text: the difference in words.
@@ -42,7 +42,7 @@ class Difference:
     parts: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> Json:
-        """Return the entries of a record. Non-finite sizes become null."""
+        """Return the entries for a record. Non-finite sizes become null."""
         finite = math.isfinite(self.relative)
         return {
             "relative": self.relative if finite else None,
@@ -93,7 +93,7 @@ class OutputComparison:
         )
 
     def to_json(self) -> Json:
-        """Return the entries that determine results."""
+        """Return the settings that determine the results."""
         names: list[str | None] = [None] if self.stdout else []
         names += self.files
         entries: Json = {"file": names[0] if len(names) == 1 else names}
@@ -102,7 +102,7 @@ class OutputComparison:
         return entries | {"tolerance": self.tolerance}
 
     def parts(self, folder: Path, stdout: Path) -> dict[str, bytes | None]:
-        """Read a run's outputs, by name; None for a file that it did not write."""
+        """Read a run's outputs by name; None for a file that is missing or outside the folder."""
         outputs: dict[str, bytes | None] = {}
         if self.stdout:
             outputs[STDOUT] = self._kept(_beginning(stdout))
@@ -157,7 +157,7 @@ def _pattern(text: str) -> bytes:
 
 
 def _read_inside(folder: Path, name: str) -> bytes | None:
-    """Read a regular file below the folder; None if a link leads out of it."""
+    """Read a regular file below the folder; None if it is missing or a link leads out of it."""
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()) or not path.is_file():
         return None
@@ -165,7 +165,7 @@ def _read_inside(folder: Path, name: str) -> bytes | None:
 
 
 def _beginning(path: Path) -> bytes:
-    """Return the contents of a file, truncated to just beyond the compared size."""
+    """Return the contents of a file, truncated to one byte more than can be compared."""
     with path.open("rb") as file:
         return file.read(LARGEST_BYTES + 1)
 

@@ -1,8 +1,8 @@
 """The folder of a campaign: its plan, its drawn faults, and its completed runs.
 
-`plan.json` describes the campaign. `faults.jsonl` (`faults-KERNEL.jsonl`) is written before the
-first fault runs. `runs.jsonl` gains one line per run, so an interrupted campaign continues where it
-stopped.
+`plan.json` describes the campaign. `faults.jsonl` (one `faults-KERNEL.jsonl` per kernel) is written
+before the first fault runs. `runs.jsonl` gains one line per run, so an interrupted campaign can
+continue where it stopped.
 """
 
 from __future__ import annotations
@@ -39,10 +39,12 @@ class Journal:
         Args:
             known: everything that determines the campaign's results, as plain values.
             runs: number of runs of each kernel when the campaign is complete.
+            kernels: names of the campaign's kernels; None for a program.
 
         Raises:
-            ConfigError: it holds another campaign, or more runs than `runs`.
-            RecordError: it cannot be written.
+            ConfigError: the folder holds another campaign, more runs than `runs`, or runs of
+                kernels other than `kernels`.
+            RecordError: the folder cannot be written.
         """
         self._folder = folder
         path = folder / PLAN
@@ -64,7 +66,7 @@ class Journal:
             self._write(b"\n")
 
     def _require_all(self, runs: int, kernels: Sequence[str] | None) -> None:
-        """Refuse to omit existing runs, because the summary covers the whole folder."""
+        """Refuse to leave out existing runs, because the summary covers the whole folder."""
         counts: dict[str, int] = {}
         for entry in read_runs(self._folder):
             kernel = entry.get("kernel", "")
@@ -142,7 +144,7 @@ def _same_fault(entry: FaultRecord, planned: FaultRecord) -> bool:
     if entry.get("kernel") != planned.get("kernel"):
         return False
     golden = planned.get("golden_sha256")
-    if entry.get("golden_sha256", golden) != golden:  # it was compared with another output
+    if entry.get("golden_sha256", golden) != golden:  # it was compared with another golden output
         return False
     if not planned["trigger"]:
         return not entry["trigger"]

@@ -1,6 +1,6 @@
 """Applies one fault in a process that keeps running: a node of a mission, or a user's program.
 
-Call it in a thread of its own, because ptrace obeys only the thread that attached.
+Call these functions in a thread of their own, because ptrace obeys only the thread that attached.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from mavfi_cli.fi.tracer.sampling import draw_fault_here
 from mavfi_cli.fi.tracer.tracee import Ended, Tracee, threads_of
 from mavfi_cli.spec.fault import UNIFORM, InstructionConfig
 
-MOST_STEPS = 1000  # executed instructions between a moment and the fault
+MOST_STEPS = 1000  # largest number of instructions from a moment to the fault
 _WINDOW = 64  # instructions for which a fault is followed
-# Longest time for which a thread is stepped to a fault, and for which the fault is followed. The
-# program runs in real time, and PX4 detects a missing companion after 0.5 s.
+# Longest time for which a thread is stepped to a fault, and for which the fault is then followed.
+# The program runs in real time, and PX4 detects a missing companion after 0.5 s.
 _STEPPED_S, _FOLLOWED_S = 0.15, 0.05
 _AT_ONCE = 50  # instructions that are stepped between two checks of the clock
 _LOOK_S, _SEARCH_S = 1e-3, 10.0  # interval of the checks for code in scope, and their total time
@@ -56,7 +56,7 @@ def mission_strategy(fault: InstructionConfig) -> Strategy:
     if fault.compat is None and strategy.rule is not Rule.INSTRUCTION:
         raise FaultSpecError(
             f"sampling by {fault.sampling} cannot be repeated; a mission's sampling must be "
-            f"{UNIFORM} (`mavfi kernels` accepts both)"
+            f"{UNIFORM} (`mavfi kernels` accepts all rules)"
         )
     return strategy
 
@@ -68,7 +68,7 @@ class LiveAttack:
     injection: Injection | None  # None: the trigger was not reached, or null injection
     followed: Followed
     reason: str
-    ended: Ended | None  # None: the process lives on, detached
+    ended: Ended | None  # None: the process continues, detached
     record: FaultRecord
 
 
@@ -92,8 +92,8 @@ def attack_live(
     `Popen.wait`.
 
     Args:
-        window: number of instructions for which a destination fault is followed.
-        armed: called once the process runs towards the trigger.
+        window: largest number of instructions for which a destination fault is followed.
+        armed: called just before the process runs to the trigger.
         reached: called when the process has stopped at the trigger.
         leave_stopped: detach with the process stopped (SIGSTOP) after the flip, for a debugger.
         context: further entries of the record: kernel, stage, sampling rule, seed, scope.
@@ -138,17 +138,17 @@ def attack_moment(
     repeat: FaultRecord | None = None,
     **context: Any,
 ) -> LiveAttack:
-    """Apply one fault in a process now or shortly afterwards, and let it continue.
+    """Apply one fault in a running process, at once or soon afterwards, and let it continue.
 
-    A thread is drawn in proportion to the CPU time that it has used so far, and stopped. Under the
-    rule `INSTRUCTION` it is stepped, and the fault strikes the k-th executed instruction in scope;
-    k is drawn uniformly from 1 to `MOST_STEPS`, and is smaller if the steps take too long. Under a
-    time rule the fault strikes where the thread is, or where a later check finds it in scope. The
-    process runs in real time, so neither is repeatable.
+    A thread is drawn with probability proportional to the CPU time that it has used, and stopped.
+    Under the rule `INSTRUCTION` it is stepped, and the fault strikes the k-th executed instruction
+    in scope; k is drawn uniformly from 1 to `MOST_STEPS`, and is smaller if the steps take too
+    long. Under a time rule, the fault strikes where the thread is, or where a later check finds the
+    thread in scope. The process runs in real time, so neither kind of fault is repeatable.
 
     Args:
-        objects: shared objects or executables in scope; empty for all files of the process,
-            without the interpreter of a Python program.
+        objects: shared objects or executables in scope; empty for all that the process has loaded,
+            except the interpreter of a Python program.
         function: only code that executes during calls of this function is in scope. The first
             thread that calls it is struck.
         null: leave out the flip.
@@ -203,7 +203,7 @@ def attack_moment(
 
 
 def _own_objects(pid: int, image: Image) -> list[str]:
-    """Return the objects of a process, without the interpreter if it is a Python program."""
+    """Return the objects of a process, except the interpreter of a Python program."""
     program = Path(os.readlink(f"/proc/{pid}/exe")).name
     left_out = ("python", "libpython") if program.startswith("python") else ()
     names = (name for name in image.names if not name.startswith(left_out))
@@ -211,7 +211,7 @@ def _own_objects(pid: int, image: Image) -> list[str]:
 
 
 def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
-    """Draw a thread in proportion to the CPU time that it has used (proc_pid_schedstat(5))."""
+    """Draw a thread with probability proportional to its CPU time (proc_pid_schedstat(5))."""
     threads = threads_of(pid)
     if not threads:
         return pid
@@ -222,7 +222,7 @@ def _drawn_thread(pid: int, rng: np.random.Generator) -> int:
 def _cpu_ns(pid: int, thread: int) -> int:
     try:
         return int(Path(f"/proc/{pid}/task/{thread}/schedstat").read_text().split()[0])
-    except (OSError, ValueError, IndexError):  # it has ended, or the kernel does not report it
+    except (OSError, ValueError, IndexError):  # it has ended, or the kernel reports no time
         return 0
 
 
@@ -235,19 +235,19 @@ def _thread_name(tid: int) -> str:
 
 @dataclass(slots=True)
 class _Search:
-    """Steps a stopped thread to a drawn execution of the code in scope."""
+    """Steps a stopped thread to a drawn execution of an instruction in scope."""
 
     tracee: Tracee
     image: Image
     scope: Scope
-    entry: int | None  # of the function during whose calls code is in scope
+    entry: int | None  # of the only function whose calls are in scope
     plan: Strategy
     rng: np.random.Generator
     _caller: int = -1  # stack pointer at the function's entry; a higher one is its caller's
     _stepped_s: float = 0.0  # excludes system calls, in which the thread waits anyway
 
     def fault(self) -> tuple[InstructionFault | None, str]:
-        """Run the thread to a fault and return the fault, or None and the reason."""
+        """Run the thread to a fault. Return the fault, or None and why there is none."""
         by_steps = self.plan.rule is Rule.INSTRUCTION
         drawn = int(self.rng.integers(MOST_STEPS)) + 1 if by_steps else 0
         reason, count = "it executed no code in scope", 0
@@ -294,14 +294,14 @@ class _Search:
         return False
 
     def _return_address(self) -> int:
-        """Return the word on top of the stack."""
+        """Return the word on top of the stack; 0 if it cannot be read."""
         try:
             return int.from_bytes(self.tracee.memory.read(self.tracee.registers.sp, 8), "little")
         except OSError:
             return 0
 
     def _steps(self, most: int) -> int:
-        """Execute at most `most` instructions in scope, in a compiled loop. Return how many."""
+        """Execute at most `most` instructions in scope, in a compiled loop. Return their number."""
         from mavfi_cli.fi.tracer import stepper  # numba takes half a second to import
 
         begun_s, tracee = time.perf_counter(), self.tracee

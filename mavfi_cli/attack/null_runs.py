@@ -49,7 +49,7 @@ class NullRuns:
 
     @property
     def reached(self) -> int:
-        """Null runs that reached their fault."""
+        """Number of null runs that reached their fault."""
         return sum(self.counting.values())
 
 
@@ -93,7 +93,7 @@ def make_null_runs(
 
 
 def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: float) -> None:
-    """Repeat a null run later to detect a slow change, such as a change of date.
+    """Repeat a null run later, to detect a slow change such as a change of date.
 
     Args:
         golden_s: end of the golden runs on `time.monotonic`. The null run begins at least a
@@ -106,8 +106,8 @@ def require_golden_again(name: str, null_runs: NullRuns, run: Run, golden_s: flo
     if any(null_run.differs for null_run in _make(null_runs.tasks[:1], run)):
         raise TargetError(
             name,
-            "a run without a flip no longer ends as the golden run did: it depends on time or on "
-            "what earlier runs left behind, so no outcome can be judged",
+            "a run without a flip no longer ends as the golden run did, so no outcome can be "
+            "judged: the target depends on time or on what earlier runs left behind",
         )
 
 
@@ -155,7 +155,7 @@ def _problem(made: Iterable[_NullRun]) -> str:
 
 
 def _by_turns(faults: Sequence[Task]) -> tuple[Task, ...]:
-    """Choose null runs in rotation from all counting methods, and from all places of each."""
+    """Choose null runs in rotation among the counting methods, and among the places of each."""
     methods: dict[Counting, dict[Location | None, list[Task]]] = {}
     for task in faults:
         stops = _detours(task[1])

@@ -1,4 +1,4 @@
-"""The interface of a place where a target runs repeatedly, and its golden run there."""
+"""The interface of a place where a target runs repeatedly, and the target's golden run."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class AttackPlace(Protocol):
         """Kind of the target for messages: kernel, node or program."""
 
     def start(self) -> Tracee:
-        """Start a run, stopped before any code in scope."""
+        """Start a run, and stop it before it executes any code in scope."""
 
     def image(self, tracee: Tracee) -> Image:
         """Return the memory image of a run."""
 
     def scope(self, image: Image) -> Scope:
-        """Return the code that may be hit."""
+        """Return the code that faults may hit."""
 
     def close(self) -> None:
         """End all processes and remove all temporary files."""
@@ -40,7 +40,7 @@ class AttackPlace(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Golden:
-    """The golden run."""
+    """The output, duration and exit code of a golden run."""
 
     output: bytes
     cpu_s: float

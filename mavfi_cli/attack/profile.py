@@ -9,8 +9,8 @@ be in the sample.
 
 A few windows, the *pilot*, are stepped first. Their lengths determine how many of the other windows
 are stepped: as many as fit into `ENOUGH` instructions, but at least a given number. A sample whose
-size depends on its own lengths would be biased, so the pilot is a complete stratum of its own, and
-only the other windows estimate the rest. Those are chosen at equal spacing from a random start.
+size depends on its own lengths would be biased, so the pilot is a complete stratum of its own. The
+other stepped windows represent the rest, and are equally spaced from a random start.
 
 To draw a fault, a stratum is drawn with a probability proportional to its number of windows times
 their mean length. An instruction is then drawn uniformly from the stepped windows of the stratum.
@@ -39,7 +39,7 @@ from mavfi_cli.fi.tracer.sampling import Segment, Stratum, draw_fault, record_wi
 from mavfi_cli.fi.tracer.tracee import Tracee
 from mavfi_cli.stats.shares import Interval, estimated_total
 
-STEPS = 2_000_000  # limit of one window
+STEPS = 2_000_000  # limit of one window, instructions
 ENOUGH = 200_000  # stepped instructions of all windows of one marker
 _NOTHING = "executes no code in scope"
 _UNNAMED = (
@@ -49,7 +49,7 @@ _UNNAMED = (
 _COOL = 64  # minimum ratio of the hottest instruction's executions to those of the counted one
 _CHECKED = 4  # instructions whose counts are checked, in addition to the most executed one
 _TAIL = 16  # bytes after the code, for the decoder
-_DETOUR_CODE = 32  # bytes of code in which a detour fits, if one does
+_DETOUR_CODE = 32  # bytes of code in which a detour fits, if any fits
 Guard = Callable[[Tracee], AbstractContextManager[object]]
 _FIRST = np.array([1])
 Window = tuple[int, int]  # stratum and number of the sampled window that a run hit
@@ -88,7 +88,7 @@ class TargetProfile:
 
     @property
     def executed(self) -> int:
-        """Number of executed instructions in scope in the stepped windows."""
+        """Number of executed instructions in scope in the stepped windows or the counted run."""
         stepped = sum(stratum.executed for stratum in self.strata)
         return stepped if self.counted is None else self.counted.executed
 
@@ -110,7 +110,7 @@ class TargetProfile:
         return 0.0 if self.counted is None else self.counted.not_reached
 
     def code_at(self, address: int) -> bytes:
-        """Return 16 bytes of code at an address, or fewer at the end."""
+        """Return 16 bytes of code at an address, or fewer at the end of the code."""
         return _code_of(self.code, address)
 
     def contains(self, addresses: NDArray[np.int64]) -> bool:
@@ -173,7 +173,7 @@ class TargetProfile:
         return replace(self, strata=tuple(map(later, self.strata)))
 
     def without(self, methods: Container[Counting]) -> TargetProfile:
-        """Return the same profile without these counting methods on the way to a fault."""
+        """Return the same profile, with triggers that use none of these counting methods."""
         strata = self.strata
         if Counting.DETOUR in methods:
             strata = tuple(stratum.without_detours() for stratum in strata)
@@ -228,13 +228,13 @@ def profile_run(
         markers: instructions in scope that begin windows; empty for the whole run.
         end: an instruction in scope; its first execution ends the profile.
         windows: minimum number of windows of each marker to step, after a pilot of half as many.
-        enough: number of instructions up to which more windows are stepped, estimated from the
-            pilot.
+        enough: number of instructions to step per marker. The pilot determines how many windows
+            that is.
         guard: creates the context in which a run is stepped.
 
     Raises:
         TargetError: no instruction in scope executes, or the run is not repeatable.
-        WindowTooLong: too many instructions.
+        WindowTooLong: a window has more than `limit` instructions.
     """
     begun = time.perf_counter()
     ends = (*markers, *([end] if end else []))
@@ -262,7 +262,7 @@ def profile_call(place: AttackPlace, *, limit: int = STEPS) -> TargetProfile:
     """Step one call of the function at which the runs of the place start.
 
     Raises:
-        WindowTooLong: too many instructions.
+        WindowTooLong: the call executes more than `limit` instructions in scope.
     """
     begun = time.perf_counter()
     return _profile(place, [_Stepper(place, None, None, limit).step(_FIRST, 1)], begun)
@@ -278,14 +278,14 @@ def profile_calls(
     watch: Watch | None = None,
     guard: Guard = nullcontext,
 ) -> TargetProfile:
-    """Step calls of one function, drawn in proportion to its number of calls.
+    """Step calls of one of the functions, drawn in proportion to its number of calls.
 
     Args:
         windows: largest number of calls to step.
         guard: creates the context in which a run is stepped.
 
     Raises:
-        WindowTooLong: too many instructions.
+        WindowTooLong: a call executes more than `limit` instructions in scope.
         TargetError: none of the functions is ever called.
     """
     begun = time.perf_counter()
@@ -360,8 +360,8 @@ def _counted(
     """Map the counts in scope to the addresses of a native run."""
     image, code, scope = _code(place)
     objects = {entry.path: entry.bias for entry in map(image.named, scope.objects) if entry.path}
-    # Valgrind names the code of an object only if a file is mapped to its writable data. Other
-    # code is at its linked address, or its address is unknown.
+    # Valgrind names an object only if the object's writable data is mapped from its file. Other
+    # code is either at its linked address, or its address is unknown.
     biases = objects | {UNNAMED: 0}
     executions = {
         biases[path] + offset: count
@@ -400,7 +400,7 @@ def function_of(place: AttackPlace, name: str) -> Location:
     """Find the entry of a function in scope.
 
     Raises:
-        UnknownName: there is no function of that name; the message suggests the nearest.
+        UnknownName: there is no function of that name; the message suggests the nearest one.
     """
     with started(place) as tracee:
         image = place.image(tracee)
@@ -466,7 +466,7 @@ class _Stepper:
     detour: Detour | None = None  # at the marker
 
     def count(self) -> int:
-        """Count the windows of a run."""
+        """Count the windows of a run that begin at the marker."""
         assert self.marker is not None
         with started(self.place) as tracee:
             return tracee.count_to_end(self.place.image(tracee).address(self.marker))
@@ -494,7 +494,9 @@ class _Stepper:
                 if self.marker is not None:
                     start = (CountedStop(self.marker, number, self.detour),)
                     if not tracee.run_to(address, number - passed, self.detour):
-                        raise TargetError(self.place.name, "does not repeat its function calls")
+                        raise TargetError(
+                            self.place.name, "does not make the same function calls in every run"
+                        )
                 trace = record_window(
                     tracee,
                     self.place.scope(image),

@@ -45,7 +45,7 @@ def _require_attackable(path: Path) -> None:
     """Refuse a program that cannot be attacked.
 
     Raises:
-        TargetError: a script, a set-uid program, or one for another processor.
+        TargetError: the program is a script, set-uid or set-gid, or built for another processor.
     """
     with path.open("rb") as file:
         head = file.read(256)
@@ -63,7 +63,7 @@ def _require_attackable(path: Path) -> None:
         raise TargetError(
             path.name,
             "is set-uid or set-gid: it would lose these rights under the tracer, and must not "
-            "hold them while its state is corrupted; attack a copy",
+            "hold them while its state is corrupted; attack a copy without them",
         )
 
 
@@ -202,9 +202,9 @@ class _Workplace:
         if (observed := self._observe()).started:
             raise TargetError(
                 self.name,
-                f"{observed.started}, which the tracer does not follow: nothing there can be "
-                "counted or struck; attack a program with one thread (--env OMP_NUM_THREADS=1 may "
-                "limit it to one)",
+                f"{observed.started}, which the tracer does not follow, so instructions there can "
+                "be neither counted nor struck; attack a program with one thread (--env "
+                "OMP_NUM_THREADS=1 may limit it to one)",
             )
         function, limit = self.target.function, self.limits.profile_steps
         if function is not None:
@@ -248,7 +248,7 @@ class _Workplace:
             return native_time_s(other, executions)
 
     def _require_golden(self, how: str, ended: Ended) -> None:
-        """Refuse a profile if the profiled run ended or printed differently from the golden run."""
+        """Refuse a profiled run whose end or output differs from that of the golden run."""
         golden = self._known_golden()
         if ended.signal is not None:
             unlike = f"it is killed by {signal_name(ended.signal)}"
@@ -281,8 +281,8 @@ class _Workplace:
         """Run once without a fault, timed from the entry point.
 
         Raises:
-            TargetError: it times out, is killed, lacks memory or a terminal, prints too much, or
-                does not write a compared file.
+            TargetError: the run times out, is killed, lacks memory or a terminal, prints too much,
+                or does not write a compared file.
         """
         before_s = _children_cpu_s()
         tracee = self.start()

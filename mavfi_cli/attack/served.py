@@ -1,8 +1,9 @@
-"""Starts a Python program, whose forks may be attacked, in the same state every time.
+"""Starts a Python program in the same state every time, so that its forks can be attacked.
 
 Its memory depends only on its messages, so a corrupted pointer leads to the same data in every
 repetition. It runs without address randomisation, in a fixed environment, and with all bytecode
-cached. A fork of the attacking process would inherit traces of everything that ran there before.
+cached. A fork of the attacking process would not do: it would inherit traces of everything that ran
+there before.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _early: dict[str, ServedProcess] = {}
 
 
 class ServedProcess:
-    """A started program. Loading may take long, so start it early.
+    """A started program. Loading may take a long time, so start it early.
 
     A program that compiles its modules has a different memory layout from one that loads their
     bytecode. So a program that wrote to a cache is replaced by another, which loads from it.
@@ -47,8 +48,8 @@ class ServedProcess:
         connection: our end of the socket to it.
 
     Args:
-        module: the program. It receives one message and replies with a value and
-            `newest_cache_ns`.
+        module: the module to run. It receives one message and replies with a value and the result
+            of `newest_cache_ns`.
         output: file descriptor of its standard output; None discards it.
     """
 
@@ -131,7 +132,8 @@ class ServedProcess:
 def newest_cache_ns() -> int:
     """Return the time of the newest change in the caches of the loaded modules.
 
-    The caches hold bytecode and compiled kernels. The time is in ns since the epoch.
+    The caches hold bytecode and compiled kernels. The time is in ns since the epoch, or 0 if there
+    are no caches.
     """
     specs = [getattr(module, "__spec__", None) for module in sys.modules.values()]
     files = [spec.cached for spec in specs if spec is not None and spec.cached is not None]

@@ -1,7 +1,8 @@
-"""The interface of targets, and the judgement of a run.
+"""The interface of targets, and the verdict on a run.
 
 An `AttackTarget` consists of plain values that can be sent to a worker process. `open` returns the
-place where it runs repeatedly from the same memory. Any class with these methods can be a target.
+place where the target runs repeatedly from the same memory. Any class with these methods can be a
+target.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class RunLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunVerdict:
-    """The judgement of a run from its end and its output.
+    """The verdict on a run, from how it ended and from its output.
 
     Attributes:
         outcome: the outcome, if the flip was applied.

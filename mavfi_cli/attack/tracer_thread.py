@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class TracerThread(Generic[T]):
-    """A separate thread that does work with a traced node.
+    """A separate thread that works on a traced node.
 
     Args:
         work: receives a function to call once the node runs towards the awaited event.

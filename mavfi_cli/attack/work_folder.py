@@ -28,7 +28,7 @@ def copied_arguments(
     The text after the first `=` of an argument, as in `of=out.txt`, is treated as an argument. An
     argument that names a path below `folder` is made to name its copy. Any other relative argument
     that names a file, or contains a slash and names a folder, is made to name a copy at the same
-    path relative to the program's folder. An absolute argument outside `folder` stays.
+    path relative to the program's folder. An absolute argument outside `folder` is left unchanged.
 
     Args:
         directory: The folder that relative arguments are relative to.
@@ -138,7 +138,7 @@ class WorkFolder:
         return (self._copy / name).is_file()
 
     def wrote(self, name: str) -> bool:
-        """Return True if the last run wrote an existing file of the folder."""
+        """Return True if the last run created or wrote a file that now exists in the folder."""
         before, after = self._copy / name, self.path / name
         if not before.is_file():
             return True
@@ -181,7 +181,10 @@ class _Copier:
                 self._name, f"{source} cannot be copied: it is neither a file nor a folder"
             )
         elif real in above or len(above) > _DEEPEST:
-            raise TargetError(self._name, f"{source} cannot be copied: it is a cycle or too deep")
+            raise TargetError(
+                self._name,
+                f"{source} cannot be copied: it is part of a link cycle or nested too deeply",
+            )
         else:
             self._require_room()
             target.mkdir(exist_ok=True)
@@ -193,7 +196,7 @@ class _Copier:
         if self._bytes < 0 or self._files < 0:
             raise TargetError(
                 self._name,
-                f"the files to copy for every run must be at most {LARGEST_BYTES >> 30} GB and "
-                f"{MOST_FILES} in number: name large inputs by absolute paths "
+                f"the files to copy for every run must total at most {LARGEST_BYTES >> 30} GB and "
+                f"{MOST_FILES} files: name large inputs by absolute paths "
                 "outside --folder, which are not copied",
             )

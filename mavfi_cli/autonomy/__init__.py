@@ -5,7 +5,7 @@ planners -> shortcut -> smoothing,           planning
                         minimum_snap
 tracking                                     control
 
-Importing this package is cheap. Each kernel module imports numba or a native library.
+Importing this package is cheap, but each of its kernel modules loads numba or a native library.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ SMOOTHERS = ("ours", "release")
 
 
 def canonical_planner(name: str) -> str:
-    """Return the canonical name of a planner, which records and groups use.
+    """Return a planner's canonical name, which is used in records and to group runs.
 
-    For our own planners, case, hyphens, underscores and the star of RRT* do not matter. Any other
-    name is returned unchanged.
+    For our own planners, case, hyphens and underscores do not matter, and `*` stands for `star`.
+    Any other name is returned unchanged.
     """
     plain = name.lower().replace("*", "star").replace("-", "").replace("_", "")
     return plain if plain in OUR_PLANNERS else name

@@ -44,7 +44,7 @@ class CollisionParams:
     spacing_m: float = 0.2
     body_radius_m: float = 0.35  # lower limit of the radius if the vehicle starts in contact
     refuses_far_waypoints: bool = True
-    farthest_m: float = 1000.0  # a waypoint farther than this from the first one is unflyable
+    farthest_m: float = 1000.0  # per axis, from the current waypoint; a farther point is unflyable
     owns_sequence_numbers: bool = False
 
 
@@ -72,10 +72,11 @@ def step(
 ) -> tuple[CollisionState, CollisionReport]:
     """Check the rest of the trajectory.
 
-    The report's time_to_collision_s runs from `inputs.time_s` along the trajectory to the first
-    contact. It is inf if there is none. future_collision_seq increases by one when the check
-    predicts a collision on a trajectory that was free or unchecked before. A waypoint that is not
-    finite or farther than `farthest_m` cannot be flown and counts as a collision at its time.
+    The report's time_to_collision_s is the time from `inputs.time_s` along the trajectory to the
+    first contact, or inf if there is none. future_collision_seq increases by one when the check
+    predicts a collision on a trajectory that was free or unchecked before. With
+    `refuses_far_waypoints`, a point that is not finite or farther than `farthest_m` from the
+    current waypoint cannot be flown and counts as a collision at its time.
     """
     time_s = math.inf
     if inputs.trajectory is not None:
@@ -106,7 +107,7 @@ def _time_to_collision(
 ) -> float:
     """Return the time from `time_s` along the trajectory to the first contact, s; inf if free.
 
-    The result is never late, and early by at most one or two spacings.
+    The result is never late. It is early by at most the time for one or two sample spacings.
     """
     farthest_m = params.farthest_m
     if not params.refuses_far_waypoints:
@@ -127,7 +128,7 @@ def _time_to_collision(
     if not snapshot.payload:
         return float(unflyable_s)
     hit = _first_contact(snapshot, points[:count], params)
-    # The previous sphere is free, so contact is not earlier than its time.
+    # The previous sphere is free, so there is no contact before its time.
     return float(times_s[max(hit - 1, 0)]) if hit is not None else float(unflyable_s)
 
 
@@ -142,8 +143,8 @@ def _shifted(trajectory: Trajectory, time_s: float, front_enu_m: FloatArray) -> 
 def _castable(trajectory: Trajectory) -> Trajectory:
     """Limit the trajectory to distances and speeds that are possible inside a map.
 
-    A far waypoint moves closer along the ray towards it, and a fast one is slowed down. A waypoint
-    that is not finite is replaced by the previous position at rest.
+    A waypoint too far from the previous one is moved closer to it, and one that is too fast is
+    slowed down. A waypoint that is not finite is replaced by the previous position at rest.
     """
     waypoints = trajectory.waypoints
     fine: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(waypoints), axis=1)
@@ -186,7 +187,7 @@ class _SphereProbe:
         self._request = fcl.CollisionRequest()
 
     def touches(self, point_enu_m: FloatArray) -> bool:
-        """Return True if the sphere centred on the point (3,) meets an occupied voxel."""
+        """Return True if the sphere centred on the point (3,) touches an occupied voxel."""
         self._sphere.setTranslation(point_enu_m)
         result = fcl.CollisionResult()
         return bool(fcl.collide(self._sphere, self._map, self._request, result))
@@ -197,8 +198,8 @@ def _first_contact(
 ) -> int | None:
     """Return the index of the first of the points (n, 3) in contact, or None.
 
-    A vehicle that is already within the radius of an obstacle may leave. Until a point is free at
-    full radius, and within two radii of the start, points are tested with the body's radius only.
+    A vehicle that is already within the radius of an obstacle may leave it: until a point is free
+    at full radius, points within two radii of the start are tested with the body's radius only.
     """
     padding_m = 0.5 * params.spacing_m
     probe = _SphereProbe(snapshot, math.hypot(params.radius_m, padding_m))
@@ -265,7 +266,7 @@ def _sample_ahead(
 
 @compiled
 def _pieces(length_m: float, spacing_m: float) -> int:
-    """Return the number of pieces that keeps to the spacing, from 1 to MAX_SAMPLES_A_PIECE."""
+    """Return how many pieces of at most `spacing_m` a length has, up to MAX_SAMPLES_A_PIECE."""
     wanted = length_m / spacing_m
     if not wanted < MAX_SAMPLES_A_PIECE:
         return MAX_SAMPLES_A_PIECE

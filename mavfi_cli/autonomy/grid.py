@@ -44,7 +44,7 @@ class ObstacleGrid:
         """Build the grid of a map inside `bounds_enu_m` (6,), dilated by `radius_m`.
 
         Occupied voxels outside the bounds count if their dilation reaches inside. Raises
-        GridTooLarge beyond MAX_VOXELS.
+        GridTooLarge if the grid would have more than MAX_VOXELS voxels.
         """
         resolution = snapshot.resolution_m
         reach = math.ceil(radius_m / resolution) + 1
@@ -63,7 +63,7 @@ class ObstacleGrid:
         )
 
     def blended(self, inner: ObstacleGrid, centre_enu_m: FloatArray, radius_m: float) -> Self:
-        """Return the grid with its voxels within the radius of the centre taken from `inner`."""
+        """Return a copy whose voxels within `radius_m` of the centre (3,) are those of `inner`."""
         blocked = self.blocked.copy()
         resolution = self.resolution_m
         to_inner = np.rint((self.origin_enu_m - inner.origin_enu_m) / resolution).astype(np.int64)
@@ -100,7 +100,7 @@ class ObstacleGrid:
 def _extent(
     leaves: NDArray[np.int64], bounds: FloatArray, resolution: float, reach: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return lower voxel index (3,) and size (3,) of the box that dilated obstacles can reach."""
+    """Return the lower voxel index (3,) and the size (3,) of the box around dilated obstacles."""
     if not len(leaves):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = leaves[:, :3].min(axis=0) - reach
@@ -111,15 +111,16 @@ def _extent(
     size = np.maximum(high - low, 0)
     if float(np.prod(size.astype(np.float64))) > MAX_VOXELS:
         raise GridTooLarge(
-            f"obstacle grid must be at most {MAX_VOXELS} voxels, got {size.tolist()}"
+            f"the obstacle grid must have at most {MAX_VOXELS} voxels, got {size.tolist()}"
         )
     return low, size
 
 
 def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
-    """Return half the dilation's height in z for each column offset (dx, dy), (w, w); -1 for none.
+    """Return the dilation's reach in z, in voxels, for each column offset (dx, dy), (w, w).
 
-    An offset of k between two voxels leaves a gap of max(|k| - 1, 0) voxels between them.
+    The reach is -1 for a column that the dilation misses. An offset of k between two voxels leaves
+    a gap of max(|k| - 1, 0) voxels between them.
     """
     reach = math.ceil(radius_m / resolution_m) + 1
     offsets = np.abs(np.arange(-reach, reach + 1))
@@ -132,7 +133,7 @@ def _run_half_widths(radius_m: float, resolution_m: float) -> NDArray[np.int64]:
 
 @compiled
 def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Blocked) -> None:
-    """Mark the voxels of every leaf (x, y, z, size) that lie inside the grid."""
+    """Mark every voxel of the grid that belongs to a leaf (x, y, z, size)."""
     nx, ny, nz = occupied.shape
     for i in range(leaves.shape[0]):
         x, y, z = leaves[i, 0] - low[0], leaves[i, 1] - low[1], leaves[i, 2] - low[2]
@@ -144,9 +145,9 @@ def _rasterise(leaves: NDArray[np.int64], low: NDArray[np.int64], occupied: Bloc
 
 @compiled
 def _dilate(occupied: Blocked, widths: NDArray[np.int64], blocked: Blocked) -> None:
-    """Dilate every occupied run in z, instead of every voxel, into the neighbouring columns.
+    """Dilate each run of occupied voxels along z into the neighbouring columns.
 
-    Walls are upright, so one run covers a whole column of voxels.
+    Walls are upright, so a run covers a whole column, which would be many single voxels.
     """
     nx, ny, nz = occupied.shape
     reach = widths.shape[0] // 2
@@ -239,7 +240,7 @@ def path_free(
     bounds: FloatArray,
     points: FloatArray,
 ) -> bool:
-    """Apply `segment_free` to every segment of a polyline (n, 3)."""
+    """Return True if every segment of a polyline (n, 3) is free; see `segment_free`."""
     for i in range(points.shape[0] - 1):
         if not segment_free(
             blocked, origin, resolution, bounds,

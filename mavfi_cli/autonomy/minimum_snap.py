@@ -1,4 +1,4 @@
-"""Minimum-snap smoothing, as the released planner of MAVFI smooths its paths.
+"""Minimum-snap smoothing, as in the released planner of MAVFI.
 
 The released motion_planner.cpp (MAVBench/MAV_apps, branch mavfi, commit d505f3c) calls the linear
 solver of mav_trajectory_generation (Richter, Bry and Roy 2013) with these conditions:
@@ -59,7 +59,7 @@ class MinimumSnap:
 
         Args:
             is_free: returns True if a polyline (k, 3) lies in free space.
-            passes_max: largest number of passes; each further pass adds a vertex and solves again.
+            passes_max: maximum number of passes; each pass after the first adds a vertex.
         """
         vertices = _distinct(path_enu_m)
         for _ in range(passes_max):
@@ -73,7 +73,7 @@ class MinimumSnap:
         return cls(durations_s=durations_s, coefficients=coefficients, free=blocked is None)
 
     def sampled(self, period_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return position, velocity and acceleration, (k, 3) each, every `period_s` from 0."""
+        """Sample position, velocity and acceleration, (k, 3) each, every `period_s` from time 0."""
         count = max(1, math.floor(float(self.durations_s.sum()) / period_s))
         times_s = np.arange(count, dtype=np.float64) * period_s
         position, velocity, acceleration = (
@@ -146,8 +146,8 @@ def _equations(
 def _eliminate(matrix: FloatArray, right: FloatArray) -> None:
     """Replace the right-hand side (m, 3) with the solution of the banded equations.
 
-    This is Gaussian elimination with partial pivoting, because the last digit of a BLAS
-    solution depends on the processor.
+    This function performs Gaussian elimination with partial pivoting. It avoids BLAS, because the
+    last digit of a BLAS solution depends on the processor.
     """
     size = len(matrix)
     for column in range(size):

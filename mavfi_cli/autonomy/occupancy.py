@@ -92,7 +92,7 @@ class OccupancyMap:
         """Integrate one cloud: rays clear voxels, and end points in range mark theirs as occupied.
 
         Points that are not finite, out of the octree's range or outside the height limits are
-        ignored. A cloud with such an origin is ignored entirely.
+        ignored. A cloud whose origin is not finite or out of that range is ignored entirely.
         """
         self._stamp_s = cloud.stamp_s
         points = self._usable(cloud.points_enu_m)
@@ -128,12 +128,12 @@ class OccupancyMap:
         return np.ascontiguousarray(points if kept.all() else points[kept])
 
     def _in_range(self, coordinates: FloatArray) -> NDArray[np.bool_]:
-        """Return True for coordinates over two ray lengths inside the octree; False for NaN."""
+        """Return True for each coordinate over two ray lengths inside the octree; False for NaN."""
         limit = HALF_RANGE * self._params.resolution_m - 2.0 * self._params.max_range_m
         return np.abs(coordinates) < limit
 
     def _remember(self, ends: FloatArray) -> None:
-        """Add the voxels of ray ends (n, 3) to the voxels that may be occupied."""
+        """Add the voxels of ray ends (n, 3) to the list of voxels that may be occupied."""
         codes = np.unique(_codes_of(ends, self._params.resolution_m))
         places, after = (np.searchsorted(self._ended_in, codes, side) for side in ("left", "right"))
         fresh = places == after  # `setdiff1d` would sort all voxels anew
@@ -142,7 +142,7 @@ class OccupancyMap:
             self._occupied = np.insert(self._occupied, places[fresh], False)
 
     def _look_up(self, low: FloatArray, high: FloatArray) -> None:
-        """Look up in the tree all listed voxels in the box from low to high, each (3,)."""
+        """Update the occupancy of all listed voxels in the box from low to high, each (3,)."""
         resolution = self._params.resolution_m
         centres = np.empty((len(self._ended_in), 3))
         _voxel_centres(self._ended_in, resolution, centres)
@@ -205,7 +205,7 @@ def _stream_of(codes: Codes) -> bytes:
 
 @compiled
 def _encode(codes: Codes, stream: NDArray[np.uint8]) -> int:
-    """Fill `stream` and return the number of bytes."""
+    """Write the node stream of sorted codes (n,) into `stream`, and return its size in bytes."""
     stack = np.empty((8 * TREE_DEPTH + 8, 3), np.int64)  # first code, end of codes, height
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, len(codes), TREE_DEPTH
     depth, position = 1, 0

@@ -5,8 +5,9 @@ is what to track (the trajectory, the point on it, the rate of its clock), and a
 plan if one is needed.
 
 A vehicle that plans in motion slows down and stops by slowing the trajectory's clock, so that it
-stays on the checked path; see `_ActivePlan`. A vehicle that stops on a report drops the
-trajectory and brakes at once. A vehicle that does not plan in motion comes to rest before it plans.
+stays on the checked path; see `_ActivePlan`. A vehicle that stops on a report drops the trajectory
+and brakes, either at once or when the time to the collision requires it. A vehicle that does not
+plan in motion comes to rest before it plans.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class PlanRequest:
     yaw_rad: float
     goal_enu_m: FloatArray  # (3,)
     attempt: int  # number of the plan in the mission; seeds the planner
-    trajectory_seq: int = 0  # newest number; the planner's node takes the next
+    trajectory_seq: int = 0  # newest number; the planner's node uses the next one
     future_collision_seq: int = 0
 
 
@@ -108,16 +109,16 @@ class PilotParams:
 class _ActivePlan:
     """The active trajectory, its clock, and the current point on it.
 
-    The clock may run slower than time, so that the vehicle slows down on the checked path. Its rate
-    is ramped within the braking limit: along a path of planned speed v, a rate r gives the velocity
-    r v, and a ramp dr/dt gives the acceleration v dr/dt.
+    The clock may run slower than simulated time to slow the vehicle down on the checked path. Its
+    rate is ramped within the braking limit: along a path of planned speed v, a rate r gives the
+    velocity r v, and a ramp dr/dt gives the acceleration v dr/dt.
 
     Attributes:
         trajectory: Active trajectory; None while hovering.
         time_s: Time on the trajectory, since its first waypoint.
         rate: Trajectory seconds per second, 0..1.
         rate_change_per_s: Time derivative of the rate.
-        pace: Factor on the clock's rate from the current command, 0..1.
+        pace: Factor by which the current command slows the clock down, 0..1.
         checked: Trajectory that was last sent to the collision check.
     """
 
@@ -161,7 +162,7 @@ class _ActivePlan:
 
     @property
     def over(self) -> bool:
-        """True if there is no trajectory, or its end has passed or is NaN."""
+        """True if there is no trajectory, or if its end has passed; NaN counts as passed."""
         return self.trajectory is None or not self.time_s < self.trajectory.duration_s
 
     @property
@@ -227,9 +228,9 @@ class Pilot:
 
     @np.errstate(over="ignore", invalid="ignore")
     def on_report(self, report: CollisionReport) -> bool:
-        """Handle a report of the collision check. Return True if its time to collision was used.
+        """Handle a report of the collision check. Return True if the pilot reacts to a collision.
 
-        A report with a future_collision_seq older than the newest is ignored.
+        A report whose future_collision_seq is lower than the newest one is ignored.
         """
         if report.future_collision_seq < self._collision_seq:
             self.counters.reports_ignored += 1
@@ -255,7 +256,7 @@ class Pilot:
         )
 
     def _react(self, report: CollisionReport) -> None:
-        """Fly on, slow down or stop, depending on the time to the collision."""
+        """Continue, slow down or stop, depending on the time to the collision."""
         p = self.params
         left_s = 0.0
         if p.uses_time_to_collision:
@@ -281,7 +282,7 @@ class Pilot:
         self.mode = PilotMode.STOPPING
 
     def _plan_anew(self) -> None:
-        """Request a plan and abandon the pending one, whose start is no longer valid."""
+        """Request a plan, and abandon any pending request, because its start is no longer valid."""
         self._wanted = True
         if self._awaiting_plan:
             self._awaiting_plan = False
@@ -321,8 +322,8 @@ class Pilot:
     def _is_new(self, plan: Trajectory) -> bool:
         """Return True if a plan is new and accounts for the newest predicted collision.
 
-        A pilot that owns its numbers stores a plan's trajectory_seq before it checks the other
-        number, as the released follow_trajectory.cpp does.
+        A pilot that owns its numbers stores a plan's trajectory_seq before it checks the plan's
+        future_collision_seq, as the released follow_trajectory.cpp does.
         """
         if not self.params.owns_sequence_numbers:
             newer = plan.trajectory_seq > self._trajectory_seq
@@ -340,7 +341,7 @@ class Pilot:
         self.plan_lost()
 
     def plan_lost(self) -> None:
-        """Request another plan after the planner died before it answered the pending request."""
+        """Request another plan if one is pending, because that one will not arrive."""
         if self._awaiting_plan:
             self._awaiting_plan = False
             self._wanted = True
@@ -415,7 +416,7 @@ class Pilot:
 
     @property
     def _look_s(self) -> float:
-        """Time since the vehicle began to make one full turn."""
+        """Time since the vehicle began its full turn, s; 0 without one."""
         return 0.0 if self._look_started_s is None else self._stamp_s - self._look_started_s
 
     def _has_arrived(self, state: VehicleState) -> bool:
@@ -451,7 +452,7 @@ class Pilot:
         self.active.begin(
             self._next,
             time_s=max(0.0, late_s) if moving else 0.0,
-            # The plan departs at the velocity of its request, so the clock keeps that rate.
+            # The plan's initial velocity includes the clock's rate at the request: divide by it.
             rate=min(1.0, self.active.rate / self._requested_rate) if moving else 1.0,
         )
         self._next = None
@@ -483,7 +484,7 @@ class Pilot:
         self.mode = PilotMode.WAITING
 
     def _flies_blind(self, state: VehicleState) -> bool:
-        """Return True if the trajectory leaves the camera's field of view."""
+        """Return True if the direction of flight is outside the camera's field of view."""
         east, north = self.active.reference()[4:6]
         if not math.hypot(east, north) > self.params.rest_mps:
             return False
@@ -553,5 +554,5 @@ class Pilot:
         return waypoint[0:3], self.active.rate * waypoint[4:7], float(waypoint[3])
 
     def _near(self, place_enu_m: FloatArray, state: VehicleState) -> bool:
-        """Return True if a position (3,), possibly corrupted, is near enough to begin a plan."""
+        """Return True if a plan may begin at this position (3,), which may be corrupted."""
         return norm(place_enu_m - state.position_enu_m) <= self.params.start_error_max_m

@@ -1,7 +1,7 @@
 """The planning stage: search for a path, shorten it, smooth it into a trajectory.
 
-Other packages register planners as entry points `mavfi.planners`. Ours are OMPL's: RRT* (Karaman
-and Frazzoli 2011), RRT (LaValle 1998), RRTConnect (Kuffner 2000).
+Other packages register planners in the entry-point group `mavfi.planners`. Ours are OMPL's:
+RRT* (Karaman and Frazzoli 2011), RRT (LaValle 1998) and RRTConnect (Kuffner 2000).
 
 OMPL's random generators take their seeds from a process-wide sequence when they are created. Each
 search resets that sequence first and creates its generators afterwards, so its result depends only
@@ -45,7 +45,7 @@ class PlanningParams:
 
     radius_m: float = 1.1  # clearance from obstacles
     escape_radius_m: float = 2.2  # within this distance of a blocked start, the radius may shrink
-    shortcut_spacing_m: float = 1.0  # vertex spacing of the path before the second shortcut
+    shortcut_spacing_m: float = 1.0  # largest distance between vertices before the 2nd shortcut
     smoother: str = SMOOTHERS[0]
     smoothing: SmoothingParams = field(default_factory=SmoothingParams)
 
@@ -140,11 +140,11 @@ def plan(
 ) -> Trajectory | PlanFailure:
     """Plan from the request's position to its goal.
 
-    If the vehicle is moving and cannot stop in free space, the result is a failure: it must brake
-    first.
+    If the vehicle is moving and cannot stop in free space, the plan fails, because the vehicle
+    must brake first.
 
     Args:
-        request: Start, goal, and the numbers of the trajectory.
+        request: Start, goal, and the sequence numbers of the trajectory.
         snapshot: Newest map.
         bounds_enu_m: Allowed volume (6,), xmin ymin zmin xmax ymax zmax.
     """
@@ -292,7 +292,7 @@ def _result(problem: PlanningProblem, definition: Any, iterations: int) -> PlanR
 
 
 _GOAL_BIAS = {"setGoalBias": 0.05}  # OMPL's default
-_FIRST_SOLUTION = (_Search(iterations=5000, range_m=10.0),)  # for dense maps, shorter than OMPL's
+_FIRST_SOLUTION = (_Search(iterations=5000, range_m=10.0),)  # for dense maps, steps below OMPL's
 _OURS = {
     planner.name: planner
     for planner in (

@@ -23,8 +23,8 @@ class PointCloudParams:
     """Range and density of the rays that enter the map.
 
     A ray that ends within `max_range_m` (MAVBench: 7 m) observes an obstacle and is always kept. A
-    longer ray, or one without return, only clears space, at ten times the cost. Of these, one
-    pixel in `free_stride` x `free_stride` is kept, cut off just beyond the range. Neighbouring
+    longer ray, or one without a return, only clears space, at ten times the cost. Of these, one
+    in `free_stride` x `free_stride` pixels is kept, and cut off just beyond the range. Neighbouring
     rays of 64 columns over 90 degrees are 0.11 to 0.22 m apart at 7 m. A stride of 4 therefore
     clears every voxel of 0.2 m up to about 2 m in one frame, and farther ones while the vehicle
     moves. Unknown space is free, so clearing matters only where the map is wrong.

@@ -1,8 +1,8 @@
 """Smoothing: turns a path into a trajectory within the limits, sampled every 0.5 s.
 
-On each straight segment of the path the vehicle accelerates constantly, cruises, and brakes
-constantly. One blend of constant acceleration cuts each corner, from velocity c u_1 to c u_2 (c the
-corner speed, u the directions). It lasts |c u_2 - c u_1| / a, starts and ends
+On each straight segment of the path the vehicle accelerates at a constant rate, cruises, and brakes
+at a constant rate. One blend of constant acceleration cuts each corner, from velocity c u_1 to
+c u_2 (c the corner speed, u the directions). It lasts |c u_2 - c u_1| / a, starts and ends
 h = c^2 sin(theta / 2) / a from the corner, and passes it at a distance of
 c^2 sin(theta / 2)^2 / (2 a). The velocity is continuous. The norms of velocity and acceleration
 never exceed their limits, because the velocity inside a blend is a convex combination of the
@@ -18,8 +18,8 @@ B-spline, and the knots of the spline are the waypoints. Interpolated as in `tra
   points, within a T^2 / 8 (9 cm) of the motion;
 - the spline starts at exactly the given position and velocity and ends at rest on the last point.
 
-If a piece is not free, the vehicle slows down at the corners that it rounds, in the limit to a stop
-on the corner itself, which lies on the free path.
+If a piece of the spline is not free, the vehicle slows down at the corners that the piece rounds.
+In the limit it stops on the corner itself, which lies on the free path.
 """
 
 from __future__ import annotations
@@ -106,11 +106,11 @@ def smooth(
 def smooth_as_released(
     path_enu_m: FloatArray, grid: ObstacleGrid, request: PlanRequest, params: SmoothingParams
 ) -> tuple[Trajectory, bool]:
-    """Compute the released planner's trajectory along a free path (n, 3), as `smooth` does.
+    """Compute the trajectory of the released planner. Arguments and result are those of `smooth`.
 
-    One point differs. The release gives a waypoint the position of the next sample. Ours has the
-    position, velocity and acceleration of one moment, because our reference moves between waypoints
-    (see `tracking`).
+    One point differs. The release gives each waypoint the position of the next sample. Our waypoint
+    has the position, velocity and acceleration of one moment, because our reference moves between
+    waypoints (see `tracking`).
     """
     curve = MinimumSnap.through(
         np.asarray(path_enu_m, np.float64),
@@ -138,7 +138,7 @@ def _cut(velocity: FloatArray, limit: float) -> FloatArray:
 def _with_run_out(
     path: FloatArray, velocity: FloatArray, grid: ObstacleGrid, params: SmoothingParams
 ) -> tuple[FloatArray, bool]:
-    """Return the vertices to fly, and True if the straight stretch from the start is free.
+    """Return the vertices to fly, and True if the straight run-out from the start is free.
 
     A vehicle in motion runs straight on for half a sample, then brakes to a stop. From there the
     path leads to the farthest path vertex in line of sight, or back to the start of the path if
@@ -185,7 +185,7 @@ def _squared_corner_speeds(
 ) -> FloatArray:
     """Return the highest squared speeds at the vertices (n,) that caps and lengths allow.
 
-    The start has its given speed, the end is at rest. `caps` (n,) are squares of speeds. The first
+    The motion begins at the start speed and ends at rest. `caps` (n,) are squared speeds. The first
     segment must be long enough to stop from the start speed.
     """
     lengths, sines = line.lengths, line.half_sines
@@ -219,7 +219,7 @@ def _reachable(q_from: float, sine_from: float, sine_to: float, length: float, a
 def _dwells(
     directions: FloatArray, q: FloatArray, yaw_rad: float, params: SmoothingParams
 ) -> FloatArray:
-    """Return the waiting time at each vertex (n,), which includes the time to turn at rest."""
+    """Return the waiting time at each vertex (n,), s, including the time to turn at rest."""
     dwells = np.zeros(len(q))
     for i, direction in enumerate(directions):
         steep = math.hypot(direction[0], direction[1]) < 0.1
@@ -247,7 +247,7 @@ class _Motion:
     def add(
         self, duration_s: float, velocity: FloatArray, acceleration: FloatArray, corner: int = -1
     ) -> None:
-        """Append a phase with a velocity (3,) at its start unless its duration is zero.
+        """Append a phase that starts at `velocity` (3,), unless its duration is not positive.
 
         `corner` is the vertex that the phase rounds or waits at; -1 for none.
         """
@@ -276,7 +276,7 @@ class _Motion:
         return position
 
     def corners_during(self, begin_s: float, end_s: float) -> set[int]:
-        """Return the vertices of the phases that overlap a time interval."""
+        """Return the vertices that the phases in a time interval round or wait at."""
         starts_s = [row[0] for row in self._rows]
         ends_s = [*starts_s[1:], self.duration_s]
         return {
@@ -324,7 +324,7 @@ def _motion(line: _Polyline, q: FloatArray, dwells_s: FloatArray, a: float) -> _
 def _blocked_corners(
     spline: FloatArray, moving: _Motion, grid: ObstacleGrid, period: float
 ) -> list[int]:
-    """Return the vertices that are rounded by spline pieces that are not free."""
+    """Return the vertices that the spline rounds, or waits at, in pieces that are not free."""
     blamed: set[int] = set()
     for piece in np.flatnonzero(~_piecewise_free(spline, grid)):
         # Piece k depends on the control points at (k - 1) T, k T and (k + 1) T.
@@ -333,7 +333,7 @@ def _blocked_corners(
 
 
 def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]:
-    """Return a flag for each spline piece (m - 2,): True if its four chords are free."""
+    """Return, for each of the m - 2 spline pieces, True if its four chords are free."""
     first, second, third = spline[:-2, None], spline[1:-1, None], spline[2:, None]
     u = np.linspace(0.0, 1.0, 5)[:, None]
     # (m - 2, 5, 3)
@@ -342,7 +342,7 @@ def _piecewise_free(spline: FloatArray, grid: ObstacleGrid) -> NDArray[np.bool_]
 
 
 def _trajectory(spline: FloatArray, request: PlanRequest, params: SmoothingParams) -> Trajectory:
-    """Convert control points (m, 3) to the trajectory of the spline's m - 1 knots."""
+    """Convert control points (m, 3) to a trajectory whose waypoints are the m - 1 knots."""
     period = params.sample_period_s
     velocities = np.diff(spline, axis=0) / period
     accelerations = np.zeros_like(velocities)
@@ -358,7 +358,7 @@ def _sampled(
     request: PlanRequest,
     params: SmoothingParams,
 ) -> Trajectory:
-    """Build the trajectory for a request from samples (n, 3) one sample period apart."""
+    """Build the requested trajectory from samples (n, 3) that are one sample period apart."""
     period = params.sample_period_s
     yaws = _headings(positions_enu_m, request.yaw_rad, params.yaw_rate_max_radps * period)
     states = [positions_enu_m, yaws, velocities_enu_mps, accelerations_enu_mps2]

@@ -7,7 +7,7 @@ reference t seconds after its start is
 
 so the acceleration is part of the motion. Yaw turns at a constant rate towards the next waypoint's
 yaw, the shorter way round. After the end the reference stays at the last waypoint's final point. A
-duration that is NaN or negative counts as zero. An infinite duration never ends.
+duration that is NaN or negative counts as zero. A waypoint with an infinite duration never ends.
 
 Control acts on the position error e:
 
@@ -17,7 +17,7 @@ Control acts on the position error e:
 The clock of the trajectory runs at `rate`. At a rate r that changes by dr/dt, the reference has the
 velocity r v and the acceleration r^2 a + dr/dt v.
 
-With `stretches_clock`, the `pace` of a command clipped by the speed limit is the ratio of clipped
+With `stretches_clock`, the `pace` of a command that the speed limit clips is the ratio of clipped
 to demanded speed. The trajectory's clock runs slower by this factor while the command holds, so
 that a waypoint lasts until its distance is covered, as in the released common.cpp. That code flies
 a waypoint in slices of 10 ms and sleeps through a stretched slice. Its C++ library (ROS Kinetic,
@@ -68,7 +68,7 @@ def waypoint_index(trajectory: Trajectory, time_s: float) -> int:
 
 
 def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
-    """Drop one waypoint and fill its time from the next one.
+    """Drop one waypoint and fill its duration with the motion of the next.
 
     The next waypoint's motion is extended backwards over the dropped duration, so the trajectory
     keeps its timing and stays continuous there. The last waypoint is replaced by rest at the end of
@@ -92,9 +92,9 @@ def without_waypoint(trajectory: Trajectory, index: int) -> Trajectory:
 
 @compiled
 def locate(durations_s: FloatArray, time_s: float) -> tuple[int, float]:
-    """Return the waypoint at `time_s` and the time since its start; (-1, 0) if there is none.
+    """Return the index of the waypoint at `time_s`, and the time since it began, s.
 
-    A time that is NaN counts as zero.
+    A `time_s` that is NaN or negative counts as zero. Without waypoints, the result is (-1, 0).
     """
     left = time_s if time_s > 0.0 else 0.0
     last = len(durations_s) - 1
@@ -185,7 +185,7 @@ class TrackingInputs:
 def step(
     state: TrackingState, inputs: TrackingInputs, params: TrackingParams
 ) -> tuple[TrackingState, Command]:
-    """Run one control tick. Return the command and the state for the next tick."""
+    """Run one control tick. Return the state for the next tick, and the command."""
     target = np.zeros(10)
     if inputs.trajectory is None:
         target[0:3] = inputs.hold_enu_m
@@ -252,7 +252,7 @@ def track(
     step_max_s: float,
     out: FloatArray,
 ) -> None:
-    """Run the controller; write velocity, acceleration, integral and yaw into `out`."""
+    """Run the controller. Write velocity, acceleration, integral and yaw into `out` (10,)."""
     step_s = elapsed_s if elapsed_s > 0.0 else 0.0
     step_s = min(step_s, step_max_s)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Run every kernel once on a toy scene, so that each is loaded before the first tick."""
+"""Runs every kernel once on a toy scene, so that all are loaded before the first tick."""
 
 from __future__ import annotations
 

@@ -60,6 +60,8 @@ def chosen(
     changes: Sequence[str] = (),
     programs: Sequence[str | None] = (),
     sampling: Sampling | None = None,
+    *,
+    many_worlds: bool = False,
 ) -> tuple[Spec, Path]:
     """Find the named campaign and its folder.
 
@@ -72,13 +74,14 @@ def chosen(
         programs: programs that a folder's missions may name; see
             `MissionConfig.require_programs`.
         sampling: how faults are drawn; None means as specified. It becomes part of the name too.
+        many_worlds: replaces fixed worlds by one for each seed. It becomes part of the name too.
 
     Raises:
         ConfigError: the specification or the scale is invalid, or `out` is None and the name is
             that of both a preset and a campaign's folder in the working directory.
         UnknownName: no preset, file or folder has this name.
     """
-    spec = chosen_spec(what, scale, changes, out, programs, sampling)
+    spec = chosen_spec(what, scale, changes, out, programs, sampling, many_worlds=many_worlds)
     if (folder := _folder(what)) is not None:
         return spec, folder
     if out is None:
@@ -93,18 +96,21 @@ def chosen_spec(
     out: Path | None = None,
     programs: Sequence[str | None] = (),
     sampling: Sampling | None = None,
+    *,
+    many_worlds: bool = False,
 ) -> Spec:
     """Find the named specification as `chosen` does, but without its folder."""
     folder = _folder(what)
     if folder is None:
-        spec = replaced(load_spec(what), changes)
+        spec = load_spec(what)
+        spec = replaced(spec.in_many_worlds() if many_worlds else spec, changes)
         spec = spec if scale is None else spec.scaled(scale)
         return spec if sampling is None else spec.sampled(sampling)
     with Ledger(folder) as ledger:
-        if scale is not None or changes or out is not None or sampling is not None:
+        if (scale, out, sampling) != (None, None, None) or changes or many_worlds:
             raise ConfigError(
-                "cannot be combined with --scale, --set, --sampling or --out, because the folder "
-                "stores them",
+                "cannot be combined with --scale, --set, --sampling, --worlds or --out, because "
+                "the folder stores them",
                 path=folder,
             )
         stored = stored_spec(ledger) or _Unflown.of(ledger)
@@ -465,6 +471,7 @@ def _search(
                 return flown[:seed]
     often = sorted(itertools.chain.from_iterable(flown))
     seen = f"; the flights replanned {often[0]} to {often[-1]} times" if often else ""
+    assert rule.replans is not None
     least, most = rule.replans
     raise ConfigError(
         f"no world seed of {config.world} from 1 to {rule.candidates} gives a median of {least} to "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
@@ -115,7 +115,8 @@ class FixedWorld:
     """The table `[fixed_world]` of a specification.
 
     Attributes:
-        replans: least and largest median of replans over the golden runs.
+        replans: least and largest median of replans over the golden runs; None: no rule, so that
+            only worlds with a `world_seed` are fixed.
         flights: number of golden runs per candidate; seeds start at the campaign's first.
         candidates: largest world seed to try, starting at 1; the first that fits is chosen.
         worlds: the worlds that the rule covers; empty for all worlds of the campaign.
@@ -124,7 +125,7 @@ class FixedWorld:
             could not begin has fewer than `flights` values.
     """
 
-    replans: tuple[int, int]
+    replans: tuple[int, int] | None = None
     flights: int = 5
     candidates: int = 60
     worlds: tuple[str, ...] = ()
@@ -132,11 +133,13 @@ class FixedWorld:
     flown: Mapping[str, Flown] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        least, most = self.replans
+        least, most = self.replans or (0, 0)
         if not 0 <= least <= most:
             raise ValueError(
                 f"replans: must be [LEAST, MOST] with 0 <= LEAST <= MOST, got [{least}, {most}]"
             )
+        if self.replans is None and not self.world_seed:
+            raise ValueError("must have replans or world_seed")
         if self.flights < 1 or self.candidates < 1:
             raise ValueError(
                 "flights and candidates: must be at least 1, "
@@ -152,24 +155,30 @@ class FixedWorld:
         A user's world file is covered only if it is named, because its boxes are already fixed.
         """
         named = world in self.worlds or world in self.world_seed
-        return named or (not self.worlds and not world.endswith(".toml"))
+        ruled = self.replans is not None and not self.worlds and not world.endswith(".toml")
+        return named or ruled
 
     def fits(self, replans: Sequence[int]) -> bool:
         """Return True if a candidate fits the rule, given the replans of its golden runs."""
+        assert self.replans is not None
         least, most = self.replans
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
-    def describe(self) -> str:
-        """Describe the rule and the chosen worlds in one line."""
+    def describe(self, worlds: Container[str]) -> str:
+        """Describe the rule and the seeds of some worlds in one line."""
         phrases = []
-        for world, seed in self.world_seed.items():
+        for world in filter(worlds.__contains__, self.world_seed):
+            seed = self.world_seed[world]
             flown = self.flown.get(world)
             median = "named" if flown is None else f"median {statistics.median(flown[-1]):g}"
             phrases.append(f"{world} {seed} ({median})")
-        return f"world seeds: {', '.join(phrases or ['none yet'])}; {self.rule()}"
+        return "; ".join(filter(None, [f"world seeds: {', '.join(phrases or ['none yet'])}",
+                                       self.rule()]))  # fmt: skip
 
     def rule(self) -> str:
-        """Describe the rule."""
+        """Describe the rule; empty without one."""
+        if self.replans is None:
+            return ""
         least, most = self.replans
         often = f"{least} to {most} times" if most > least else f"{least} times"
         often = "once" if often == "1 times" else often
@@ -287,6 +296,21 @@ class Spec:
         )
         repetitions = max(1, round(self.repetitions * scale))
         return replace(self, repetitions=repetitions, settings=settings)
+
+    def describe_worlds(self) -> str:
+        """Describe the fixed worlds of the missions in one line; empty without any."""
+        flown = {kind.config.world for kind in self.kinds()}
+        return "" if self.fixed_world is None else self.fixed_world.describe(flown)
+
+    def in_many_worlds(self) -> Spec:
+        """Return the same campaign with a generated world for each seed.
+
+        Raises:
+            ConfigError: it has no fixed worlds.
+        """
+        if self.fixed_world is None:
+            raise ConfigError(f"campaign {self.name!r} has no fixed worlds", key="worlds")
+        return replace(self, name=f"{self.name}-many-worlds", fixed_world=None)
 
     def missions(self) -> list[PlannedMission]:
         """List the missions repetition by repetition, so that pairs and settings grow together.
@@ -416,12 +440,13 @@ class Spec:
             own = {"name": setting.name or None, "repetitions": setting.repetitions}
             own = {key: value for key, value in own.items() if value is not None}
             settings.append({**own, **setting.axes})
+        fixed = asdict(self.fixed_world) if self.fixed_world else {}
         tables = {
             "mission": self.fixed,
             "factors": self.axes,
             "setting": settings,
             "stop": asdict(self.stop) if self.stop else {},
-            "fixed_world": asdict(self.fixed_world) if self.fixed_world else {},
+            "fixed_world": {key: value for key, value in fixed.items() if value is not None},
         }
         plain = {name: getattr(self, name) for name in names}
         plain["keep"] = self.keep.value

@@ -18,12 +18,14 @@ from mavfi_cli.core.config import (
     Shipped,
     parse_toml,
     read_text,
+    read_toml,
     structure,
 )
 from mavfi_cli.core.errors import ConfigError, UnknownName, named_member
 from mavfi_cli.spec.fault import FaultConfig, InstructionConfig
 
 PRESETS = Shipped("campaign", Path(__file__).parent / "presets")
+_FIXED_WORLDS = Shipped("fixed worlds", Path(__file__).parent / "fixed_worlds")
 _FACTORS = ("mission", "factors", "setting")  # tables of factors
 _TOP = (*(key.name for key in fields(Spec) if key.name not in ("fixed", "axes", "settings")),
         *_FACTORS)  # fmt: skip
@@ -82,6 +84,11 @@ def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
         "axes": _axes(factors, "factors", path),
         "settings": axes_of_settings,
     }
+    if isinstance(name := values.get("fixed_world"), str):
+        if name not in _FIXED_WORLDS.names:
+            error = UnknownName(_FIXED_WORLDS.kind, name, _FIXED_WORLDS.names)
+            raise ConfigError(str(error), path=path, key="fixed_world")
+        values["fixed_world"], _ = read_toml(_FIXED_WORLDS.path(name))
     if "keep" in values:
         values["keep"] = named_member(Keep, "policy of keeping runs", str(values["keep"]))
     if "sampling" in values:

@@ -32,6 +32,9 @@ _SET = _what("--set", "changes", multiple=True, metavar="KEY=VALUE[,VALUE]",
 _SAMPLING = _what("--sampling", type=click.Choice(["uniform", "stratified"]),
                   help="How faults are drawn: each by itself, or in rounds, with more of them "
                        "where outcomes have varied, and weights  [as specified].")  # fmt: skip
+_WORLDS = _what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
+                help="Worlds of a campaign that has fixed ones: these, or another one for each "
+                     "seed.")  # fmt: skip
 _KEEP = ("none", "failures", "sampled", "all")
 # Options of `status` that imply --full.
 _FULL = {"by", "confidence", "quality", "overhead", "failures"}
@@ -57,6 +60,7 @@ def campaign() -> None:
 @_what("--scale", type=types.SCALE, help="Fraction of the repetitions to run: 0.1 runs a tenth.")
 @_SET
 @_SAMPLING
+@_WORLDS
 @_what("--missing-only", is_flag=True,
        help="Resume a campaign; fail if there is none in the folder.")  # fmt: skip
 @_what("--append", is_flag=True, help="Add the missions that are not yet on the folder's list.")
@@ -96,7 +100,7 @@ def run(what: str, as_json: bool, quiet: bool, **options: Any) -> None:
     trusted = (options["firmware"], options["companion"])
     spec, folder = chosen(
         what, options["out"], options["scale"], options["changes"], programs=trusted,
-        sampling=_sampling(options["sampling"]),
+        sampling=_sampling(options["sampling"]), many_worlds=options["worlds"] == "many",
     )  # fmt: skip
     flying = Options(
         **grouped.given_fields(
@@ -255,6 +259,7 @@ def draw(what: str, number: int | None, output: Path, as_json: bool) -> None:
 @click.argument("what", metavar="[WHAT]", required=False, type=types.CAMPAIGN)
 @_what("--scale", type=types.SCALE, help="Fraction of the repetitions to run.")
 @_SET
+@_WORLDS
 @_size("--margin", type=Number(1.0e-6, 0.5, max_open=True),
        help="Print the number of missions per setting for a confidence interval of this "
             "half-width.")  # fmt: skip
@@ -282,7 +287,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
     if options["margin"] is options["difference"] is None:
         refuse_given(("confidence",), "needs --margin or --difference")
     if what is None:
-        refuse_given(("scale", "changes"), "needs a campaign")
+        refuse_given(("scale", "changes", "worlds"), "needs a campaign")
     answer: dict[str, Any] = {}
     lines: list[str] = []
     names = ("margin", "expected", "difference", "discordant", "power", "confidence")
@@ -304,7 +309,7 @@ def plan(what: str | None, scale: float | None, as_json: bool, **options: Any) -
             f"(--discordant {discordant:g})"
         )
     if what is not None:
-        answer["campaign"], more = _planned(what, scale, options["changes"])
+        answer["campaign"], more = _planned(what, scale, options["changes"], options["worlds"])
         lines += more
     if not answer:
         raise click.UsageError("name a campaign, --margin or --difference")
@@ -326,7 +331,7 @@ def keys(folder: Path) -> None:
 
 
 def _planned(
-    what: str, scale: float | None, changes: Sequence[str]
+    what: str, scale: float | None, changes: Sequence[str], worlds: str
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the missions of a campaign as a dict for JSON and as lines of text."""
     from collections import Counter
@@ -334,10 +339,10 @@ def _planned(
     from mavfi_cli.campaigns.begin import chosen_spec, flyable
     from mavfi_cli.campaigns.missions import label_text
 
-    spec = chosen_spec(what, scale, changes)
+    spec = chosen_spec(what, scale, changes, many_worlds=worlds == "many")
     missions = flyable(spec)
     settings = Counter(label_text(mission.labels) for mission in missions)
-    rule = None if spec.fixed_world is None else spec.fixed_world.describe()
+    rule = spec.describe_worlds() or None
     pairs = len({mission.pair for mission in missions})
     summary = {
         "name": spec.name, "about": spec.about, "fixed_world": rule, "missions": len(missions),

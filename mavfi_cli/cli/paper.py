@@ -26,6 +26,9 @@ _output = section("Output")
             "fraction.")  # fmt: skip
 @_what("--stack", type=STACK, default="mavbench", metavar="NAME|FILE",
        help="Stack of the companion: the paper's, or another one (`mavfi stacks`).")  # fmt: skip
+@_what("--worlds", type=click.Choice(["fixed", "many"]), default="fixed",
+       help="Fly one fixed world of each environment, as the paper does, or another world for each "
+            "seed.")  # fmt: skip
 @_what("--settle", is_flag=True,
        help="Then fly further missions where claims are undecided, until each is decided. Tests "
             "and intervals hold at any number of looks.")  # fmt: skip
@@ -55,8 +58,9 @@ def reproduce(names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any
 
     load_stack(options["stack"])  # fail before the flights
     plan = FlightsPlan(
-        items=items_named(names), stack=options["stack"], scale=options["scale"], out=options["out"]
-    )
+        items=items_named(names), stack=options["stack"], scale=options["scale"],
+        worlds=options["worlds"], out=options["out"],
+    )  # fmt: skip
     if options["settle"]:
         require_settleable(plan)
     else:

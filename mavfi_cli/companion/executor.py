@@ -2,12 +2,12 @@
 
 A node runs one kernel. Its input queue has length one: a newer input replaces a waiting one. An
 invocation that starts at `t` occupies the node and one core of the platform until `t` plus its
-latency. Its output takes effect at that time. The computation itself happens at any host time in
+latency. Its output takes effect at that time. The computation itself may happen at any host time in
 between, so the vehicle's simulation need not wait for it.
 
-A turn uses the outputs. It is a coroutine that awaits one node after the other:
-`cloud = await point_cloud.run(frame)` continues when the cloud takes effect, and never if its input
-was replaced or lost.
+A turn is a coroutine that uses the outputs of nodes and awaits one node after another:
+`cloud = await point_cloud.run(frame)` continues when the cloud takes effect. If the frame was
+replaced or lost, it never continues.
 
 Nodes that share a process run one after another in the listed order, each with its newest input.
 If one of them fails, the whole process ends, and the waiting inputs of the other nodes are lost.
@@ -49,7 +49,7 @@ class LatencyModel:
 
     Each kernel has its own random stream, so the number of calls of one kernel never changes the
     latencies of another. On a measured platform the latency is the host time of the kernel's newest
-    invocation, times the profile's factor.
+    invocation times the profile's factor.
     """
 
     def __init__(
@@ -60,7 +60,10 @@ class LatencyModel:
         self._host_s: dict[str, list[float]] = {kernel: [] for kernel in KERNELS}
 
     def draw_s(self, kernel: str) -> float:
-        """Return the latency of a kernel's next invocation, or of its newest if measured, s."""
+        """Return the latency of a kernel's next invocation, s.
+
+        On a measured platform, this is the latency of its newest invocation.
+        """
         if self._profile.measured_factor is not None:
             assert self._wall is not None
             host_s = self._wall.newest.get(kernel, 0.0)
@@ -70,7 +73,7 @@ class LatencyModel:
         return latency.latency_s * math.exp(latency.spread * float(drawn))
 
     def summary(self) -> MeasuredPlatform | None:
-        """Return a measured platform's factor and each kernel's medians, s; otherwise None."""
+        """Return the factor and the kernels' median times (s) of a measured platform, else None."""
         factor = self._profile.measured_factor
         if factor is None:
             return None
@@ -87,7 +90,7 @@ class LatencyModel:
 
 
 class TurnOver(Exception):
-    """Ends a turn before its last node."""
+    """Raised to end a turn before its last node."""
 
 
 @dataclass(slots=True, eq=False)
@@ -104,9 +107,9 @@ class Node(Generic[In, Out]):
     invocations: int = 0
     dropped: int = 0  # inputs replaced by a newer one before they were read
     busy_s: float = 0.0
-    process: NodeProcess | None = None  # process that runs the kernel; None for this one
+    process: NodeProcess | None = None  # process that runs the kernel; None: this process
     restarts: int = 0
-    free_s: float = 0.0  # end of the newest invocation outside the queue
+    free_s: float = 0.0  # end of the newest invocation by `Executor.call`
     mates: list[AnyNode] = field(default_factory=list)  # others in its process, in cyclic order
     standby: bool = False  # this process's kernel also runs on every input, to take over
 
@@ -130,7 +133,7 @@ class _Job:
     output: Any = None
 
     def begin(self, wall: WallClock) -> None:
-        """Run the kernel, or send the input to the node's process."""
+        """Run the kernel, or send the input to the node's process, unless this was done before."""
         if self.done or self.order is not None:
             return
         process = self.node.process
@@ -144,7 +147,7 @@ class _Job:
             self.input = None
 
     def settle(self, wall: WallClock) -> NodeLost | None:
-        """Wait for the output. If the node's process is lost, return the loss."""
+        """Wait for the output. Return the loss if the node's process was lost, otherwise None."""
         self.begin(wall)
         if not self.done:
             assert self.node.process is not None
@@ -166,9 +169,9 @@ class Executor:
 
     Attributes:
         draw_latency_s: Function from a node's name to the latency of its next invocation, s.
-        cores: Maximum number of concurrent nodes; others wait in the order of their requests.
-        compute_first: Draw an invocation's latency after its computation.
-        restart_s: Simulated time from a node's end until its successor is ready, s.
+        cores: Maximum number of nodes that run at once; others wait in the order of their requests.
+        compute_first: Start an invocation's computation before its latency is drawn.
+        restart_s: Simulated time from the end of a node's process until the new one is ready, s.
         watchdog_s: Simulated time after which an unfinished invocation is killed, s.
         on_start: Called with node, input and start stamp of each invocation.
     """
@@ -213,16 +216,16 @@ class Executor:
                 node.standby = True
 
     def process_of(self, name: str) -> dict[str, Callable[[Any, float], Any]]:
-        """Return the kernels in the process of a node, by node name."""
+        """Return the kernels that run in a node's process, by node name."""
         node = self.nodes[name]
         return {member.name: member.kernel for member in (node, *node.mates)}
 
     def isolate(self, name: str, process: NodeProcess | None = None) -> None:
-        """Run a node's kernel in a separate process until `close`.
+        """Run the kernels of a node and its mates in a separate process until `close`.
 
         Args:
-            process: Process that runs the kernels of the node and its mates; by default a fork of
-                this one, with a copy of their state.
+            process: Process that runs these kernels; by default a fork of this process, with a
+                copy of their state.
         """
         node = self.nodes[name]
         node.process = process or NodeProcess.fork(self.process_of(name))
@@ -238,8 +241,8 @@ class Executor:
         """Move a node that has already run to a separate process, as `isolate` does.
 
         Args:
-            fresh: Unused kernels by node, from which a lost process restarts. A hot standby keeps
-                the kernels that have already run.
+            fresh: Kernels that have never run, by node name. A lost process restarts with these. A
+                hot standby keeps the kernels that have already run.
             process: As for `isolate`.
         """
         self.isolate(name, process)
@@ -250,7 +253,7 @@ class Executor:
     # Turns
 
     def start(self, turn: Turn) -> None:
-        """Begin a turn at the present simulated time."""
+        """Begin a turn at the current simulated time."""
         self._go_on(turn, None)
 
     def _go_on(self, turn: Turn, output: Any) -> None:
@@ -270,10 +273,12 @@ class Executor:
         """Run a node at once, outside the queue and without using a core of the platform.
 
         Args:
-            again: Repeat the newest invocation, even before it ends, when other calls are dropped.
+            again: Repeat the newest invocation even if it has not ended. Other calls are dropped
+                until then.
 
         Returns:
-            Output, and latency until it takes effect, s; None if the node is busy, down or lost.
+            The output and the latency until it takes effect, s; None if the node is busy, down or
+            lost.
         """
         if node.busy or (self.now_s < node.free_s - _SAME_S and not again):
             node.dropped += 1
@@ -360,7 +365,7 @@ class Executor:
         self._free_cores(1)
 
     def _start_next(self, node: AnyNode) -> None:
-        """Start the next node of the process that has an input."""
+        """Start the next node in this node's process that has an input waiting."""
         for member in (*node.mates, node):
             self._start_if_free(member)
 
@@ -372,7 +377,7 @@ class Executor:
     # Ends of processes
 
     def settle(self) -> None:
-        """Wait for pending computations, so that a fault does not depend on the host's speed."""
+        """Wait for all node processes to answer, so that host speed does not affect a fault."""
         for job in self._jobs.values():
             if job.order is not None:
                 job.settle(self.wall)
@@ -386,9 +391,10 @@ class Executor:
                 node.process = None
 
     def kill(self, name: str) -> None:
-        """Kill the process of a node as a signal would. Does nothing if the node is down.
+        """Treat a node's process as killed by SIGKILL. Do nothing if the node is down.
 
-        Its current input is lost, as in a crash. Its successor takes the newest input.
+        Unless the node has a hot standby, its current input is lost, as in a crash. After the
+        restart, the node continues with its newest waiting input.
         """
         node = self.nodes[name]
         members = (node, *node.mates)
@@ -421,7 +427,7 @@ class Executor:
             member.process, member.standby = None, False
 
     def _lose(self, job: _Job, loss: NodeLost) -> None:
-        """Handle a lost output: the node stays busy until its death, then until its restart."""
+        """Handle a lost output: the node stays busy until its process has ended and restarted."""
         end_s = self.now_s
         gone_s = max(end_s, job.start_s + self.watchdog_s) if loss.hung else end_s
         job.node.busy_s += gone_s - end_s
@@ -439,7 +445,7 @@ class Executor:
         self._free_cores(1)
 
     def _restart(self, node: AnyNode) -> None:
-        """Start a new process with fresh state: the nodes' kernels in this process never ran."""
+        """Fork a new process. Its state is fresh, because its kernels never ran in this one."""
         if node.process is not None:
             node.process.close(kill=True)
         members = (node, *node.mates)

@@ -49,7 +49,7 @@ class NoInjection:
         self.injector = NoInjector()
 
     def aim(self, shortest_flight_s: float, protection: NoProtection) -> None:
-        """Draw the values that depend on the distance to the goal and on the detector."""
+        """Draw the parts of the fault that depend on the goal's distance and on the detector."""
 
     def begin(self, path: Path) -> None:
         """Write the planned fault before the flight."""
@@ -58,11 +58,11 @@ class NoInjection:
         """Give the attacked node a process of its own before the flight."""
 
     def news(self) -> list[str]:
-        """Return one line per strike since the last call."""
+        """Return the new lines about the fault since the last call."""
         return []
 
     def finish(self) -> Json | None:
-        """Write and return the record at the end of the mission."""
+        """Write and return the record at the end of the mission; None without a fault."""
         return None
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class NoInjection:
 
 
 class Killer(Injector):
-    """Decides when the process of a node is killed. It is killed once."""
+    """Decides when a fault strikes a process. It strikes once."""
 
     _awaits = "control tick"
 
@@ -106,7 +106,7 @@ class SourceInjection(NoInjection):
         """Draw the fault.
 
         Args:
-            shortest_flight_s: Interval from which a random trigger is drawn, s.
+            shortest_flight_s: Length of the interval from which a random trigger time is drawn, s.
             protection: Protection whose detector the fault may corrupt.
 
         Raises:
@@ -124,7 +124,9 @@ class SourceInjection(NoInjection):
             self._stage, self._units = PROCESS, {config.target: ""}
         elif config.attacks_detector:
             if protection.gate is None:
-                raise FaultSpecError("a fault in the detector needs a detector: --detector NAME")
+                raise FaultSpecError(
+                    "a fault in the detector needs a detector: give --detector NAME"
+                )
             memory = MemoryInjector(
                 protection.gate.memory,
                 config.detector_part,
@@ -142,7 +144,7 @@ class SourceInjection(NoInjection):
             self._units = {state.name: state.unit for state in fault.states}
 
     def arm(self, executor: Executor, config: MissionConfig, briefing: Briefing) -> None:
-        """Give a node that will be killed a process of its own."""
+        """Move the node that will be killed to a process of its own."""
         if self._config.killed_node is not None:
             self._executor = executor
             executor.isolate(self._config.killed_node)
@@ -153,12 +155,12 @@ class SourceInjection(NoInjection):
         self._write()
 
     def news(self) -> list[str]:
-        """Return the first strike as text, once."""
+        """Return a description of the first strike, once."""
         news, self._news = self._news, []
         return news
 
     def _on_strike(self, strike: Strike) -> None:
-        """Write the first strike to disk before it takes effect, and kill a targeted process."""
+        """Write the first strike to disk before it takes effect, and kill the targeted process."""
         if self._state == "planned":
             self._news.append(_strike_text(strike))
             self._state = "applied"
@@ -213,9 +215,10 @@ class StruckNode(NoInjection):
     """Injection of a fault that has already struck its node outside the flight.
 
     Attributes:
-        node, order: the node, and the number of the request in which it was struck, from 1.
+        node, order: the node, and the number (from 1) of the request in which it was struck.
         effect: what the fault did to the node, in one word.
-        process: serves the node starting with this request; None if the fault left it unchanged.
+        process: process that serves this request and all later ones; None if the fault left the
+            node unchanged.
         how: how the node ended or hung; empty if it answers.
     """
 

@@ -1,4 +1,4 @@
-"""The kernels of the mission's nodes with their state between invocations.
+"""The kernels of the mission's nodes, with the state that they keep between invocations.
 
 If a node runs in its own process, its state lives there.
 """
@@ -28,12 +28,12 @@ class ControlInput:
     """Input of the controller.
 
     Attributes:
-        goes_on: Control follows its own plan and ignores the one in `inputs`.
+        goes_on: True if control continues with its own copy of the plan, not the one in `inputs`.
     """
 
     inputs: tracking.TrackingInputs
     goes_on: bool = False
-    fresh: tracking.TrackingState | None  # state to compute from instead of the controller's own
+    fresh: tracking.TrackingState | None  # state to start from; None: the controller's own
     yaw_rad: float  # vehicle's yaw, for the first invocation of the controller
 
 
@@ -88,7 +88,7 @@ class Kernels:
         return self._map.snapshot()
 
     def collision_check(self, inputs: collision.CollisionInputs, stamp_s: float) -> CollisionReport:
-        """Check a trajectory."""
+        """Check a trajectory for collisions with the map."""
         read = replace(inputs, stamp_s=stamp_s, trajectory=self._as_read(inputs.trajectory))
         self._collision_state, report = collision.step(
             self._collision_state, read, self._collision_params
@@ -127,19 +127,19 @@ class Kernels:
         return command
 
     def restore_check(self, report: CollisionReport | None) -> None:
-        """Set the number of the last report in a collision check that is about to restart."""
+        """Restore the sequence number of the last report before the collision check restarts."""
         if report is not None:
             self._collision_state = collision.CollisionState(
                 future_collision_seq=report.future_collision_seq
             )
 
     def restore_planner(self, plans: Sequence[Trajectory]) -> None:
-        """Set the number of the last plan in a planner that is about to restart."""
+        """Restore the sequence number of the last plan before the planner restarts."""
         if plans:
             self._plans = plans[-1].trajectory_seq
 
     def _as_read(self, trajectory: Trajectory | None) -> Trajectory | None:
-        """Return a plan as its readers use it, without accelerations if feed-forward is off."""
+        """Return the plan that its readers use: without accelerations if feed-forward is off."""
         if trajectory is None or self._stack.feeds_acceleration_forward:
             return trajectory
         waypoints = trajectory.waypoints.copy()
@@ -148,5 +148,5 @@ class Kernels:
 
 
 def _next_int32(value: int) -> int:
-    """Increment a 32-bit counter; it wraps around, as it may after a fault."""
+    """Increment a signed 32-bit counter. It wraps around, as it may have to after a fault."""
     return (value + 1 + 2**31) % 2**32 - 2**31

@@ -1,4 +1,4 @@
-"""A process that runs the kernels of nodes, separate from the process of the mission.
+"""A process that runs the kernels of nodes outside the mission's process.
 
 The process is a fork of the companion, so it has every kernel loaded and its own copy of every
 node's state. Inputs and outputs are sent as pickles over a socket pair. Numbers stay exact, so
@@ -27,9 +27,9 @@ from mavfi_cli.core.processes import fork, receive, send
 
 Run = Callable[[Any, float], Any]
 
-# A node hangs if one invocation exceeds this CPU time, or this wall time while it waits. A healthy
-# invocation takes well under half a second. The record does not depend on the limits themselves,
-# but only on whether they were exceeded.
+# A node hangs if one invocation exceeds this CPU time or this wall-clock time; the latter catches a
+# node that only waits. A healthy invocation takes well under half a second. The record depends only
+# on whether a limit was exceeded, not on its value.
 HANG_CPU_S = 5.0
 HANG_WALL_S = 120.0
 HUNG = "hung: killed by the watchdog"
@@ -53,7 +53,7 @@ class _Answer:
 
 
 class NodeLost(Exception):
-    """A node's process has ended or had to be killed. The executor sets node and stamp."""
+    """A node's process ended or hung, or its kernel failed. The executor sets node and stamp."""
 
     node = ""
     stamp_s = 0.0  # due time of the output, or time of the watchdog's kill
@@ -68,7 +68,7 @@ class NodeProcess:
     """Runs kernels for the executor: `order` sends an input, `take` returns its output.
 
     Args:
-        ending: Describes the process's end if another waiter reaped it, else returns None.
+        ending: Returns a description of the process's end if other code reaps it, otherwise None.
         answered: Called after each answer or loss, before the process gets another input; may be
             set later.
         patient: Never treat the process as hung, because a debugger may hold it.
@@ -96,7 +96,7 @@ class NodeProcess:
 
     @classmethod
     def fork(cls, runs: Mapping[str, Run]) -> NodeProcess:
-        """Fork this process."""
+        """Fork this process into one that runs the given kernels, by node name."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
         def child() -> int:
@@ -108,7 +108,7 @@ class NodeProcess:
         return cls(ours, pid)
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """Send an input. Return the number to pass to `take`.
+        """Send an input to a node. Return the number to pass to `take`.
 
         If the process has already ended, `take` reports it.
         """
@@ -124,7 +124,7 @@ class NodeProcess:
         return self._count + 1
 
     def rehearse(self, node: str, value: Any, start_s: float) -> None:
-        """Send an input to a fork that shares the connection, under the next request's number."""
+        """Send the next request to a fork that shares the connection, without counting it."""
         self.order(node, value, start_s)
         self._count -= 1
 
@@ -132,7 +132,7 @@ class NodeProcess:
         """Wait for the output of a request. Return it with the kernel's host time in seconds.
 
         Raises:
-            NodeLost: The process ended, hung and was killed, or its kernel raised an error.
+            NodeLost: The process ended or hung, or its kernel raised an error.
         """
         try:
             answer = self._await(number)
@@ -171,7 +171,7 @@ class NodeProcess:
             return 0.0
 
     def _end(self) -> str:
-        """Describe how the process ended."""
+        """Reap the process if necessary, and describe how it ended."""
         ending = self._ending()
         self._gone = True
         if ending is not None:
@@ -181,7 +181,7 @@ class NodeProcess:
         return "ended"
 
     def close(self, *, kill: bool = False) -> None:
-        """End the process, which exits by itself when the connection closes unless it is stuck."""
+        """Close the connection, so that the process exits, and reap it. `kill` ends a stuck one."""
         self._socket.close()
         if self._gone:
             return
@@ -234,14 +234,14 @@ class StruckNodeProcess(NodeProcess):
         self._count, self._has_order = number, True
 
     def order(self, node: str, value: Any, start_s: float) -> int:
-        """See `NodeProcess`. The first call stands for the request that the process already has."""
+        """See `NodeProcess`. The first call sends nothing: the process already has that request."""
         if self._has_order:
             self._has_order = False
             return self._count
         return super().order(node, value, start_s)
 
     def _end_of_zombie(self) -> str | None:
-        """Wait for the end of the process; return None if it has been reaped."""
+        """Wait until the process ends, and describe its end; return None if it has been reaped."""
         with contextlib.suppress(OSError):
             while True:
                 stat = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
@@ -272,7 +272,7 @@ class LostNode(NodeProcess):
 
 
 def _described_end(status: int) -> str:
-    """Describe a wait status."""
+    """Describe the end of a process, given its wait status."""
     if os.WIFSIGNALED(status):
         return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
     return f"ended with code {os.waitstatus_to_exitcode(status)}"

@@ -59,7 +59,7 @@ CHECKED_STATES = {*FOLLOWED_STATES, *PLAN_STATES} - {"waypoint_yaw"}
 
 
 class _Withheld(TurnOver):
-    """The detector withholds a message."""
+    """Raised when the detector withholds a message."""
 
     def __init__(self, decision: Decision) -> None:
         super().__init__()
@@ -100,8 +100,8 @@ class Companion:
     """Perception, planning and control of one mission.
 
     Attributes:
-        plan_failures: Number of failed plans by the planner's reason.
-        reactions: Depth frames, each with the first setpoint that depends on it.
+        plan_failures: Number of failed plans for each reason that the planner gave.
+        reactions: Stamps of depth frames, each with that of the first setpoint that depends on it.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class Companion:
     # Control
 
     def tick(self, state: VehicleState) -> Command | None:
-        """Run one control tick in flight and return the command to send now.
+        """Run one control tick in flight. Return the command to send now; None if there is none.
 
         The caller must call `executor.advance` before and `executor.compute` after it.
         """
@@ -257,7 +257,7 @@ class Companion:
     def _track(
         self, inputs: TrackingInputs, attempt: int = 0, fresh: TrackingState | None = None
     ) -> _Setpoint | None:
-        """Compute a command, which is due after control's latency.
+        """Compute a command, due after control's latency. Return None if control is busy or down.
 
         Args:
             fresh: State from which the controller starts; None for its own.
@@ -307,8 +307,9 @@ class Companion:
     def _track_again(self, setpoint: _Setpoint, decision: Decision) -> None:
         """Recompute a withheld command, in this tick if the platform is fast enough.
 
-        If that did not help, or the waypoint is at fault, drop the waypoint and start from a fresh
-        state. After ATTEMPTS alarms the last command holds until the next tick.
+        If a recomputation did not help, or the waypoint is at fault, drop the waypoint and start
+        from a fresh state. After ATTEMPTS recomputations in vain, the last command holds until the
+        next tick.
         """
         if self._fresh_frame_s is None:
             self._fresh_frame_s = setpoint.frame_s  # no setpoint has used it yet
@@ -371,8 +372,9 @@ class Companion:
     def _strike_memory(self) -> Trajectory | None:
         """Let a fault strike memory, then have the detector judge the active plan before its use.
 
-        If control owns its queue, its copy is the active trajectory, and control passes the rest of
-        it to the other nodes. Otherwise the copy lasts only for this tick, and is returned.
+        Return control's copy of the plan if only the copy was corrupted; it lasts for this tick.
+        If control owns its queue, its copy is the active trajectory, because control passes the
+        rest of it to the other nodes.
         """
         active, moment, copy = self.pilot.active, self._moment(), None
         self._injector.strike(moment)
@@ -388,7 +390,7 @@ class Companion:
         return copy
 
     def _follow(self, copy: Trajectory | None) -> None:
-        """Note that mission logic and control read the present waypoint and the next yaw."""
+        """Note for the fault's follower that control reads the current waypoint and next yaw."""
         follower, active = self._follower, self.pilot.active
         if not follower.waits:
             return
@@ -439,7 +441,7 @@ class Companion:
 
     @property
     def tracked(self) -> tuple[Trajectory, int] | None:
-        """Return the tracked trajectory and the index of its present waypoint."""
+        """The tracked trajectory and the index of its current waypoint; None without one."""
         trajectory = self.pilot.active.trajectory
         if trajectory is None or not len(trajectory.waypoints):
             return None

@@ -1,7 +1,7 @@
 """The detector's gate in a mission: decides whether to withhold, recompute or accept a message.
 
-`Protection` judges and counts messages. `Recovery` applies its response to the mission: it
-recomputes the stage of a withheld message (paper, section V-E), or holds the vehicle.
+`Protection` judges and counts messages. `Recovery` carries out the response: it recomputes the
+stage of a withheld message (paper, section V-E), or holds the vehicle.
 
     response    report                       plan              active plan          command
     RECOMPUTE   recompute perception         request another   drop the waypoint    recompute it
@@ -40,7 +40,7 @@ ANNOUNCED_EVERY_S = 1.0  # minimum time between two announced alarms of one stag
 
 
 class Response(Enum):
-    """The gate's decision about a message with an alarm."""
+    """The gate's decision about a message."""
 
     PASS = "pass"
     RECOMPUTE = "recompute"  # withheld; its stage is recomputed
@@ -102,7 +102,7 @@ class NoProtection:
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> Decision:
-        """Judge the present waypoint and the command."""
+        """Judge the current waypoint and the command."""
         return PASSED
 
     def news(self) -> list[str]:
@@ -160,7 +160,7 @@ class Protection(NoProtection):
     def tick(
         self, trajectory: Trajectory | None, index: int, command: Command, stamp_s: float
     ) -> Decision:
-        """Judge the present waypoint and the command."""
+        """Judge the current waypoint and the command."""
         alarm = self._judge("tick", self.gate.judge_tick, trajectory, index, command)
         stage = Stage.CONTROL if alarm is None else alarm.stage
         flown = Stage.PLANNING in self.gate.fresh
@@ -190,9 +190,9 @@ class Protection(NoProtection):
 
         Args:
             accept: Makes the gate accept the message despite its alarm.
-            proven: The message contained all states for which its stage raises alarms. Only such a
-                message ends the series of alarms of a holding vehicle, because the steps within a
-                plan and the commands of a hover always pass.
+            proven: True if the message contained every state that can raise an alarm in its stage.
+                While the vehicle holds, only such a message ends the series of alarms, because
+                steps within a plan and the commands of a hover always pass.
         """
         if alarm is not None:
             decision = self._respond(alarm, message, stage, stamp_s)
@@ -277,13 +277,13 @@ class Protection(NoProtection):
 
     @staticmethod
     def is_compiled(config: DetectorConfig, stack: str) -> bool:
-        """Return True if the kernels are compiled. Otherwise `warm_up` takes many seconds."""
+        """Return True if a gate's kernels are compiled. Otherwise `warm_up` takes many seconds."""
         judge = getattr(config.build(stack), "tick_judge", None)
         return in_cache(judge or take_tick)
 
     @staticmethod
     def warm_up(config: DetectorConfig, stack: str) -> None:
-        """Load and compile all that a gate runs. Raises what `DetectorConfig.build` raises."""
+        """Load and compile all code of a gate. Raises what `DetectorConfig.build` raises."""
         gate = Gate(config.build(stack))
         report = CollisionReport(
             stamp_s=0.0, collision=False, time_to_collision_s=math.inf, future_collision_seq=0
@@ -325,7 +325,7 @@ class Recovery:
         self.state: VehicleState | None = None
 
     def recover(self, withheld: Message, decision: Decision) -> None:
-        """Start the recovery from a withheld message; a command is recomputed by its sender."""
+        """Start the recovery from a withheld message. The sender of a command recomputes it."""
         self._follower.withheld(withheld)
         if isinstance(withheld, Trajectory):
             self._pilot.reject_plan()
@@ -338,14 +338,14 @@ class Recovery:
             self._hold()
 
     def judge_changes(self, stamp_s: float, unharmed: Trajectory) -> None:
-        """Judge changes of the active plan since the last tick, before the mission logic uses it.
+        """Judge the active plan if it changed since the last tick, before mission logic uses it.
 
-        A new plan or a new waypoint triggers a check of the whole plan ahead. In between, each tick
-        checks only the present waypoint, because 50 checks of the whole plan per second would cost
-        an order of magnitude more.
+        A new plan or a new waypoint triggers a check of the whole plan ahead. In between, the gate
+        checks only the current waypoint, because 50 checks of the whole plan per second would cost
+        an order of magnitude more. So after a strike, only an alarm at that waypoint counts.
 
         Args:
-            unharmed: Plan before this tick's strike, which the gate has already judged.
+            unharmed: The plan, already judged by the gate, as it was before this tick's strike.
         """
         active, (judged, judged_at) = self._pilot.active, self._judged
         if active.trajectory is None:
@@ -357,7 +357,7 @@ class Recovery:
         self._judged = (active.trajectory, at)
 
     def judge_ahead(self, stamp_s: float, only: int | None = None) -> None:
-        """Drop anomalous waypoints of the plan ahead before other nodes use them."""
+        """Judge the plan ahead. Drop or correct its anomalous waypoints before they are used."""
         active = self._pilot.active
         while (flown := active.trajectory) is not None:
             decision = self._protection.ahead(flown, active.waypoint, only, stamp_s)
@@ -377,7 +377,7 @@ class Recovery:
             return
 
     def drop(self, flown: Trajectory, waypoint: int) -> Trajectory:
-        """Return a plan without a waypoint, and replace the active plan if it is `flown`."""
+        """Return `flown` without a waypoint. If `flown` is the active plan, replace it."""
         bridged = without_waypoint(flown, waypoint)
         self._replace(flown, bridged)
         return bridged

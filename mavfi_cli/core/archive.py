@@ -73,7 +73,7 @@ def unpack(archive: bytes, kind: type[T]) -> T:
     try:
         with zipfile.ZipFile(io.BytesIO(archive)) as parts:
             if any(part.compress_type != zipfile.ZIP_STORED for part in parts.infolist()):
-                raise ValueError("is compressed")
+                raise ValueError("the archive must not be compressed")
         with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
             text, data = arrays["value"].tobytes(), arrays["data"].tobytes()
         known: dict[Any, Any] = {}
@@ -86,7 +86,7 @@ def unpack(archive: bytes, kind: type[T]) -> T:
             place = at, dtype, *shape, order, writeable
             if place not in known:
                 if dtype not in _TYPES or at < 0 or min(shape, default=0) < 0:
-                    raise ValueError("has an array of an unsupported kind")
+                    raise ValueError("the archive has an array of an unsupported kind")
                 count = int(np.prod(shape, dtype=object))
                 made = np.frombuffer(data, dtype, count, at).copy().reshape(shape, order=order)
                 made.flags.writeable = writeable
@@ -114,7 +114,7 @@ def _converter() -> cattrs.Converter:
         )
 
         def hook(value: Any, kind: Any) -> Any:
-            """Raise ValueError if an array has the wrong shape."""
+            """Build the dataclass. Raises ValueError if an array in it has the wrong shape."""
             made = make(value, kind)
             for name, shape in _SHAPES.items():
                 array = getattr(made, name, None)
@@ -129,7 +129,7 @@ def _converter() -> cattrs.Converter:
 
 def _as_it_is(*kinds: type) -> Any:
     def hook(value: Any, _: Any) -> Any:
-        """Raise TypeError for a value of the wrong type, ValueError for one beyond 64 bits."""
+        """Return the value. Raises TypeError for a wrong type, ValueError if it exceeds 64 bits."""
         if isinstance(value, bool) is not (kinds[0] is bool) or not isinstance(value, kinds):
             raise TypeError(f"must be of type {kinds[0].__name__}, got {value!r}")
         if isinstance(value, int) and not -(2**63) <= value < 2**63:

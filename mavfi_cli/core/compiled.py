@@ -1,4 +1,4 @@
-"""Compile Python functions with numba, which is imported on first use only, into a cache on disk.
+"""Compiles Python functions with numba and caches them on disk. Imports numba on first use.
 
 The code targets x86-64-v3 on every processor that supports it, so an instruction-level fault
 strikes the same instruction on a processor with AVX-512 and on one without.
@@ -37,7 +37,7 @@ def compiled(function: F) -> F:
 
     numba's cache checks the source file of a function, but not the files of the functions that
     were compiled into it. Here a cache entry's stamp covers all sources in the folder of the
-    function and in the folders of the compiled functions it can call. Outdated code is never run.
+    function and in the folders of the compiled functions in its module, own or imported.
     """
     numba = _numba()
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
@@ -83,8 +83,8 @@ def in_cache(kernel: Callable[..., Any]) -> bool:
 def _load_without_compiler(cache: Any) -> None:
     """Make numba load machine code without its compiler, and recompile damaged cache entries.
 
-    numba would load its whole compiler before it checks the cache, which takes 0.4 s.
-    Machine code needs only the runtime, and the compiler loads what it needs itself.
+    Otherwise numba would load its whole compiler, in 0.4 s, before it checks the cache. Machine
+    code needs only the runtime. If something is compiled, the compiler loads what it needs.
     """
     from numba.core.runtime import rtsys
 
@@ -101,7 +101,7 @@ def _load_without_compiler(cache: Any) -> None:
 
 
 def _numba() -> Any:
-    """Import numba without BLAS, which takes 0.14 s to load and which no kernel uses."""
+    """Import numba, but not BLAS, which no kernel uses and which takes 0.14 s to load."""
     choose_caches()  # before numba reads the environment
     import numba
 
@@ -128,7 +128,7 @@ def _callees(function: Any) -> list[Any]:
 def folder_digest(folder: Path, *, deep: bool = False) -> str:
     """Return the SHA-256 of the names and contents of all Python sources in a folder.
 
-    `deep` includes its subfolders, and the TOML files of worlds, vehicles, stacks and platforms.
+    `deep` adds its subfolders and all TOML files: worlds, vehicles, stacks, platforms and others.
     """
     digest = hashlib.sha256()
     paths = [*folder.rglob("*.py"), *folder.rglob("*.toml")] if deep else folder.glob("*.py")
@@ -149,7 +149,7 @@ def own_digest() -> str:
 
 @functools.cache
 def choose_caches() -> None:
-    """Choose other caches if the defaults are not writable, as in another user's installation.
+    """Choose other cache folders if the default ones, such as another user's, are not writable.
 
     Machine code stays next to the sources if their folder is writable. Otherwise it goes to
     XDG_CACHE_HOME/mavfi, or else to a private temporary folder, whose path is printed to stderr
@@ -168,7 +168,7 @@ def choose_caches() -> None:
 
 
 def _home(variable: str, name: str) -> Path:
-    """Return the user's folder for an XDG variable; relative if there is no home."""
+    """Return the user's folder for an XDG variable; a relative path if the home is unknown."""
     given = Path(os.environ.get(variable, ""))
     return given if given.is_absolute() else Path(os.path.expanduser("~"), name)
 

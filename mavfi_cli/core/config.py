@@ -1,4 +1,4 @@
-"""Load TOML into frozen dataclasses with strict types, and write it. An unknown key is an error."""
+"""Loads TOML into frozen dataclasses and writes it. Types are strict; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def toml_text(values: Mapping[str, Any]) -> str:
-    """Write TOML that reads back as equal values; empty tables are left out.
+    """Return TOML text that reads back as equal values. Empty tables are left out.
 
     Args:
         values: Strings, finite numbers, booleans, arrays of them, tables, and arrays of tables.
@@ -76,7 +76,7 @@ def _without_empty_tables(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Shipped:
-    """The TOML files of one kind that are part of the program, in one folder."""
+    """The TOML files of one kind that ship with mavfi, in one folder."""
 
     kind: str
     folder: Path
@@ -165,7 +165,7 @@ _IN_WORDS = {int: "a whole number", float: "a number", bool: "true or false", st
 
 def _strict(kind: type, *accepted: type) -> Any:
     def hook(value: Any, _cls: Any) -> Any:
-        """Raise TypeError for a value of the wrong type, ValueError for one that is not finite."""
+        """Convert a value. Raises TypeError for a wrong type, ValueError if it is not finite."""
         if isinstance(value, bool) is not (kind is bool) or not isinstance(
             value, (kind, *accepted)
         ):
@@ -179,7 +179,7 @@ def _strict(kind: type, *accepted: type) -> Any:
 
 def _shaped(accepted: Any, wanted: str, structured: Any, length: int | None = None) -> Any:
     def hook(value: Any, cls: Any) -> Any:
-        """Raise TypeError for the wrong type or length. A string does not count as an array."""
+        """Convert a table or array. Raises TypeError for a wrong type, also a string, or length."""
         if not isinstance(value, accepted):
             raise TypeError(f"must be {wanted}, got {value!r}")
         if length is not None and len(value) != length:
@@ -240,7 +240,7 @@ def _first_problem(error: Exception, key: str) -> tuple[str, Exception]:
 
 
 def _line_of(text: str, key: str) -> int | None:
-    """Find the line that sets a dotted key, or the header of its table, by searching the text."""
+    """Return the number of the line that sets a dotted key, or else of its table's header."""
     section, _, last = key.rpartition(".")
     last = last.partition("[")[0]
     current, head = "", None

@@ -23,7 +23,7 @@ def described(error: BaseException) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a line with its control characters, which a terminal could obey, replaced."""
+    """Return a line in which every character that could control a terminal is replaced."""
     return "".join(c if c.isprintable() else "\ufffd" for c in text)
 
 
@@ -61,7 +61,7 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
 
 
 class UnknownName(MavfiError):
-    """An unknown name, a usage error. The message suggests the nearest known name."""
+    """An unknown name, which is a usage error. The message suggests the nearest known name."""
 
     exit_code = 2
 
@@ -98,7 +98,7 @@ class ConfigError(MavfiError):
     def unknown_key(
         cls, key: str, known: Iterable[str], *, path: Path | None = None, line: int | None = None
     ) -> Self:
-        """Return the error about an unknown key. It suggests the nearest known key."""
+        """Return the error for an unknown key. Its message suggests the nearest known key."""
         problem = f"unknown key; {_suggestion(key.rpartition('.')[2], known)}"
         return cls(problem, path=path, line=line, key=key)
 
@@ -149,7 +149,7 @@ class ModelError(MavfiError):
 
 
 class RecordError(MavfiError):
-    """A run folder that cannot be written or read."""
+    """A file or folder of results that cannot be written or read."""
 
 
 class FaultError(MavfiError):

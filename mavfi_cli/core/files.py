@@ -1,7 +1,8 @@
-"""Files: atomic writes, bounded reads and scratch folders.
+"""Handles files: atomic writes, bounded reads and scratch folders.
 
-A kill leaves the old file or the new one, never a partial one. A folder of results is untrusted:
-nothing is written through a link in it, and every read from it is bounded.
+A process that is killed while it writes leaves the old file or the new one, never a partial one. A
+folder of results is untrusted: nothing is written through a link in it, and every read from it is
+bounded.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def file_digest(name: str | Path) -> str:
 
 @contextlib.contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Turn an OSError in the block into a RecordError that names the path."""
+    """Convert an OSError in the block into a RecordError that names the path."""
     try:
         yield
     except OSError as error:
@@ -53,7 +54,7 @@ def writing(place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading(place: Path) -> Iterator[None]:
-    """Turn errors that a file's damaged contents cause into RecordError."""
+    """Convert errors caused by a file's damaged contents into RecordError."""
     try:
         yield
     except (
@@ -112,7 +113,7 @@ def inflate(data: bytes, limit: int) -> bytes:
     """Decompress zlib's format.
 
     Raises:
-        ValueError: The data are damaged, or have more than `limit` bytes.
+        ValueError: The data are damaged or truncated, or decompress to more than `limit` bytes.
     """
     inflater = zlib.decompressobj()
     try:
@@ -131,8 +132,8 @@ _unsynced: set[Path] = set()
 def leave_unsynced(folder: Path) -> None:
     """Let this process and its forks write files below a folder without syncing them.
 
-    Use it if the folder need not survive a power failure, because its files are removed, or kept
-    only after `sync_folder`. A sync takes 10 to 300 ms, and all other work waits for it.
+    Use it for a folder that need not survive a power failure, because its files are temporary or
+    are synced later by `sync_folder`. Each sync takes 10 to 300 ms, during which nothing else runs.
     """
     _unsynced.add(folder.absolute())
 
@@ -189,17 +190,17 @@ _TRIES = 10  # attempts to remove a folder, in which a dying program may still c
 class ScratchFolder:
     """A private temporary folder that is removed however the process ends.
 
-    It is removed by `close`, with the object, or when the process exits. A killed process leaves
-    it behind, and the next process that makes a scratch folder in the same place removes it. A
-    lock on a file in the folder shows that the process, or a fork of it, is still running. A fork
-    never removes the folder of its parent.
+    It is removed by `close`, when the object is deleted, or when the process exits. A killed
+    process leaves it behind, and the next process that makes a scratch folder in the same place
+    removes it. A lock on a file in the folder shows that the process, or a fork of it, is still
+    running. A fork never removes the folder of its parent.
 
     As a context manager it returns the path.
 
     Args:
         what: A word in its name, `mavfi-WHAT-...`.
-        parent: Folder to make it in, by default the temporary directory. Elsewhere its name begins
-            with a dot.
+        parent: Folder to create it in; its name then begins with a dot. None selects the temporary
+            directory.
 
     Attributes:
         path: The folder.
@@ -245,7 +246,7 @@ def _remove_scratch(path: Path, lock: int, owner: int) -> None:
 
 @cache
 def _remove_abandoned(place: Path) -> None:
-    """Remove this user's scratch folders that killed processes left, once per process."""
+    """Remove the scratch folders that killed processes of this user left; once per process."""
     for path in [*place.glob(f"{_SCRATCH}*"), *place.glob(f".{_SCRATCH}*")]:
         with contextlib.suppress(OSError):  # not ours, or its process is running
             about = path.lstat()
@@ -263,13 +264,13 @@ def require_output(path: Path, suffixes: Sequence[str] = ()) -> None:
     """Check that a file can be written, before its contents are computed.
 
     Raises:
-        RecordError: The name has none of the suffixes, if any are given, or the folder does not
-            exist.
+        RecordError: The name has none of the given suffixes, the folder does not exist or cannot be
+            written, or the path is not a regular file.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         *others, last = suffixes
         known = f"{', '.join(others)} or {last}" if others else last
-        raise RecordError(f"{path}: name a file that ends in {known}")
+        raise RecordError(f"{path}: the file name must end in {known}")
     if not path.absolute().parent.is_dir():
         raise RecordError(f"{path}: its folder does not exist")
     if path.exists() and not path.is_file():
@@ -288,7 +289,7 @@ def require_folder(folder: Path) -> None:
     except UnicodeEncodeError:
         raise RecordError(f"{str(folder)!r}: not a UTF-8 name") from None
     if not can_write(folder):
-        raise RecordError(f"{folder}: not a folder that can be created or written")
+        raise RecordError(f"{folder}: this folder cannot be created or written")
 
 
 def write_text(path: Path, text: str) -> None:

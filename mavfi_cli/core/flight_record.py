@@ -1,4 +1,4 @@
-"""The sections of a result.json: a flight writes these types, and everything else reads them.
+"""Defines the sections of a result.json, which a flight writes and all other parts read.
 
 A record of a mission that was cut off, or from an earlier version, lacks some of the fields, so
 every field has a default. docs/reference/records.md describes all of them.
@@ -50,7 +50,7 @@ class RecordedPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResponseTime:
-    """Time from a depth frame to its setpoint, s; None without any."""
+    """Times from a depth frame to its setpoint, s; None if there was none."""
 
     median: float | None = None
     p95: float | None = None
@@ -62,7 +62,7 @@ class ResponseTime:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelUse:
-    """Invocations of a kernel, inputs replaced by newer ones, and the time that it was busy."""
+    """A kernel's invocations, its inputs that newer ones replaced, and the time it was busy."""
 
     invocations: int = 0
     dropped_inputs: int = 0
@@ -88,7 +88,7 @@ class NodeEnds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramEnds:
-    """Starts of a program of a user's companion, and the exit codes of its processes."""
+    """How often a program of a user's companion was started, and its processes' exit codes."""
 
     starts: int = 0
     codes: Sequence[int] = ()
@@ -120,7 +120,7 @@ class Change:
     """One value that a strike changed.
 
     Attributes:
-        index: Waypoint; 0 for messages without rows.
+        index: Index of the waypoint; 0 for messages without waypoints.
         before, after: None in a record stands for infinity or NaN, which JSON lacks; `before_hex`
             and `after_hex` have the bits.
     """

@@ -1,4 +1,4 @@
-"""A process that loads everything once and forks a fresh worker for every request.
+"""A server process that loads everything once and forks a fresh worker for every request.
 
     python -m mavfi_cli.core.fork_server FD MODULE
 
@@ -8,8 +8,9 @@
                   └─ guard ...
 
 A worker is forked from a single-threaded process that has only loaded modules. It dies with its
-guard. When it ends or its time runs out, the guard kills every process that it started, and only
-then reports. When the client dies or closes the channel of a request, the guard kills the worker.
+guard. When the worker ends or its time runs out, the guard kills every process that the worker
+started, and only then reports. When the client dies or closes a request's channel, the guard kills
+the worker.
 Killing any process leaves no orphan and no blocked peer.
 
 The fork server of `multiprocessing` is not suitable: its children keep the server's pipe open, so a
@@ -78,10 +79,10 @@ class _Module(Protocol):
         """Load everything once, without starting a thread."""
 
     def perform(self, task: Mapping[str, Any], folder: Path) -> Path:
-        """Perform a task. Return the folder that it created in `folder`.
+        """Perform a task. Return the folder for its results, which it has created in `folder`.
 
-        It also gets the argument `forks`, a `Forks`, if the request allows it to fork itself. A
-        fork returns the folder that it created in the folder of the fork.
+        If the request allows the worker to fork itself, there is another argument, `forks`, a
+        `Forks`. In a fork, the folder is created in the fork's own folder.
         """
 
 
@@ -123,7 +124,7 @@ class ForkServer:
                     continue
                 undo.pop_all()
                 return ours
-        raise MavfiError("the process that forks the workers ended at once")
+        raise MavfiError("the process that forks the workers ended twice before it got the task")
 
     def _running(self) -> socket.socket:
         if self._control is not None:
@@ -150,7 +151,7 @@ class ForkServer:
         return ours
 
     def close(self) -> None:
-        """End the server; guards and workers end with their channels."""
+        """End the server. Guards and workers end when their channels are closed."""
         if self._control is None or self._process is None:
             return
         self._control.close()
@@ -265,7 +266,7 @@ def _await(worker: int, channel: socket.socket, deadline_s: float) -> bool:
         while True:
             left_s = math.inf if late else max(0.0, deadline_s - time.monotonic())
             ready = {ended for ended, _ in poller.poll(1e3 * min(left_s, _LONGEST_WAIT_S))}
-            if channel.fileno() in ready:  # a client sends nothing, so this is its end
+            if channel.fileno() in ready:  # a client sends nothing, so it has closed the channel
                 raise ConnectionError("the client closed the channel")
             if process in ready:
                 return late
@@ -292,7 +293,7 @@ def _report_of_worker(reading: int) -> Any:
 def _work(
     order: Mapping[str, Any], module: _Module, guard: int, writing: int, forks: Forks | None
 ) -> NoReturn:
-    """Run a worker, or the rest of the task in its fork."""
+    """Perform the task, report its result and exit. A fork of the worker ends here, too."""
     code, report = 1, {}
     try:
         _call_this_process(WORKER)
@@ -329,11 +330,11 @@ class Forks:
         """Fork the worker. Return True in the fork, and False in the worker after the fork's end.
 
         The fork ends by returning from `perform`. No fork is made if HALT exists, or if the system
-        has no memory or process left; a message reports the latter to the client.
+        has no memory or process left. In the latter case a message tells the client.
 
         Args:
-            key: identifies the fork in the message about its end, which includes the wall time
-                since the previous fork.
+            key: identifies the fork in the message about its end. The message also gives the wall
+                time since the end of the previous fork.
             folder: as for `ForkServer.start`.
             limit_s: limit of the fork's wall time, s.
         """
@@ -398,7 +399,7 @@ def _isolate_streams(folder: Path) -> None:
 
 
 def die_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends. Exit if that has already ended."""
+    """Have the kernel kill this process when `parent` ends. Exit if it has already ended."""
     _request(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -416,7 +417,7 @@ def _request(option: int, value: int | ctypes.c_char_p) -> None:
 
 
 def _end_children(others: Sequence[int] = ()) -> None:
-    """Kill and reap every descendant of this process, except some children.
+    """Kill and reap every descendant of this process, except the children `others`.
 
     This process inherits the children of a killed child, so the loop repeats until there are none.
     """

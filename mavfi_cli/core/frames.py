@@ -1,9 +1,9 @@
-"""Coordinate frames: ENU and FLU inside mavfi (ROS REP-103), NED and FRD in MAVLink messages.
+"""Converts coordinate frames: ENU and FLU in mavfi (ROS REP-103), NED and FRD in MAVLink.
 
 World frame: x east, y north, z up (ENU). Body frame: x forward, y left, z up (FLU).
 Yaw is measured counter-clockwise from east. A MAVLink heading is measured clockwise from north.
 Quaternions are Hamilton, scalar first (w, x, y, z), and rotate body into world.
-Each conversion is its own inverse.
+Each conversion between frames is its own inverse.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ FARTHEST_M, FASTEST_MPS = 1e4, 1e3
 
 
 def is_within(limit: float, values: Iterable[float]) -> bool:
-    """Return True if no value is NaN or beyond a limit."""
+    """Return True if the magnitude of every value is at most `limit`. NaN never is."""
     return all(abs(value) <= limit for value in values)
 
 
 def dot(a: Vector | Sequence[float], b: Vector | Sequence[float]) -> float:
     """Return the dot product of two vectors (n,), summed in the order of their elements.
 
-    numpy's `@`, `dot` and `linalg.norm` use BLAS, whose last digit depends on the processor.
+    numpy's `@`, `dot` and `linalg.norm` use BLAS, and its last digit depends on the processor.
     """
     total = 0.0
     for x, y in zip(_floats(a), _floats(b), strict=True):

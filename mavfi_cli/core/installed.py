@@ -1,4 +1,4 @@
-"""Installed versions of mavfi and its libraries, and plug-ins."""
+"""Finds the installed versions of mavfi and its libraries, and loads plug-ins."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LIBRARIES = ("numpy", "numba", "jsbsim", "pymavlink", "pyoctomap", "ompl", "pyt
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the versions of all libraries that a record depends on."""
+    """Return the versions of mavfi, Python and all libraries that a record depends on."""
     own = {"mavfi": __version__, "python": sys.version.split()[0]}
     return own | {name: importlib.metadata.version(name) for name in _LIBRARIES}
 

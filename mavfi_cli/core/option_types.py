@@ -24,7 +24,7 @@ class Number(click.FloatRange):
 
 
 class _OutPath(click.Path):
-    """A path to write. It must not be empty, which would mean the current folder.
+    """A path to write. An empty one is rejected, because it would mean the current folder.
 
     Args:
         require: raises RecordError for a path that cannot be written.

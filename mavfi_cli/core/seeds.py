@@ -1,7 +1,7 @@
-"""Named random streams from one root seed, so that golden and faulty runs stay paired.
+"""Derives named random streams from one root seed, so that golden and faulty runs stay paired.
 
-A stream is identified by its name, not by its order of use. A new consumer therefore never
-changes the numbers of another. The stream's name is the spawn key of numpy's SeedSequence.
+A stream is identified by its name, not by its order of use. A new consumer therefore never changes
+the numbers that another one draws. A hash of the name is the spawn key of numpy's SeedSequence.
 """
 
 from __future__ import annotations

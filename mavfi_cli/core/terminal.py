@@ -1,4 +1,4 @@
-"""Prints the output of commands and returns their exit codes. No text can control the terminal."""
+"""Prints the output of commands, in which no text can control the terminal; gives exit codes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mavfi_cli.core.errors import Interrupted, MavfiError, described, nearest, p
 
 
 def cleaned(text: str) -> str:
-    """Return lines without control characters."""
+    """Return text in which all control characters except newlines are replaced."""
     return "\n".join(map(printable, text.split("\n")))
 
 
@@ -74,7 +74,7 @@ def exit_code(program: Callable[[], object]) -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process as `sys.exit` does, but without freeing objects, which takes a second."""
+    """End this process like `sys.exit`, but do not spend a second on freeing objects."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

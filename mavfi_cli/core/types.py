@@ -63,11 +63,11 @@ class Briefing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightTruth:
-    """Records of the vehicle's side at the end of a flight.
+    """What the vehicle's side has recorded by the end of a flight.
 
     Attributes:
         log: Columns of the referee, (n,) or (n, 3 or 4), one row per control tick.
-        report: The referee's report, as in the section `referee` of a record, and its `world`.
+        report: The referee's report: the section `referee` of a record, and the `world`.
         stage_wall_s: Wall-clock time by part, s.
         memory_mb: Peak memory of the process.
     """

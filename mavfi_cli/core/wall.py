@@ -1,4 +1,4 @@
-"""Wall-clock time of the host. Only the record's `host` section contains it, never the mission."""
+"""Measures the host's wall-clock time, which only the `host` section of a record contains."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class WallClock:
     """Host seconds by name: the total and the newest measurement.
 
     A stage that runs in every tick is sampled: it is measured in every seventh tick, which counts
-    sevenfold. Measuring every tick would take a twentieth of a flight.
+    sevenfold. Measuring every tick would take a twentieth of a flight's wall time.
 
     Attributes:
         skipped_s: time that no measurement includes, because the whole flight waited.
@@ -33,7 +33,7 @@ class WallClock:
         return _Measurement(self, name, EVERY) if self._ticks % EVERY == 0 else _UNMEASURED
 
     def measure(self, name: str) -> _Measurement:
-        """Return a context that adds the time of its block to a name."""
+        """Return a context that adds the time of its block to the total of a name."""
         return _Measurement(self, name)
 
     def add(self, name: str, seconds: float) -> None:

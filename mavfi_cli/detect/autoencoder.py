@@ -2,8 +2,8 @@
 
     13 inputs -> 6 tanh -> 3 tanh -> 13 linear outputs,    error = mean (out - in)^2.
 
-Each delta is divided by its scale, so inputs and outputs of the net are about -1 to 1. A score
-above the largest error of error-free runs raises an alarm.
+Each delta is divided by its scale, so the network's inputs and outputs lie between about -1 and 1.
+An error above the largest one in error-free flights raises an alarm.
 """
 
 from __future__ import annotations
@@ -110,5 +110,5 @@ class AutoencoderDetector(FittedDetector):
     plan_judge = staticmethod(_judge_plan)
 
     def score(self, deltas: Codes, stage: Stage) -> float:
-        """Return the reconstruction error: the mean square over the 13 scaled deltas."""
+        """Return the reconstruction error: the mean squared error over the 13 scaled deltas."""
         return _reconstruction_error(self.flat, deltas)

@@ -1,10 +1,11 @@
 """The detector interface, the registry, and the base class and model files of our detectors.
 
-A model file is a fitted detector with its provenance in JSON. Reading is strict.
+A model file holds a fitted detector and its provenance as JSON. Unknown and missing keys
+are errors.
 
 Our detectors keep their state in one flat array. A cheap one scores a whole tick, or a whole plan,
-in one compiled call, because the call overhead exceeds the arithmetic. In flight, where caches hold
-other data, the overhead is several times larger.
+in one compiled call, because a call costs more time than the arithmetic. In flight, where caches
+hold other data, a call costs several times more.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Detector(Protocol):
 
         Args:
             deltas: Deltas of all states; 0 for states without a new sample.
-            stage: Stage to score (per stage), or stage of the message (one score over all).
+            stage: Stage to score if `per_stage`, otherwise the stage of the message.
         """
 
     def learn(self, deltas: Codes, stage: Stage) -> None:
@@ -76,7 +77,7 @@ class Detector(Protocol):
 def find_detector(
     name: str, *, model: Path | None = None, threshold: float | None = None
 ) -> Detector:
-    """Create a new detector of that name.
+    """Create a new detector by name.
 
     Args:
         model: Model file; None selects the shipped one.
@@ -124,7 +125,7 @@ class Model:
 
     @property
     def training_flights(self) -> list[str]:
-        """Flights (`world/seed`) that the model was made from, over all parts of its split."""
+        """Flights (`world/seed`) that the model was fitted to, from all parts of its split."""
         parts = self.provenance.get("split", {})
         if not isinstance(parts, Mapping):
             return []
@@ -203,7 +204,7 @@ def shipped(detector: str, stack: str = DEFAULT_STACK) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorListing:
-    """A detector with one of its models."""
+    """A detector with one of its models, or with none, as a row of `listing`."""
 
     name: str
     model: str | None = None  # path of the model file
@@ -214,7 +215,7 @@ class DetectorListing:
 
 
 def listing(models: Path | None = None) -> list[DetectorListing]:
-    """List all detectors with their models. A detector without a model has one row.
+    """List every detector once per model; a detector without a model has one row.
 
     Args:
         models: Folder of model files `NAME.json`; None selects the shipped ones.
@@ -256,7 +257,7 @@ def _listed(name: str, path: Path | None) -> DetectorListing:
 
 
 Shapes = dict[str, tuple[int, ...]]
-# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score and its stage.
+# (memory, work, waypoints, row, velocity, yaw, keep_report) -> score, and PASSED or its stage.
 TickJudge = Callable[..., tuple[float, int]]
 # (memory, work, waypoints, first, steps, changes, scores) -> number of steps.
 PlanJudge = Callable[..., int]
@@ -271,11 +272,11 @@ class FittedDetector:
         shapes: Names and shapes of the parts of the memory, in order. The first part is the
             threshold, a single number.
         divisors: Parts, besides the threshold, whose numbers must all be above 0.
-        scratch: Number of scratch elements for compiled code after the parts.
+        scratch: Number of scratch elements, which follow the parts, for compiled code.
         stack: Stack of the flights that the model was fitted to; None without a model file.
         extended: Ranges of the extended states in these flights; None without a model file.
-        tick_judge: `preprocess.take_tick` followed by scoring and learning as in the gate.
-        plan_judge: `preprocess.plan_deltas` and the score of each step that it returns.
+        tick_judge: Calls `preprocess.take_tick`, then scores and learns as the gate does.
+        plan_judge: Calls `preprocess.plan_deltas`, then scores each step that it returns.
     """
 
     name: ClassVar[str]
@@ -323,7 +324,7 @@ class FittedDetector:
 
     @classmethod
     def _arrays(cls, model: Model, path: Path) -> dict[str, FloatArray]:
-        """Return the arrays of a model. A ModelError explains why this version cannot use it."""
+        """Return the arrays of a model. Raise ModelError if this detector cannot use it."""
         if problem := model.incompatibility(cls.name, cls.shapes):
             raise ModelError(problem, path=path)
         arrays = {}

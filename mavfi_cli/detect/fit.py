@@ -1,10 +1,11 @@
 """Fits models to a data set of error-free flights.
 
-Flights are split by seed into three disjoint parts: `train` fits weights, means and scales,
-`validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds.
+A seeded shuffle splits the flights into three disjoint parts: `train` fits weights, means and
+scales, `validation` selects the epoch of the autoencoder, and `threshold` sets the thresholds. The
+Gaussian model also learns from `validation`. The ranges of `range` cover all flights.
 
 Only the autoencoder needs torch: `pip install mavfi[train]`. Adam minimises the mean squared
-reconstruction error of all distinct error-free vectors in one batch, starting from several sets of
+reconstruction error of all distinct training vectors in one batch, starting from several sets of
 random weights. The threshold will be the largest error, so training keeps the weights whose largest
 error on the validation vectors is lowest over all epochs and starts. It runs on one thread in
 double precision with a fixed seed, so the same data and version of torch give the same weights.
@@ -37,7 +38,7 @@ FLIGHTS_MIN = 10
 KINDS = ("gad", "aad", "range", "l2")
 # Cycle of the split: of ten flights, five train, one validates and four set thresholds.
 _TURNS = ("train", "threshold") * 4 + ("train", "validation")
-# The Gaussian model keeps learning in flight, so the distance of the same step changes.
+# The Gaussian model keeps learning in flight, so the score of the same step changes.
 _LEARNING = 1.02
 # Two reports can arrive between two ticks, so a sequence number may increase by two.
 _LEAST_SCALE = np.array([2 if s.dtype is DType.INT32 else 1 for s in DETECTED])
@@ -47,7 +48,7 @@ _YAW = [NAMES.index("waypoint_yaw"), NAMES.index("command_yaw")]
 
 
 def check(kinds: Collection[str], flights: int, n_sigma: float | None = None) -> None:
-    """Check, before the flights, that `fit` will be able to use them.
+    """Check the arguments of `fit`, if possible before the flights are flown.
 
     Raises:
         UnknownName: A kind is unknown.
@@ -69,8 +70,8 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
     """Fit one kind of detector. Raises the same errors as `check`.
 
     Args:
-        n_sigma: Threshold of the Gaussian model. None selects the smallest integer at least 2 %
-            above all scores of the third part, but no less than `gaussian.N_SIGMA`.
+        n_sigma: Threshold of the Gaussian model. None selects the smallest integer that is at least
+            2 % above all scores of the part `threshold`, but no less than `gaussian.N_SIGMA`.
     """
     check([kind], len(dataset), n_sigma)
     flights, parts = dataset.flights, _split(dataset, seed)
@@ -113,7 +114,7 @@ def fit(kind: str, dataset: Dataset, *, seed: int = 1, n_sigma: float | None = N
 
 
 def _split(dataset: Dataset, seed: int) -> dict[str, list[int]]:
-    """Split by flight, in similar proportions for each world. Return the indices by use."""
+    """Split the flights, in similar proportions for each world. Return their indices by use."""
     drawn = Stream.MISSION.generator(seed, "detector-split").permutation(len(dataset))
     worlds = [dataset.flights[place].world for place in drawn]
     ordered = [int(drawn[i]) for i in sorted(range(len(drawn)), key=lambda i: (worlds[i], i))]
@@ -137,10 +138,10 @@ def _scale_of(flights: Sequence[FlightSamples]) -> FloatArray:
 def _mirrored(flights: Sequence[FlightSamples]) -> NDArray[np.int64]:
     """Return the distinct deltas (m, COUNT) of the flights and their mirror images.
 
-    The training worlds have their goals north-east of the start, but no direction is special. The
-    images mirror east, mirror north, and swap the two. A mirrored velocity or position has the
-    negated code. Mirroring north also negates yaw. The other two leave the yaw delta unchanged,
-    which is an approximation.
+    In the training worlds, the goal lies north-east of the start, but no direction is special. The
+    images negate east, negate north, swap the two, or combine these. A negated velocity or position
+    has the negated code. Negating north also negates yaw. The other two leave the yaw delta
+    unchanged, which is an approximation.
     """
     deltas = np.concatenate([flight.deltas for flight in flights])
     rows = np.unique(deltas.astype(np.int64), axis=0)
@@ -204,7 +205,7 @@ Trained = tuple[dict[str, FloatArray], dict[str, Any]]  # weights by name, and t
 
 
 def _train_autoencoder(inputs: FloatArray, validation: FloatArray, seed: int) -> Trained:
-    """Train on scaled vectors (n, 13); return the best weights on validation vectors (m, 13)."""
+    """Train on scaled vectors (n, 13); return the weights best on validation vectors (m, 13)."""
     import torch
 
     threads = torch.get_num_threads()
@@ -227,7 +228,7 @@ def _train_once(torch: Any, inputs: FloatArray, validation: FloatArray, seed: in
         weights[f"{name}_biases"] = torch.zeros(after, dtype=torch.float64).requires_grad_()
 
     def loss_of(rows: Any) -> Any:
-        """Return the mean squared error (n,) of each vector (n, COUNT)."""
+        """Return the mean squared errors (n,) of vectors (n, COUNT)."""
         hidden = torch.tanh(rows @ weights["hidden_weights"].T + weights["hidden_biases"])
         coded = torch.tanh(hidden @ weights["coded_weights"].T + weights["coded_biases"])
         output = coded @ weights["output_weights"].T + weights["output_biases"]

@@ -1,14 +1,15 @@
-"""The gate that every message passes before it takes effect, and that may raise an alarm.
+"""The gate, which checks every message before it takes effect and may raise an alarm.
 
-A message that raises an alarm does not become the reference, and the detector does not learn it.
+A message that raises an alarm does not become the reference, and the detector does not learn from
+it.
 The caller withholds the message and recomputes the stage. If recomputation confirms the message,
 the caller accepts it with `accept_report`, `accept_plan` or `accept_tick`, and the message becomes
 the reference.
 
 The alarm of a per-stage detector (`Detector.per_stage`) names the stage with anomalous states. A
-detector over all stages scores one vector when a report arrives, and one at each tick, which
-includes a report received since the last tick. Its alarm always names control (paper, section V-D).
-The gate also checks a plan as a whole. Such an alarm names the waypoint to drop.
+detector over all stages scores one vector when a report arrives, and one at each tick. The latter
+includes a report received since the last tick. The alarm always names control (paper, section V-D).
+The gate also checks the steps of a plan. An alarm about a step names the waypoint to drop.
 
 An extended watch checks the extended states of reports and plans one by one before the detector
 scores the message. Whatever the detector, its alarm names the stage of the message.
@@ -46,16 +47,16 @@ class Alarm:
     threshold: float
     states: tuple[str, ...]  # anomalous states, worst first
     waypoint: int | None = None  # waypoint to drop, for the alarm of a plan
-    mended: Trajectory | None = None  # active plan with the accepted extended states
+    mended: Trajectory | None = None  # active plan, reset to the accepted extended states
 
 
 class _ExtendedWatch:
     """Judges each extended state by its range of changes in error-free flights.
 
     The change since the last accepted message must lie between the smallest and the largest change
-    in the training flights. All counters begin at 0 and no collision is predicted, so even the
-    first message is judged. A planner that owns its counter also counts plans that never took
-    effect. After n messages that were not accepted, n + 1 changes may therefore add up.
+    in the training flights. At the start, the counters are 0 and no collision is predicted, so even
+    the first message is judged. A planner that owns its counter also counts plans that never took
+    effect. So after n messages that were not accepted, the sum of n + 1 changes is allowed.
 
     Attributes:
         memory: Last accepted codes, smallest and largest changes, (3, 3) int16 with one column per
@@ -174,7 +175,7 @@ class Gate:
 
     @property
     def memory(self) -> Mapping[str, NDArray[Any]]:
-        """All state of detector and gate as writable arrays, so that a fault takes effect."""
+        """All state of detector and gate as writable arrays, into which faults can be injected."""
         own = {"gate": self._work} | ({} if self._watch is None else {"watch": self._watch.memory})
         return {**own, **self.detector.memory}
 
@@ -202,8 +203,8 @@ class Gate:
     def judge_plan(self, trajectory: Trajectory) -> Alarm | None:
         """Judge a published plan: all steps from waypoint to waypoint, and the extended states.
 
-        Only per-stage detectors judge the steps. An alarm of a detector over all stages recomputes
-        control, and there is no command to recompute yet; see `judge_ahead`.
+        Only per-stage detectors judge the steps here. An alarm of a detector over all stages would
+        recompute control, but there is no command to recompute yet; see `judge_ahead`.
         """
         if Stage.PLANNING not in self.protect:
             return None
@@ -213,7 +214,7 @@ class Gate:
         return self._settled(trajectory, alarm)
 
     def _settled(self, message: CollisionReport | Trajectory, alarm: Alarm | None) -> Alarm | None:
-        """Report to the extended watch whether a judged message passed. Return the alarm."""
+        """Tell the extended watch whether a judged message passed. Return the alarm."""
         if self._watch is not None:
             self._watch.accept(message) if alarm is None else self._watch.lose(type(message))
         return alarm
@@ -226,13 +227,13 @@ class Gate:
     def judge_ahead(self, trajectory: Trajectory, first: int) -> Alarm | None:
         """Judge the steps of the active plan, starting at waypoint `first`.
 
-        Whatever the detector, call this each time a node that looks ahead gets the plan, because
-        the collision check uses a corrupted waypoint long before the vehicle reaches it. The call
+        With any detector, call this each time a node that looks ahead receives the plan. The
+        collision check would use a corrupted waypoint long before the vehicle reaches it. The call
         does not change the gate, and the detector does not learn.
 
         Returns:
-            Alarm of the first bad step, which names the waypoint to drop, or alarm about extended
-            states that differ from those of the accepted plan.
+            An alarm about extended states that differ too much from those of the accepted plan, or
+            about the first bad step, with the waypoint to drop; None without either.
         """
         if Stage.PLANNING not in self.protect:
             return None
@@ -255,7 +256,7 @@ class Gate:
         return self._alarm(stage, scores[number], deltas, waypoint)
 
     def _score_steps(self, trajectory: Trajectory, first: int) -> list[float]:
-        """Return the scores of steps with a changed code, which fill `_steps` and `_changes`."""
+        """Score the steps that change a code; write steps and deltas to `_steps` and `_changes`."""
         waypoints = trajectory.waypoints
         if len(waypoints) > len(self._steps):
             self._steps = np.empty(len(waypoints), np.int64)
@@ -276,8 +277,8 @@ class Gate:
     ) -> Alarm | None:
         """Judge the current waypoint and the command, before the command is sent.
 
-        A waypoint is a new sample if its trajectory or index differs from the last accepted one. If
-        its stage raises an alarm, the command computed from it is not judged.
+        A waypoint is a new sample if its trajectory or index differs from that of the last accepted
+        one. If its stage raises an alarm, the command computed from it is not judged.
         """
         if trajectory is None or (trajectory is self._trajectory and index == self._index):
             waypoints, row = _NO_WAYPOINTS, -1
@@ -304,7 +305,7 @@ class Gate:
     def _judge_stages(
         self, _flat: FloatArray | None, work: Codes, *tick: *_Tick
     ) -> tuple[float, int]:
-        """Judge a tick as `FittedDetector.tick_judge` does, for a detector that has none."""
+        """Judge a tick without `tick_judge`: the detector has none, or a stage is not watched."""
         preprocess.take_tick(*tick, work)
         for span in self._ignored:
             self._deltas[span] = 0
@@ -355,7 +356,7 @@ class Gate:
         )
 
     def _blame(self, stage: Stage, threshold: float, deltas: Codes) -> tuple[str, ...]:
-        """Return the states that are anomalous alone, or else all that changed; worst first."""
+        """Return the states that are anomalous on their own, else all changed ones; worst first."""
         first, end = SPANS[stage] if self._per_stage else (0, COUNT)
         alone: list[tuple[float, int]] = []
         for place in range(first, end):

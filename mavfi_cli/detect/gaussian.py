@@ -5,9 +5,9 @@ Mean and sum of squares follow equations 1 and 2, with M_1 = x_1 and S_1 = 0:
     M_k = M_{k-1} + (x_k - M_{k-1}) / k
     S_k = S_{k-1} + (x_k - M_{k-1}) (x_k - M_k),        sigma = sqrt(S_k / (k - 1)).
 
-The score of a stage is the largest |x - M| / sigma of its states. The threshold is n. Codes are
-integers, and a state that rarely changes has a sigma close to 0, so `sigma_floor` of the stage is a
-lower limit of sigma. With fewer than two samples sigma is this floor.
+The score of a stage is the largest |x - M| / sigma of its states, and its threshold is `n_sigma`.
+Codes are integers, and a state that rarely changes would have a sigma close to 0, so sigma is never
+below the `sigma_floor` of its stage. With fewer than two samples, sigma is this floor.
 """
 
 from __future__ import annotations

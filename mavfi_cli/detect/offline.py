@@ -1,16 +1,16 @@
 """Replays of recorded flights through the gate, and data sets of their samples.
 
-A replay gives the scores of a detector, and the samples of error-free flights to fit models to. One
-row of a data set is one judged message: a collision report, a control tick, or one step of a
-published plan from waypoint to waypoint. Its deltas are the detector's input.
+A replay gives a detector's scores and, for error-free flights, the samples that models are fitted
+to. One row of a data set is one judged message: a collision report, a control tick, or one step of
+a published plan from waypoint to waypoint. Its deltas are the detector's input.
 
 A trace maps column names to arrays with one row per control tick. It has `stamp_s` and every
 monitored state by its name (NaN or masked before the first message with the state). Optional
-columns `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s` identify a new message with
-unchanged values. Without them a message counts as new if one of its values changes.
+columns `report_stamp_s`, `waypoint_index` and `trajectory_stamp_s` reveal a new message whose
+values are unchanged. Without them, a message counts as new only if one of its values changes.
 
-A trace contains only the current waypoint, but the gate also judges the active plan. The replay
-does the same if it gets the published plans and the changes that a fault made to the active one.
+A trace contains only the current waypoint, but the gate also judges the active plan. A replay does
+the same if it gets the published plans and the changes that a fault made to the active one.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def replay(
 ) -> Iterator[_Judgement]:
     """Judge every message of a trace in the order of arrival.
 
-    Nothing is recomputed; the messages are those of the flight.
+    Nothing is recomputed: the messages are always those of the flight.
 
     Args:
         detector: New detector; None computes only the deltas.
@@ -165,7 +165,7 @@ class _FlownPlans:
         if not plans:
             return
         if not {"trajectory_stamp_s", "waypoint_index"} <= set(trace):
-            raise ModelError("the trace has no columns trajectory_stamp_s and waypoint_index")
+            raise ModelError("the trace needs the columns trajectory_stamp_s and waypoint_index")
         self._stamps_s = _reals(trace["trajectory_stamp_s"])
         self._waypoints = _reals(trace["waypoint_index"])
 
@@ -231,7 +231,7 @@ class _Messages:
         )
 
     def waypoint(self, row: int) -> Trajectory | None:
-        """Return a trajectory of only the current waypoint, the same object until it changes."""
+        """Return a trajectory with only the current waypoint: the same object until it changes."""
         if self._new_waypoint[row]:
             self._trajectory = Trajectory(
                 stamp_s=self.stamps_s[row],
@@ -293,7 +293,7 @@ _FLAGS = ("reports", "plan_steps", "new_waypoint")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSamples:
-    """Samples of one error-free flight, oldest first."""
+    """Samples of one error-free flight: reports and ticks in order, then the steps of its plans."""
 
     world: str
     seed: int
@@ -302,7 +302,7 @@ class FlightSamples:
     plan_steps: NDArray[np.bool_]  # (n,) True for a step of a plan; otherwise a control tick
     new_waypoint: NDArray[np.bool_]  # (n,) True for a control tick with new planning states
     deltas: Codes  # (n, COUNT)
-    extended: Codes  # (n, 3) extended states; those of a plan are in the row of its first step
+    extended: Codes  # (n, 3) changes of extended states; a plan's are in the row of its first step
 
     @classmethod
     def of_ticks(
@@ -310,7 +310,7 @@ class FlightSamples:
     ) -> FlightSamples:
         """Extract the samples of a flight from its control ticks: stamp, waypoint, command.
 
-        A waypoint is a trajectory of one row, the same object until it changes.
+        A waypoint is a trajectory with one row, and is the same object until it changes.
         """
         gate, rows = Gate(_Probe(None)), []
         for stamp_s, trajectory, command in ticks:
@@ -337,7 +337,7 @@ class FlightSamples:
         params: PreprocessParams | None = None,
         plans: Sequence[Trajectory] = (),
     ) -> FlightSamples:
-        """Extract the samples of a flight.
+        """Extract the samples of a flight from its trace and its plans.
 
         Args:
             plans: All published plans. The trace contains only the flown waypoints.
@@ -368,7 +368,7 @@ class FlightSamples:
         )
 
     def of_stage(self, stage: Stage) -> Codes:
-        """Return the deltas (m, COUNT) of the samples with new states of a stage."""
+        """Return the deltas (m, COUNT) of the samples that have new states of a stage."""
         if stage is Stage.PERCEPTION:
             return self.deltas[self.reports]
         if stage is Stage.PLANNING:
@@ -402,7 +402,7 @@ def _plan_steps(plan: Trajectory, params: PreprocessParams) -> Codes:
 
 
 def _extended_changes(messages: Sequence[CollisionReport | Trajectory]) -> Codes:
-    """Return the changes (n, 3) of the extended states between messages of one kind."""
+    """Return the changes (n, 3) of the extended states between successive messages of a kind."""
     changes = np.zeros((len(messages), len(EXTENDED)), np.int16)
     before = [0] * len(EXTENDED)
     for row, message in enumerate(messages):
@@ -457,7 +457,7 @@ class Dataset:
 
         Raises:
             RecordError: The file is unreadable.
-            ModelError: It is not a data set, or was made with another state table or other
+            ModelError: It is not a data set, or was made with another schema, state table or
                 preprocessing.
         """
         params = preprocess or PreprocessParams()
@@ -470,7 +470,7 @@ class Dataset:
             raise ModelError("not a mavfi data set", path=path)
         if metadata | _signature(params) != metadata or "mavfi_stack" not in metadata:
             raise ModelError(
-                "was made for another version, table of states or preprocessing; record it again",
+                "was made with another schema, state table or preprocessing; create it again",
                 path=path,
             )
         stack = StackMark(name=metadata["mavfi_stack"], digest=metadata["mavfi_stack_digest"])

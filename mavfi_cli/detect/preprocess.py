@@ -17,7 +17,7 @@ same state, saturated to 16 bits. It is 0 if there is no such sample. Yaw wraps:
 docs/results/detectors.md compares this code with other combinations of sign and exponent.
 
 The extended states are `collision` of a report, and `plan_trajectory_seq` and
-`plan_future_collision_seq` of a plan. They are integers, which are their own codes.
+`plan_future_collision_seq` of a plan. Their codes are their integer values.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class PreprocessParams:
             raise ConfigError(problem, key="time_to_collision_ceiling")
 
     def working_array(self) -> Codes:
-        """Create the working array (ROWS, COUNT) for the functions below, without references.
+        """Create the working array (ROWS, COUNT) for the functions below, with no references yet.
 
         Row REFERENCE holds the reference codes of the deltas, PREVIOUS the reference codes before
         the last sample, CODE and DELTA the codes and deltas of the last sample. FLOOR, CEILING and
@@ -134,7 +134,7 @@ class PreprocessParams:
         return work
 
     def digest(self) -> str:
-        """Return the SHA-256 of the parameters and of the coding."""
+        """Return the SHA-256 of the parameters and of the name of the coding."""
         return _digest({"coding": "signed log-magnitude", **asdict(self)})
 
 
@@ -200,7 +200,7 @@ def take_tick(
     keep_report: bool,
     work: Codes,
 ) -> None:
-    """Compute the deltas of a control tick: waypoint `index` of (n, 10), and a command.
+    """Compute the deltas of a control tick from row `index` of `waypoints` (n, 10) and a command.
 
     A negative `index` means no waypoint. The deltas of the last report stay if `keep_report` is set
     and become 0 otherwise.

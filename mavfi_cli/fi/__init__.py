@@ -1,1 +1,1 @@
-"""Fault injection: bit operations, fault records, and the instruction-level injector."""
+"""Fault injection: bit operations, the source-level injector and the instruction-level tracer."""

@@ -1,6 +1,6 @@
 """All bit operations of the project.
 
-A value is handled as its *pattern*, an unsigned Python integer with bit 0 the least significant.
+A value is handled as its *pattern*: an unsigned Python integer whose bit 0 is least significant.
 Layouts of binary32 and binary64: IEEE 754-2019, section 3.4.
 """
 
@@ -37,7 +37,7 @@ _FORMATS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BitType:
-    """A type as bits: its name, its width, and the bits of its fields."""
+    """The bit layout of a type: its name, its width, and the bits of its fields."""
 
     name: str
     width: int
@@ -95,14 +95,14 @@ class BitType:
         return tuple(sorted(candidates[int(index)] for index in chosen))
 
     def pattern(self, value: Scalar) -> int:
-        """Return the bits of a value; a float32 is first rounded to the nearest binary32 value."""
+        """Return the pattern of a value; a float32 is first rounded to the nearest binary32."""
         of_value, of_pattern = _FORMATS[self.name]
         return int(struct.unpack(of_pattern, struct.pack(of_value, value))[0])
 
     def value(self, pattern: int) -> Scalar:
         """Return the value of a pattern.
 
-        A signalling float32 NaN may come back quiet, because Python holds every float as binary64.
+        A signalling float32 NaN may become quiet, because Python holds every float as binary64.
         """
         of_value, of_pattern = _FORMATS[self.name]
         value: Scalar = struct.unpack(of_value, struct.pack(of_pattern, pattern))[0]
@@ -156,6 +156,6 @@ NUMPY_TYPES = {kind.name: kind for kind in (
 
 
 def format_distinct(*values: object) -> list[str]:
-    """Format values with six digits, or with all digits if they would look equal."""
+    """Format values with six significant digits, or with all digits if any would look equal."""
     short = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
     return short if len(set(short)) == len(short) else [repr(value) for value in values]

@@ -1,7 +1,7 @@
 """Source-level faults: injection site, trigger and corruption as three small frozen types.
 
-`draw_fault` resolves a requested fault to one exact fault: it looks names up and draws the rest.
-`inject` flips bits of one value or of one element of an array, without a mission.
+`draw_fault` resolves a requested fault to one exact fault: it looks up names and draws the rest.
+`inject` flips bits of one value, or of one element of an array, without a mission.
 
 Vocabulary: transient, intermittent and stuck-at faults as in Avizienis et al., "Basic concepts and
 taxonomy of dependable and secure computing", IEEE TDSC 1(1), 2004.
@@ -32,7 +32,7 @@ class When(Enum):
     PHASE = "phase"  # the pilot's mode
     FORESEEN = "foreseen"  # the first report of a foreseen collision
     INVOCATION = "invocation"  # the n-th output of the kernel
-    RANDOM = "random"  # a time drawn over the flight from the fault's own stream
+    RANDOM = "random"  # a flight time drawn from the fault's own random stream
 
 
 class Effect(Enum):
@@ -41,7 +41,7 @@ class Effect(Enum):
     FLIP = "flip"  # on a process: it is killed
     ZERO = "zero"
     RANDOM = "random"  # all bits are replaced by random ones
-    FREEZE = "freeze"  # the value stays what it was at the first strike
+    FREEZE = "freeze"  # the value stays as it was at the first strike
     DROP = "drop"
     LATE = "late"  # late=SECONDS
     TWICE = "twice"
@@ -56,7 +56,7 @@ OF_PROCESSES = (Effect.FLIP, Effect.STOP, Effect.SLOW)
 
 
 class Persistence(Enum):
-    """The duration of a corruption."""
+    """How long a corruption lasts, and whether it recurs."""
 
     TRANSIENT = "transient"
     STUCK_AT = "stuck-at"
@@ -65,10 +65,10 @@ class Persistence(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger:
-    """The time of a fault. PHASE uses `phase`; RANDOM and FORESEEN use neither field."""
+    """When a fault strikes. PHASE uses `phase`; RANDOM and FORESEEN use neither field."""
 
     when: When = When.RANDOM
-    number: float = 0.0  # seconds, ticks, or the count of the invocation (from 1)
+    number: float = 0.0  # seconds, ticks, or the invocation's number (from 1)
     phase: str = ""
 
     def __post_init__(self) -> None:
@@ -78,7 +78,9 @@ class Trigger:
                 f"got {self.number:g}"
             )
         if self.when is When.INVOCATION and self.number < 1:
-            raise FaultSpecError(f"the invocation must be at least 1, got {self.number:g}")
+            raise FaultSpecError(
+                f"the number of the invocation must be at least 1, got {self.number:g}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +90,8 @@ class Corruption:
     Attributes:
         bits: number of distinct bits of `field` that are flipped.
         duration_s: duration of a stuck-at or intermittent fault, s.
-        amount: delay of a late message, s, or share of a slow process.
+        period_s: interval between the strikes of an intermittent fault, s.
+        amount: delay of a late message, s, or processor share of a slowed process.
     """
 
     effect: Effect = Effect.FLIP
@@ -108,7 +111,7 @@ class Corruption:
             raise FaultSpecError(f"period_s must be finite and above 0, got {self.period_s:g}")
         most = {Effect.LATE: 3600.0, Effect.SLOW: 1.0}.get(self.effect)
         if most is None and self.amount:
-            raise FaultSpecError(f"{self.effect.value} must have no number, got {self.amount:g}")
+            raise FaultSpecError(f"{self.effect.value} takes no number, got {self.amount:g}")
         if most is not None and not 0.0 < self.amount <= most:
             raise FaultSpecError(
                 f"{self.effect.value}=NUMBER must be above 0 and at most {most:g}, "
@@ -116,19 +119,19 @@ class Corruption:
             )
 
     def require(self, name: str, kind: BitType, bits: Sequence[int] | None) -> None:
-        """Refuse a corruption of bits that a type does not have.
+        """Refuse a corruption that cannot be applied to values of a type.
 
         Raises:
-            FaultError: an exact bit or the field is missing, the field has too few bits, or the
-                effect does not apply to values.
+            FaultSpecError: the type lacks an exact bit or the field, the field has too few bits, or
+                the effect does not apply to values.
         """
         require_effect(name, self.effect, OF_VALUES)
         if bits is not None:
             kind.mask(bits)
         elif self.effect is Effect.FLIP and self.bits > len(kind.field_bits(self.field)):
             raise FaultSpecError(
-                f"{name} is {kind.name}: bits of its field {self.field.value} must be at most "
-                f"{len(kind.field_bits(self.field))}, got {self.bits}"
+                f"{name} is {kind.name}: the number of flipped bits in field {self.field.value} "
+                f"must be at most {len(kind.field_bits(self.field))}, got {self.bits}"
             )
 
 
@@ -144,9 +147,9 @@ class SourceFault:
     """One source-level fault.
 
     Attributes:
-        states: the attacked states, all of one message. Several states are struck together,
-            with separate bits.
-        bits: the exact bits of every state, as in a replay; None draws them.
+        states: the attacked states, all of the same message. Several states are struck at once,
+            each with its own bits.
+        bits: the exact bits of each state, as in a replay; None draws them.
     """
 
     states: tuple[State, ...]
@@ -170,7 +173,7 @@ def draw_fault(
     known: Mapping[str, State] = BY_NAME,
     wholes: Mapping[str, tuple[State, ...]] = STAGES,
 ) -> SourceFault:
-    """Draw the fault of a target and a seed.
+    """Draw the fault that a target and a seed determine.
 
     Args:
         target: a stage, a state, or a group of states. From a stage, one state that has the
@@ -241,21 +244,23 @@ def inject(
     Args:
         value: Python float (binary64), int (int64) or bool, a numpy scalar, or an array of any
             shape with dtype float64, float32, bool or any integer. It is not changed.
-        field: Field of the bits: sign, exponent, mantissa or any.
+        bits: Number of distinct bits to flip.
+        field: Part of the value whose bits are flipped: sign, exponent, mantissa or any.
         seed: Seed from which the element and the bits are drawn, 0 or more.
         exact_bits: Bits to flip instead of drawn ones; bit 0 is the least significant.
 
     Raises:
-        FaultSpecError: The type of the value is not supported, or the array is empty.
+        FaultSpecError: The type of the value is not supported, the array is empty, the type lacks
+            the field or a bit of `exact_bits`, or the field has too few bits.
         UnknownName: No field has this name.
-        FaultError: The type lacks the field or a bit of `exact_bits`, or the field has too few
-            bits.
     """
     corrupted: NDArray[Any] = np.array(value)
     kind = NUMPY_TYPES.get(corrupted.dtype.name)
     if kind is None:
         known = ", ".join(NUMPY_TYPES)
-        raise FaultSpecError(f"cannot flip bits of {corrupted.dtype.name}; the types are {known}")
+        raise FaultSpecError(
+            f"cannot flip bits of {corrupted.dtype.name}; the supported types are {known}"
+        )
     if corrupted.size == 0:
         raise FaultSpecError("cannot flip bits of an array without elements")
     rng = Stream.FAULT.generator(seed, "value")

@@ -1,14 +1,15 @@
-"""Applies a source-level fault to the messages between kernels.
+"""Injects source-level faults into the messages between kernels, or into a detector's memory.
 
 Every message passes through `pass_on` when it is published. The active plan also passes through
-`strike_latched` once a tick, because a fault may strike it at any time of its long life.
+`strike_latched` once per tick, because it stays active for many ticks and a fault may strike in any
+of them.
 
 A listener is called with a strike *before* the changed message is passed on, so that the record
 survives any effect of the fault.
 
-A `Follower` determines whether a corrupted value was read before it was replaced: a flip in a value
-that is never read is not a fault that the system survived. It uses the terms of the instruction
-level (`fi.tracer.inject.BitActivation`).
+A `Follower` determines whether a corrupted value was read before it was replaced. A corruption that
+nobody reads shows nothing about the system's resilience. `Activation` uses the terms of the
+instruction level where they apply (`fi.tracer.inject.BitActivation`).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _WORDS: dict[type, str] = {CollisionReport: "report", Trajectory: "plan", Comman
 
 
 class Moment(NamedTuple):
-    """The mission's state at one moment, against which triggers are checked."""
+    """A snapshot of the mission. Triggers are checked against it."""
 
     stamp_s: float
     flight_s: float  # since the companion took over
@@ -52,10 +53,10 @@ class Moment(NamedTuple):
 
 
 class Pattern:
-    """The corruption of one value, drawn once: its bits and their new values.
+    """The corruption of one value: its bits and their new values, fixed at the first strike.
 
     Args:
-        bits: the exact bits; None draws them at the first strike.
+        bits: the exact bits to flip; None draws them at the first strike.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Pattern:
         self._target = 0
 
     def corrupt(self, pattern: int, kind: BitType) -> int:
-        """Return the pattern after a strike."""
+        """Return `pattern` with the corruption applied."""
         if self._bits is None:
             self._bits = self._choose(pattern, kind)
         mask = kind.mask(self._bits)
@@ -97,7 +98,7 @@ Listener = Callable[[Strike], None]
 
 
 class NoInjector:
-    """Null object that changes nothing.
+    """A null object: an injector that changes nothing.
 
     Attributes:
         follower: determines who reads a struck value.
@@ -107,7 +108,7 @@ class NoInjector:
         self.follower = Follower()
 
     def watch(self, moment: Moment) -> None:
-        """Update the mission's current state, once per control tick and for every report."""
+        """Check the trigger at this moment. Called once per control tick and for every report."""
 
     def pass_on(self, message: M, moment: Moment) -> M:
         """Return a published message, corrupted if the fault strikes it."""
@@ -118,16 +119,16 @@ class NoInjector:
         return trajectory
 
     def strike(self, moment: Moment) -> None:
-        """Inject a fault into memory or a process if it is due. Called once per control tick."""
+        """Strike memory or a process if the fault is due. Called once per control tick."""
 
 
 class Injector(NoInjector):
-    """The schedule and the strikes of one fault. Subclasses strike messages or memory.
+    """Schedules and records the strikes of one fault. Subclasses strike messages or memory.
 
     Args:
-        rng: random generator, which first draws the time of a random trigger.
-        shortest_flight_s: lower bound of the mission's flight time. A random time is drawn
-            uniformly below it, so that every flight reaches it.
+        rng: random generator. Its first draw is the time of a random trigger.
+        shortest_flight_s: lower bound on the mission's flight time. The time of a random trigger is
+            drawn uniformly below this bound, so that every flight reaches the trigger.
         listener: called with every strike before the mission continues.
     """
 
@@ -152,9 +153,9 @@ class Injector(NoInjector):
         self.count = 0
 
     def watch(self, moment: Moment) -> None:
-        """Update the mission's current state, even if there is nothing to strike.
+        """Check the trigger at this moment, even if there is nothing to strike.
 
-        A phase may begin and end before the next message with the attacked state.
+        Otherwise, a phase that ends before the next message with the attacked state is missed.
         """
         self._triggered = self._triggered or self._is_triggered(moment)
 
@@ -171,7 +172,7 @@ class Injector(NoInjector):
         return f"no {self._awaits} came after {since}" if self._triggered else never
 
     def _due(self, moment: Moment, invocations: int = 0) -> bool:
-        """Return True if the fault strikes now. `invocations` is the number of outputs so far."""
+        """Return True if the fault strikes now. `invocations` counts the outputs so far."""
         self.watch(moment)
         corruption = self._corruption
         if self._begun_s is None:
@@ -236,7 +237,7 @@ class SourceInjector(Injector):
         self._struck: Message | None = None
 
     def pass_on(self, message: M, moment: Moment) -> M:
-        """See `NoInjector`."""
+        """See `NoInjector.pass_on`."""
         if type(message) is not self._kind:
             return message
         self._invocations += 1
@@ -247,7 +248,7 @@ class SourceInjector(Injector):
         return self._strike(message, moment, 0)
 
     def strike_latched(self, trajectory: Trajectory, moment: Moment, index: int) -> Trajectory:
-        """See `NoInjector`."""
+        """See `NoInjector.strike_latched`."""
         if self._kind is not Trajectory or not self._strikes_latched():
             return trajectory
         if trajectory is self._struck and self.fault.corruption.persistence is not (
@@ -261,7 +262,7 @@ class SourceInjector(Injector):
         return struck
 
     def _strikes_latched(self) -> bool:
-        """Return True for every trigger except an invocation, which is checked on publication."""
+        """Return True unless the trigger is an invocation, which is checked on publication."""
         return self.fault.trigger.when is not When.INVOCATION
 
     def _strike(self, message: M, moment: Moment, first: int) -> M:
@@ -275,7 +276,7 @@ class SourceInjector(Injector):
             assert change.after is not None
             changed = state.write(changed, self._index, change.after)
             changes.append(change)
-        # An unchanged message remains the same object: its readers may read an earlier strike.
+        # If nothing changed, keep the same object: it may still hold an unread earlier strike.
         struck: Any = changed if any(change.bits for change in changes) else message
         self.follower.struck(struck, self._record(moment, self._invocations, changes))
         result: M = struck
@@ -318,7 +319,8 @@ def rehearsed(fault: SourceFault, seed: int) -> tuple[float, Strike]:
 
     Returns:
         The moment as a fraction of the shortest possible flight, and a strike with the bits of each
-        component. In a flight, the bits differ if the last waypoint of a plan is struck.
+        state. In a flight, the bits differ if only a plan's last waypoint can be struck, because
+        then no waypoint is drawn.
     """
     injector = SourceInjector(
         fault, seed=seed, shortest_flight_s=1.0, listener=lambda _strike: None
@@ -340,7 +342,8 @@ class MemoryInjector(Injector):
     The memory is that of a detector: its thresholds, means and weights.
 
     Args:
-        array: the attacked array; None draws one in proportion to its size in bytes.
+        array: the attacked array; None draws one with probability proportional to its size in
+            bytes.
         trigger: when to strike; an invocation is a control tick.
         shortest_flight_s, listener: as for `Injector`.
 
@@ -349,8 +352,8 @@ class MemoryInjector(Injector):
 
     Raises:
         UnknownName: no array has this name.
-        FaultError: the array's elements do not have these bits.
-        FaultSpecError: the array has no elements, or the field has too few bits.
+        FaultSpecError: the array has no elements, its elements lack the bits or the field, or the
+            field has too few bits.
     """
 
     _awaits = "control tick"
@@ -386,7 +389,7 @@ class MemoryInjector(Injector):
         self._pattern = Pattern(corruption, rng, chosen)
 
     def strike(self, moment: Moment) -> None:
-        """See `NoInjector`."""
+        """See `NoInjector.strike`."""
         if not self._due(moment, moment.tick):
             return
         place = self._memory[self.array]
@@ -397,7 +400,7 @@ class MemoryInjector(Injector):
 
 
 class Activation(Enum):
-    """Fate of the corrupted values, over all strikes of a fault."""
+    """The fate of the corrupted values, over all strikes of a fault."""
 
     READ = "read"  # a receiver worked with a corrupted value
     WITHHELD = "withheld"  # the detector's gate withheld it from its receivers
@@ -423,11 +426,11 @@ class Follower:
 
     @property
     def waits(self) -> bool:
-        """True while a struck message is in transit and unread."""
+        """True while a corrupted value may still be read."""
         return self._message is not None
 
     def struck(self, message: Message, strike: Strike) -> None:
-        """Record that a message was corrupted; `message` is the changed one."""
+        """Record a strike; `message` is the message after it."""
         if self.activation is Activation.READ:
             return
         corrupted = {c.state: c.index for c in strike.changes if c.bits}
@@ -445,7 +448,7 @@ class Follower:
         states: Collection[str],
         index: int | None = None,
     ) -> None:
-        """Record that a receiver reads states of a message, at one waypoint or at all of them."""
+        """Record that a receiver reads `states` of a message, at waypoint `index` or at all."""
         if self._message is None or message is not self._message:
             return
         for state, at in self._corrupted.items():
@@ -460,7 +463,7 @@ class Follower:
             self.activation, self._message = Activation.WITHHELD, None
 
     def settle(self, held: Callable[[Message], bool]) -> None:
-        """Record the message as overwritten unless it is still `held`."""
+        """Record the struck message as overwritten unless it is still `held`."""
         if self._message is not None and not held(self._message):
             self._message = None
             self._become(Activation.OVERWRITTEN)

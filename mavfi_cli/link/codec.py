@@ -49,7 +49,7 @@ def key_from_passphrase(passphrase: str) -> bytes:
 
 
 class Signing:
-    """Key, outgoing timestamp, and the newest timestamp of every received stream.
+    """Signs sent frames and checks received ones, with the newest timestamp of each stream.
 
     Args:
         key: 32 secret bytes, see `key_from_passphrase`.
@@ -72,7 +72,8 @@ class Signing:
     def accept(self, frame: bytes, header: int, message_id: int, *, signed: bool) -> bool:
         """Return True if a frame is authentic and not a replay, or is an unsigned RADIO_STATUS.
 
-        Only authentic frames update the timestamps, so an attacker cannot block a stream.
+        Only authentic frames update the timestamps, so a sender without the key cannot block a
+        stream.
         """
         if not signed:
             return message_id == _RADIO_STATUS
@@ -84,7 +85,7 @@ class Signing:
         return True
 
     def renew(self, frame: bytes, block: bytes) -> bytes:
-        """Return a changed frame's signature block, with the link id and timestamp of `block`."""
+        """Return a new signature block for a changed frame, keeping `block`'s link id and time."""
         return block[:7] + self._digest(frame + block[:7])
 
     def authenticates(self, data: bytes) -> bool:
@@ -118,7 +119,7 @@ def _timestamp(frame: bytes) -> int:
 
 
 def _stream(frame: bytes, header: int) -> tuple[int, int, int]:
-    """Return link id, system and component of a signed frame."""
+    """Return the link id, system id and component id of a signed frame."""
     return frame[-13], frame[header - 5], frame[header - 4]
 
 
@@ -138,7 +139,7 @@ _V1_HEAD, _V2_HEAD = struct.Struct("<BBBBB"), struct.Struct("<BBBBBBHB")
 
 _crc: Callable[..., int] = dialect.mcrf4xx  # CRC-16/MCRF4XX, compiled
 
-# A further byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]. This is the table.
+# A further byte x changes a checksum c to (c >> 8) ^ table[(c ^ x) & 0xFF]. These are its entries.
 _CRC_TABLE = frozenset(_crc(bytes([x]), 0) for x in range(256))
 
 
@@ -167,12 +168,12 @@ class _Kind:
             (place, length, kinds[name] == "uint8_t")
             for place, (name, length) in enumerate(zip(names, cls.lengths, strict=True))
             if length > 1
-        ]  # index of the field, length, and whether its bytes are contiguous
+        ]  # index of the field, length, and whether it is packed in one piece
         if cls.msgname == _PACKET:
             self._columns, self._arrays = lambda packet: (packet.seqnr, bytes(packet.data)), []
 
     def payload(self, message: Message) -> bytes:
-        """Return the payload of a message without trailing zeros."""
+        """Return a message's payload without trailing zeros, but with at least one byte."""
         values = self._columns(message)
         if self._arrays:
             values = list(values)
@@ -182,7 +183,7 @@ class _Kind:
         return self.pack(*values).rstrip(b"\0") or b"\0"
 
     def values(self, frame: bytes, start: int, length: int) -> Sequence[Any]:
-        """Return the fields of a payload. Arrays become lists, and texts lose their padding."""
+        """Return a payload's values in wire order: arrays as lists, texts without padding."""
         size = self.size
         if length != size:  # senders cut trailing zeros, and newer ones add fields
             frame, start = frame[start : start + length].ljust(size, b"\0"), 0
@@ -199,11 +200,11 @@ class _Kind:
 
 
 def _received(cls: Any) -> Any:
-    """Return a subclass for received messages that differs only in its constructor.
+    """Return a subclass of `cls` for received messages. Only its constructor differs.
 
-    The constructor takes _OF_FRAME and the fields in wire order. It is generated, like those of
-    dataclasses. With pymavlink's constructor a frame takes a third longer to decode, because every
-    message gets an empty header and attributes that are the same for the whole class.
+    The constructor takes _OF_FRAME and the fields in wire order. It is generated as source text, as
+    in dataclasses. With pymavlink's constructor, decoding a frame takes a third longer, because
+    each message gets an empty header and attributes that are the same for the whole class.
     """
     kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
     blank = vars(cls(*(b"" if kind == "char" else 0 for kind in cls.fieldtypes)))
@@ -230,7 +231,7 @@ def _kind(message_id: int) -> _Kind | None:
 
 
 class Codec:
-    """Codec of one end of a link. It numbers the frames that it encodes.
+    """Encodes and decodes frames at one end of a link, and numbers the frames that it encodes.
 
     Args:
         keeps_unknown: Decode frames whose id the dialect lacks as `MAVLink_unknown`, so that they
@@ -279,8 +280,9 @@ class Codec:
     def decode(self, data: bytes, *, datagram: bool = False) -> list[Message]:
         """Return the messages that `data` completes, oldest first. Never raises.
 
-        A false marker costs one byte, but not the frames after it. A frame may continue in the next
-        call unless `datagram` is set; then no frame extends beyond `data`.
+        Only one byte is skipped at a false marker, so the frames after it are found. A frame may
+        continue in the next call, unless `datagram` is set, which means that `data` holds whole
+        frames.
         """
         buffer = self._rest + data if self._rest else bytes(data)
         messages: list[Message] = []
@@ -304,11 +306,11 @@ class Codec:
         return messages
 
     def _take(self, buffer: bytes, start: int, end: int, messages: list[Message]) -> bool:
-        """Append the message of a candidate frame. Return False if its checksum is wrong.
+        """Append the message of a candidate frame. Return False if the frame is not valid.
 
-        The checksum includes a byte that depends on the message definition. It is unknown if the
-        dialect lacks the id, so noise passes the check once in 256 times. Such a frame must also be
-        followed by another frame or the end of the data.
+        The checksum includes a byte that depends on the message definition. If the dialect lacks
+        the id, any value of that byte is accepted, so one in 256 frames of noise passes. Such a
+        frame must therefore also be followed by a marker or the end of the data.
         """
         frame = buffer[start:end]
         if frame[0] == _V2:
@@ -358,8 +360,8 @@ class Codec:
 def renewed(message: Message, signing: Signing | None = None) -> Message | None:
     """Rebuild the frame of a received message whose fields were changed.
 
-    Length, checksum and signature are recomputed, and the rest of the header stays. Fields that the
-    dialect lacks are lost.
+    Length, checksum and signature are recomputed, and the rest of the header is kept. Fields that
+    the dialect lacks are lost.
 
     Returns:
         The message, or None if its frame is signed and there is no key.
@@ -380,13 +382,13 @@ def renewed(message: Message, signing: Signing | None = None) -> Message | None:
 
 
 def begins_with_frame(data: bytes) -> bool:
-    """Return True if data begins with a whole frame of the dialect with a correct checksum."""
+    """Return True if data begins with a complete, valid frame of a message of the dialect."""
     length = frame_length(data, 0, len(data)) if data[:1] in (b"\xfd", b"\xfe") else 0
     return length > 0 and bool(Codec(0, 0).decode(data[:length], datagram=True))
 
 
 def frame_length(buffer: bytes, position: int, end: int) -> int:
-    """Return the length of the frame at a position, _INCOMPLETE, or 0 if none can start there."""
+    """Return a frame's length, _INCOMPLETE if it is cut off, or 0 if none can start here."""
     if end - position < 3:
         return _INCOMPLETE
     length = buffer[position + 1] + 8
@@ -449,14 +451,14 @@ AvailableModes = _message_class(
 ADDED: dict[int, Any] = {
     message.id: message for message in (ProtocolVersion, ComponentMetadata, AvailableModes)
 }
-"""Message classes by id."""
+"""The added message classes by id."""
 
 SLOW_STREAMS_US = {
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2e5,
     dialect.MAVLINK_MSG_ID_SYS_STATUS: 5e5,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5e5,
 }
-"""Intervals of the streams that a flight needs besides the state, us, by message id."""
+"""Interval of each stream that a flight needs besides the vehicle state, us, by message id."""
 STATE_STREAMS = (
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
 )  # fmt: skip
@@ -465,10 +467,15 @@ CHUNK_LENGTH = 50  # characters per STATUSTEXT
 
 
 def text_messages(severity: int, data: bytes, text_id: int) -> Iterator[Message]:
-    """Yield the STATUSTEXTs of an ASCII text, with a MAV_SEVERITY and an id in 1 .. 65535.
+    """Yield the STATUSTEXT messages of an ASCII text.
 
-    A text that fits into one message has id 0. A longer one is sent in chunks that share the id;
-    the last is shorter than CHUNK_LENGTH (https://mavlink.io/en/messages/common.html#STATUSTEXT).
+    A text that fits into one message gets id 0. A longer one is split into chunks that share
+    `text_id`. The last chunk is shorter than CHUNK_LENGTH, and may be empty.
+    Source: https://mavlink.io/en/messages/common.html#STATUSTEXT.
+
+    Args:
+        severity: MAV_SEVERITY.
+        text_id: 1 .. 65535.
     """
     if len(data) <= CHUNK_LENGTH:
         yield dialect.MAVLink_statustext_message(severity, data)

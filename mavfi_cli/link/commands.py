@@ -1,7 +1,7 @@
-"""MAVLink's command protocol: sends a command, awaits its acknowledgement, repeats it.
+"""Implements MAVLink's command protocol: sends a command and repeats it until it is acknowledged.
 
-The caller supplies the time. An acknowledgement names only the command, so the same command is
-never pending twice for one component. Source: https://mavlink.io/en/services/command.html.
+The caller supplies the time. An acknowledgement names only the command, so equal commands to one
+component are sent one after the other. Source: https://mavlink.io/en/services/command.html.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MODE_PATIENCE_S = 1.5  # wait for a mode change; HEARTBEAT arrives once a secon
 _LOOK_INTERVAL_S = 0.2
 _HOME_INTERVAL_S = 1.0
 _WARNING = dialect.MAV_SEVERITY_WARNING
-_MOST_TEXTS = 5  # of the autopilot, in an error
+_MOST_TEXTS = 5  # maximum number of the autopilot's texts that an error quotes
 
 
 @dataclass(slots=True, kw_only=True)
@@ -61,9 +61,9 @@ class Ticket:
 class Commands:
     """Commands of a session to the components of one system.
 
-    Any number of submitted commands may be pending. In addition, a phase of the session has one
-    request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the current
-    stamp, before any request. Acknowledgements for other systems and components are ignored.
+    Several submitted commands may be pending at once. In addition, each phase of the session makes
+    one request at a time, which is repeated until telemetry shows its effect. Set `now_s`, the
+    current stamp, before any request. Acknowledgements of other senders' commands are ignored.
     """
 
     def __init__(self, system: int, component: int, telemetry: Telemetry) -> None:
@@ -84,9 +84,10 @@ class Commands:
         unused: float = 0.0,
         refusals: int = 0,
     ) -> Ticket:
-        """Queue a COMMAND_LONG with its first parameters; the others are set to `unused`.
+        """Queue a COMMAND_LONG with the given parameters; the remaining ones are set to `unused`.
 
-        After a temporary refusal the command is repeated 1 s later, at most `refusals` times.
+        After a temporary refusal the command is repeated 1 s later, at most `refusals` times. If
+        too many commands of this kind are queued, it is given up at once.
         """
         padded = (*parameters, *[unused] * (7 - len(parameters)))
         ticket = Ticket(
@@ -153,7 +154,7 @@ class Commands:
         return self._ticket is not None
 
     def refuse(self, command: str, result: str) -> NoReturn:
-        """Raise CommandRefused with the autopilot's newest texts since the start of the phase."""
+        """Raise CommandRefused, quoting the autopilot's newest warnings since the phase began."""
         texts = self._telemetry.texts
         texts.expire(self.now_s, 0.0)
         warnings = (text for text in texts.since(self._texts_before) if text.severity <= _WARNING)
@@ -164,8 +165,8 @@ class Commands:
     def insist(self, name: str, command: int, *parameters: float, unused: float = 0.0) -> bool:
         """Send a command until it is accepted. Return True once it is.
 
-        If an accepted command shows no effect, further calls send it again. Raises CommandRefused
-        if it was refused permanently.
+        If the phase continues for 3 s after that, the command is sent again. Raises CommandRefused
+        if it was refused permanently or not answered.
         """
         if self._ticket is None:
             self._ticket = self.submit(command, *parameters, unused=unused, refusals=2)
@@ -185,7 +186,7 @@ class Commands:
         return False
 
     def request_mode(self, mode: str) -> bool:
-        """Request a mode until HEARTBEAT shows it. An acknowledgement alone does not count.
+        """Request a mode; return True once a HEARTBEAT shows it, whatever was acknowledged.
 
         Raises CommandRefused if the mode has not changed after the maximum number of requests.
         """
@@ -214,7 +215,7 @@ class Commands:
         self._request_message(dialect.MAVLINK_MSG_ID_HEARTBEAT, _LOOK_INTERVAL_S)
 
     def request_home(self) -> None:
-        """Request HOME_POSITION once a second."""
+        """Request HOME_POSITION, at most once a second."""
         self._request_message(dialect.MAVLINK_MSG_ID_HOME_POSITION, _HOME_INTERVAL_S)
 
     def _request_message(self, message_id: int, interval_s: float) -> None:
@@ -226,7 +227,7 @@ class Commands:
         self._requested[message_id] = ticket, self.now_s + interval_s
 
     def request_streams(self, state_rate_hz: float) -> None:
-        """Request the message streams of a flight: the state at this rate, the others slower."""
+        """Request a flight's streams: the state at `state_rate_hz`, the others at fixed rates."""
         state = dict.fromkeys(STATE_STREAMS, 1e6 / state_rate_hz)
         for message_id, interval_us in {**state, **SLOW_STREAMS_US}.items():
             self.submit(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)

@@ -1,4 +1,4 @@
-"""Endpoint URLs, such as `udpin:127.0.0.1:14540`, and the sender that an endpoint admits."""
+"""Parses and opens endpoint URLs, such as `udpin:127.0.0.1:14540`, and chooses between senders."""
 
 from __future__ import annotations
 
@@ -44,9 +44,10 @@ class Endpoint:
     fd: int = -1
 
     def open_socket(self, *, beyond: bool) -> socket.socket:
-        """Open a network URL's bound or connected socket. `beyond` allows leaving this machine.
+        """Open a bound or connected socket for a network URL. Raises as `open_transport` does.
 
-        Raises LinkError as `open_transport` does.
+        Args:
+            beyond: Allow addresses other than loopback.
         """
         datagram = self.scheme.startswith("udp")
         kind = socket.SOCK_DGRAM if datagram else socket.SOCK_STREAM
@@ -58,7 +59,7 @@ class Endpoint:
         family, address = entries[0][0], str(entries[0][4][0])
         if not (beyond or ipaddress.ip_address(address.partition("%")[0]).is_loopback):
             raise LinkError(
-                f"{self.url}: {address} is beyond this machine, where MAVLink signing is required: "
+                f"{self.url}: {address} is not a loopback address, so the link must be signed: "
                 "give --key-file"
             )
         opened = socket.socket(family, kind)
@@ -92,7 +93,10 @@ class Endpoint:
         }.get(error.errno or 0, text)
 
     def inherited_socket(self) -> socket.socket:
-        """Return the connected stream socket that the parent left open, or raise LinkError."""
+        """Return the connected stream socket inherited from the parent process.
+
+        Raises LinkError if the descriptor is not such a socket.
+        """
         try:
             connection = socket.socket(fileno=self.fd)
         except OSError as error:
@@ -112,7 +116,8 @@ class Endpoint:
 def parse_endpoint(url: str) -> Endpoint:
     """Parse a URL of the form `scheme:rest` or `scheme://rest`.
 
-    Raises LinkError if the scheme is unknown (lists the known ones), or the rest does not fit it.
+    Raises LinkError if the scheme is unknown (the message lists the known ones), or the rest is
+    malformed or out of range.
     """
     word, _, rest = url.partition(":")
     rest = rest.removeprefix("//")
@@ -125,7 +130,7 @@ def parse_endpoint(url: str) -> Endpoint:
         if not re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
             raise malformed
         if int(text) > largest:
-            raise LinkError(f"{url}: must be at most {largest}, got {text}")
+            raise LinkError(f"{url}: the number must be at most {largest}, got {text}")
         return int(text)
 
     if scheme == "fd":
@@ -148,18 +153,18 @@ def parse_endpoint(url: str) -> Endpoint:
 
 
 Sender = TypeVar("Sender")
-SILENCE_S = 5.0  # silence after which another sender may take the place
+SILENCE_S = 5.0  # silence after which another sender may take the slot
 TWO_AUTOPILOTS = "two autopilots send here"
 
 
 class SenderSlot(Generic[Sender]):
-    """The place of one sender. Another one may take it after 5 s of silence."""
+    """The slot for an endpoint's one sender. After 5 s of silence another sender may take it."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self.holder: Sender | None = None  # the current sender
-        # A sender that sent while the place was taken, if the holder has sent since. So it is not
-        # the holder itself, restarted on another port.
+        # Another sender, which sent while the slot was taken. The holder has sent since, so the
+        # rival is not the holder itself, restarted on another port.
         self.rival: Sender | None = None
         self._challenger: Sender | None = None
         self._silent_from_s = 0.0  # when the holder will have been silent for too long
@@ -170,17 +175,17 @@ class SenderSlot(Generic[Sender]):
         return self.holder is None or self._clock() >= self._silent_from_s
 
     def take(self, sender: Sender) -> None:
-        """Give the place to a sender."""
+        """Give the slot to a sender."""
         self.holder, self._challenger = sender, None
         self.refresh(sender)
 
     def leave(self, sender: Sender) -> None:
-        """Free the place if `sender` holds it."""
+        """Free the slot if `sender` holds it."""
         if sender == self.holder:
             self.holder = None
 
     def refresh(self, sender: Sender) -> bool:
-        """Record that a sender has sent. Return True if it holds the place."""
+        """Record that a sender has sent. Return True if it holds the slot."""
         if sender != self.holder:
             return False
         if self._challenger is not None:
@@ -189,5 +194,5 @@ class SenderSlot(Generic[Sender]):
         return True
 
     def challenge(self, sender: Sender) -> None:
-        """Record that another sender has sent while the place is taken."""
+        """Record that another sender has sent while the slot is taken."""
         self._challenger = sender

@@ -36,7 +36,7 @@ class _WireState(State):
         return number
 
     def write(self, message: Message, index: int, value: Scalar) -> Message:
-        """Return a copy of a received message with the value. Its frame is unchanged."""
+        """Return a copy of a received message with a new value of this field, but the old frame."""
         changed, field = copy.copy(message), getattr(message, self.source)
         if self.column is not None:
             field = [*field[: self.column], value, *field[self.column + 1 :]]
@@ -83,6 +83,6 @@ class WireFields:
 
 
 def is_ignored(message: Message, state: State) -> bool:
-    """Return True if the setpoint's own mask makes the autopilot ignore a field."""
+    """Return True if a message is a setpoint whose mask tells the autopilot to ignore a field."""
     mask = getattr(message, "type_mask", 0) if message.get_type() in _SETPOINTS else 0
     return bool(mask & _IGNORED.get(state.source, 0))

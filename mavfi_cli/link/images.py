@@ -1,8 +1,8 @@
 """Receives depth frames despite loss and reordering.
 
 A frame consists of CAMERA_IMAGE_CAPTURED (stamp, index, and `depth8:crc32=%08x` of the pixels in
-`file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet gives
-its place in a frame, but not the frame. The checksum of the pixels identifies the frame.
+`file_url`), DATA_TRANSMISSION_HANDSHAKE (size), and ENCAPSULATED_DATA packets. A packet contains
+its place in its frame, but nothing that identifies the frame. The checksum of the pixels does.
 Source of the protocol: https://mavlink.io/en/services/image_transmission.html.
 """
 
@@ -36,7 +36,8 @@ _TRIALS = 64  # combinations of packets that are tried against the checksum of o
 _LARGEST_GAP = 10_000  # a larger jump of the index means a restarted camera
 _REMEMBERED = 64  # indices of finished frames
 
-_DEPTH_M = np.array([*(DEPTH_UNIT_M * level for level in range(NOTHING)), math.inf])  # by pixel
+# Depth of each pixel value.
+_DEPTH_M = np.array([*(DEPTH_UNIT_M * level for level in range(NOTHING)), math.inf])
 
 _CHECKSUM = re.compile(r"depth8:crc32=([0-9a-fA-F]{8})")
 
@@ -53,10 +54,11 @@ class ImageFrame:
     def depth_frame(
         self, state: VehicleState, *, hfov_rad: float, mount_offset_flu_m: FloatArray
     ) -> DepthFrame:
-        """Convert to metres and add the camera's pose at the time of capture.
+        """Return the image in metres with the camera's pose at the time of capture.
 
-        `state` is the state at the image's stamp. `hfov_rad` is used if the image has none. The
-        offset (3,) is that of the optical centre; the camera looks along the vehicle's x axis.
+        `state` is the vehicle's state at the image's stamp. `hfov_rad` is used if the image has no
+        field of view. `mount_offset_flu_m` (3,) is the offset of the optical centre from the
+        vehicle's position. The camera looks along the vehicle's x axis.
         """
         offset_m = rotate(rotation_matrix(state.quaternion), mount_offset_flu_m)
         return DepthFrame(
@@ -77,7 +79,7 @@ class _Shape(NamedTuple):
 
 @dataclass(slots=True)
 class _Announced:
-    """A frame that is not complete yet."""
+    """A frame that was announced and is not complete yet."""
 
     index: int
     stamp_s: float
@@ -93,13 +95,13 @@ _Packet = tuple[int, bytes]  # count of messages at its arrival, data
 class ImageReceiver:
     """Assembles frames from messages.
 
-    A lost packet costs only its own frame. A frame whose checksum never matches is dropped.
-    Memory is bounded by a few frames of MAX_PIXELS for any input.
+    A lost packet costs only its own frame. A frame whose checksum never matches is dropped. For any
+    input, memory is bounded by a few frames of MAX_PIXELS.
 
-    Once there are packets for all places, two candidates are checked against the checksum of each
-    announced frame. For each place, the first takes the packet nearest to its due time after the
-    announcement, which is correct if neighbouring frames interleave slightly. The second takes the
-    newest packet of each place, which is correct for any reordering within one frame.
+    Once every place has a packet, two candidates are checked against the checksum of each announced
+    frame. The first candidate takes, for each place, the packet that arrived nearest to its due
+    time after the announcement. It is correct if neighbouring frames interleave only slightly. The
+    second takes the newest packet of each place. It is correct for any reordering within one frame.
     """
 
     def __init__(self) -> None:
@@ -121,7 +123,7 @@ class ImageReceiver:
 
     @property
     def lost(self) -> int:
-        """Number of frames, announced or skipped by the index, that can no longer be completed."""
+        """Number of frames that can no longer be completed, with those that the index skipped."""
         if self._first is None:
             return self._lost_before
         counted = self._newest - self._first + 1
@@ -157,7 +159,8 @@ class ImageReceiver:
     def _follow(self, index: int, stamp_s: float) -> bool:
         """Track the index. Return False for a frame that is known or too old.
 
-        A camera has restarted if the index is smaller but the stamp is newer.
+        The camera has restarted if the index is lower and the stamp newer than before, or if the
+        index has jumped by more than _LARGEST_GAP.
         """
         restarted = index < self._newest and stamp_s > self._newest_s
         if self._first is None or restarted or abs(index - self._newest) > _LARGEST_GAP:
@@ -222,7 +225,10 @@ class ImageReceiver:
         return done
 
     def _solve(self, frame: _Announced, shape: _Shape) -> bytes | None:
-        """Return the nearest or newest packets' pixels if they match the checksum, else None."""
+        """Return the nearest or newest packets' pixels if they match the checksum, else None.
+
+        Without a checksum, packets match if they arrived close to each other.
+        """
         newest = [self._packets[place][-1] for place in range(shape.packets)]
         nearby = [
             min((abs(packet[0] - frame.due - place), packet) for packet in self._packets[place])
@@ -249,9 +255,9 @@ class ImageReceiver:
         return None
 
     def _forget(self, frame: _Announced, packets: list[_Packet]) -> None:
-        """Remove a complete frame's packets, except those whose due time fits another frame better.
+        """Remove a complete frame's packets, except those whose arrival fits another frame better.
 
-        Frames may be completed with each other's packets if the pixels are equal, as in the sky.
+        A frame may be completed with another's packets if their pixels are equal, as in the sky.
         """
         for place, packet in enumerate(packets):
             held, since = self._packets[place], packet[0] - place

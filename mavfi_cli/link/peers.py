@@ -1,9 +1,10 @@
 """Serves the peers at several endpoints in turn, receiving and sending in bounded time.
 
-A sender on a listening endpoint becomes a peer with its first valid frame; `open_listener` bounds
-the number of peers and their waiting bytes. The source address of a datagram may be forged, and
-replies then reach a host that has sent nothing. So a UDP peer gets all messages only for a short
-time after a valid frame, then fewer and fewer. It is removed after 30 s of silence.
+A client of a TCP port becomes a peer when it connects, a sender to a UDP port with its first valid
+frame. `open_listener` bounds the number of peers and their waiting bytes. The source address of a
+datagram may be forged; replies then reach a host that has sent nothing. A peer on a UDP port
+therefore gets all messages only for a short time after a valid frame, and then fewer and fewer. It
+is removed after 30 s of silence.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class Peer(ABC):
 
     Attributes:
         scheme: Scheme of its endpoint's URL.
-        last_received_s, last_sent_s: Times of its newest valid frame and of the newest message to
-            it.
-        full_rate_s: Time after a valid frame for which it gets all messages.
+        last_received_s, last_sent_s: Times of the newest valid frame from it and of the newest
+            message to it.
+        full_rate_s: How long it gets all messages after a valid frame, s.
     """
 
     scheme = ""
@@ -47,7 +48,7 @@ class Peer(ABC):
         """Handle received bytes. Return the valid messages among them."""
 
     def forward(self, *, frame: bytes, sender: Peer) -> bool:
-        """Send another peer's frame unchanged. Return False for this peer's own frame."""
+        """Send the frame of another peer to this one, unchanged. Return False if it is its own."""
         if sender is self:
             return False
         self.transport.send(frame)
@@ -84,7 +85,7 @@ class Peers(Generic[P]):
         self.lost: LinkLost | None = None  # loss of the only peer of an endpoint that connects
 
     def __iter__(self) -> Iterator[P]:
-        """Iterate over the present peers. Peers may leave during the iteration."""
+        """Iterate over a copy of the list of peers, so that peers may leave meanwhile."""
         return iter(list(self._peers))
 
     def open(self, endpoint: str | Transport, make: Callable[[Transport], P]) -> Listener:
@@ -118,7 +119,10 @@ class Peers(Generic[P]):
         poller.poll(timeout_s * 1e3)
 
     def serve(self, until_s: float) -> None:
-        """Accept new peers, then serve all peers round-robin until the deadline."""
+        """Accept peers, then receive from all in turn until none has data, or the deadline.
+
+        Then remove silent peers on UDP ports.
+        """
         self._accept()
         idle = 0
         while idle < len(self._peers) and self._clock() < until_s:
@@ -137,8 +141,8 @@ class Peers(Generic[P]):
     def send_in_turn(self, action: Callable[[P], object], until_s: float = math.inf) -> None:
         """Call a sending function for each peer in turn, but less often for a silent UDP peer.
 
-        The intervals of a silent peer double. After `until_s` the remaining peers wait for the next
-        call, which begins with them. The function returns False if it had nothing to send.
+        For a silent peer, the interval doubles each time. The peers that remain at `until_s` come
+        first in the next call. The function returns False if it had nothing to send.
         """
         for _ in range(len(self._peers)):
             if not self._peers:
@@ -167,7 +171,7 @@ class Peers(Generic[P]):
                 fresh.append(peer)
         self._peers += fresh
         for peer in fresh:
-            self._receive(peer)  # now, or a replay of its signed frame would seem new
+            self._receive(peer)  # at once; else another sender could replay its signed frame
             peer.full_rate_s = _AFTER_FIRST_S
 
     def _receive(self, peer: P) -> bool:

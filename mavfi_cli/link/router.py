@@ -44,15 +44,15 @@ class _Program(Peer):
 
 
 class Router:
-    """The links of one autopilot and one companion.
+    """Forwards frames between one autopilot and one companion.
 
     Args:
         autopilot: URL or open transport of the autopilot.
-        companion: URL of the companion's link; a listening one takes several programs. An open
-            transport takes one.
+        companion: URL of the companion's link, to which several programs can connect if it listens,
+            or an open transport to a single program.
         passes: Decides which frames to pass on; None passes every frame.
         signing: Rejects frames without a valid signature, on both sides.
-        allow_unsigned: Allow an unsigned link to reach beyond this machine.
+        allow_unsigned: Allow addresses other than loopback without signing.
 
     Attributes:
         port: Local port of the companion's link if that listens; the system chooses one for port 0.
@@ -86,7 +86,7 @@ class Router:
             until_s: Monotonic time after which remaining frames wait for the next turn.
 
         Raises:
-            LinkLost: The autopilot, or a companion at an endpoint that connects, closed its link.
+            LinkLost: The other end closed a link that does not listen.
         """
         self.peers.wait(timeout_s)
         self.peers.serve(until_s)
@@ -96,12 +96,12 @@ class Router:
             raise LinkLost("the autopilot closed the connection")
 
     def receive(self, message: Message, sender: _Program) -> None:
-        """Pass a received message on."""
+        """Forward the frames that `passes` returns for a received message."""
         for frame in self._passes(message, sender.side):
             self.send(frame, sender.side, sender)
 
     def send(self, frame: bytes, side: Side, sender: Any = None) -> None:
-        """Send a frame as if it came from `side`."""
+        """Send a frame as if it came from `side`, but not back to `sender`."""
 
         def forward(peer: _Program) -> None:
             if peer is not sender and not side is peer.side is Side.AUTOPILOT:

@@ -1,7 +1,7 @@
-"""The companion's MAVLink session as a state machine without sockets or clock.
+"""Runs the companion's MAVLink session as a state machine without sockets or a clock.
 
-Lockstep, real time and tests drive it the same way. Call `handle` with every received message, then
-`tick` with the stamp, and send the messages that `tick` returns, in order.
+Lockstep flights, real-time flights and tests drive it the same way: call `handle` with every
+received message, then `tick` with the stamp, and send the messages that `tick` returns, in order.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _DISARM_AFTER_S = 5.0  # time on the ground after which the session disarms the 
 
 
 def _float32(vector: Sequence[float]) -> Sequence[float]:
-    """Return a vector with infinity in place of numbers beyond float32; NaN stays NaN."""
+    """Return a vector whose components beyond the range of float32 are infinite; NaN stays NaN."""
     if sum(map(abs, vector)) <= _LARGEST_FLOAT32:
         return vector
     return [
@@ -109,7 +109,7 @@ class OffboardSession:
         self.telemetry = telemetry or Telemetry()
         self.phase, self._step = Phase.CONNECTING, _STEPS[Phase.CONNECTING]
         self.failure: LinkError | None = None  # cause of the phase FAILED
-        # Why the autopilot no longer follows setpoints: mode change or disarming. Never reset.
+        # Why the autopilot stopped following setpoints: it changed mode or disarmed. Never reset.
         self.failsafe_text: str | None = None
         own = self._settings.system, self._settings.component
         self._commands = Commands(*own, self.telemetry)
@@ -133,11 +133,11 @@ class OffboardSession:
 
     @property
     def is_up(self) -> bool:
-        """True if the vehicle is in the air, or was at the take-off height."""
+        """True if the vehicle is in the air, or has reached the take-off height before."""
         return self._was_up or self.telemetry.in_air
 
     def state_at(self, stamp_s: float) -> VehicleState | None:
-        """Return the state at a stamp, exact or interpolated; None outside the last ten seconds."""
+        """Return the state at a stamp, exact or interpolated; None if the history lacks it."""
         return self.telemetry.history.at(stamp_s)
 
     # Requests of the mission --------------------------------------------------------------------
@@ -305,7 +305,10 @@ class OffboardSession:
             raise LinkError(f"{self._url}: {self.telemetry.unfit}")
 
     def _position_known(self) -> bool:
-        """Return True once a state has arrived and a required camera has answered."""
+        """Return True once the camera has answered and a state has arrived, or without a camera.
+
+        Raises LinkError if the camera or the state does not arrive in time.
+        """
         settings, request = self._settings, self._origin_request
         if not settings.needs_camera or request is None:
             return True

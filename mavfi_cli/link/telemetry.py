@@ -1,8 +1,8 @@
-"""Newest telemetry of one autopilot, updated message by message.
+"""Keeps the newest telemetry of one autopilot, updated message by message.
 
 Autopilots differ in mode numbers and take-off procedure. Sources: PX4's px4_custom_mode.h (main
-mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's mode numbers; both confirmed with
-messages from PX4 1.17 and ArduCopter 4.5.
+mode in bits 16..23, sub mode in bits 24..31) and ArduCopter's mode numbers. Both were checked
+against messages from PX4 1.17 and ArduCopter 4.5.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _AutopilotProfile:
         return f"mode {custom_mode}"
 
     def mode_parameters(self, name: str) -> tuple[float, float]:
-        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode of `modes`."""
+        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE for a mode named in `modes`."""
         number = self.modes[name]
         if self is PX4:
             return float(number >> 16 & 0xFF), float(number >> 24)
@@ -75,18 +75,18 @@ _COPTERS = (
 AUTOPILOT: int = dialect.MAV_COMP_ID_AUTOPILOT1
 CAMERA: int = dialect.MAV_COMP_ID_CAMERA
 _KEPT = 512
-_REORDERED_MS = 1000  # a stamp older by less is a late packet; by more, a restarted clock
+_REORDERED_MS = 1000  # a stamp that lags by less is a late packet; otherwise the clock restarted
 
 
 class _StateHistory:
-    """The newest states, at least _KEPT, in order of their stamps."""
+    """The newest states in stamp order. At 2 * _KEPT states, the older half is dropped."""
 
     def __init__(self) -> None:
         self._stamps_ms: list[int] = []
         self._states: list[VehicleState] = []
 
     def add(self, state: VehicleState) -> bool:
-        """Append a state; return False if it is late. A restarted clock clears the history."""
+        """Append a state; return False if it is late or repeated. A clock restart clears all."""
         stamp_ms = round(state.stamp_s * 1e3)
         if self._stamps_ms and stamp_ms <= self._stamps_ms[-1]:
             if stamp_ms > self._stamps_ms[-1] - _REORDERED_MS:
@@ -114,7 +114,7 @@ class _StateHistory:
 
 
 def _between(before: VehicleState, after: VehicleState, stamp_s: float) -> VehicleState:
-    """Interpolate position and velocity linearly, the quaternion along the shorter arc (nlerp)."""
+    """Interpolate position and velocity linearly, and the quaternion by nlerp (shorter arc)."""
     share = (stamp_s - before.stamp_s) / (after.stamp_s - before.stamp_s)
     sign = -1.0 if dot(before.quaternion, after.quaternion) < 0.0 else 1.0
     quaternion = (1.0 - share) * before.quaternion + share * sign * after.quaternion
@@ -145,14 +145,14 @@ _LONGEST = 1000  # characters of a text
 
 
 class _Text(NamedTuple):
-    """A complete text of a component."""
+    """A finished text of a component, with _GAP for missing chunks."""
 
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
     text: str
 
 
 class _Open(NamedTuple):
-    """An incomplete text: its chunks by number."""
+    """An unfinished text: its chunks by number."""
 
     severity: int
     started_s: float
@@ -160,7 +160,7 @@ class _Open(NamedTuple):
 
 
 class _TextCollector:
-    """Keeps the newest thousand texts and the incomplete ones, and counts all finished texts."""
+    """Keeps the newest 1000 finished texts and the unfinished ones, and counts the finished."""
 
     def __init__(self) -> None:
         self.texts: deque[_Text] = deque(maxlen=_MAX_TEXTS)
@@ -168,14 +168,14 @@ class _TextCollector:
         self.open: dict[tuple[int, int, int], _Open] = {}
 
     def since(self, total: int) -> list[_Text]:
-        """Return the texts after the first `total`, oldest first."""
+        """Return the kept texts after the first `total`, oldest first."""
         if total == self.total:
             return []
         fresh = min(self.total - total, len(self.texts))
         return list(self.texts)[len(self.texts) - fresh :]
 
     def add(self, message: Message, stamp_s: float) -> list[_Text]:
-        """Handle a STATUSTEXT. Return the texts that are now complete."""
+        """Handle a STATUSTEXT. Return the texts that it finishes."""
         if message.id == 0:
             return [self._emit(message.severity, message.text)]
         done = []
@@ -192,7 +192,7 @@ class _TextCollector:
         return done
 
     def expire(self, stamp_s: float, patience_s: float = _PATIENCE_S) -> list[_Text]:
-        """Close texts whose chunks have been missing too long, and return them with a gap."""
+        """Finish and return the texts that began at least `patience_s` ago, gaps included."""
         late = [k for k, o in self.open.items() if stamp_s - o.started_s >= patience_s]
         return [self._finish(key) for key in late]
 
@@ -213,9 +213,10 @@ class _TextCollector:
 
 
 class Telemetry:
-    """Newest telemetry of one autopilot.
+    """Newest telemetry of one autopilot: the first supported one that sends a HEARTBEAT.
 
-    The first autopilot that sends (component 1 of any system) is used. Others are ignored.
+    An autopilot is component 1 of any system. A HEARTBEAT of another autopilot sets `unfit`. All
+    other messages of other senders are ignored.
     """
 
     def __init__(self) -> None:
@@ -231,7 +232,7 @@ class Telemetry:
         self.mode = ""  # name of the flight mode; "" before the first HEARTBEAT
         self.landed_state: int = dialect.MAV_LANDED_STATE_UNDEFINED  # unknown values are ignored
         self.ready = False  # the pre-arm checks pass
-        self.amsl_m: float | None = None  # altitude above sea level, here and at home
+        self.amsl_m: float | None = None  # altitudes above sea level: current, and at home
         self.home_amsl_m: float | None = None
         self.battery_remaining: float | None = None  # charge, 0..1
         self.battery_voltage_v: float | None = None
@@ -247,11 +248,11 @@ class Telemetry:
 
     @property
     def in_air(self) -> bool:
-        """True if the autopilot reports that it is in the air."""
+        """True if the autopilot reports that it is taking off, flying or landing."""
         return self.landed_state in _IN_AIR
 
     def handle(self, message: Message) -> None:
-        """Handle a message from the autopilot. Others are ignored."""
+        """Handle a message from the autopilot; ignore those of other senders."""
         handler = _HANDLERS.get(type(message).id)
         if handler is None:
             return
@@ -266,7 +267,7 @@ class Telemetry:
         return bool(header.srcComponent == component and header.srcSystem == self.system != 0)
 
     def _adopt(self, message: Message) -> None:
-        """Follow the first supported autopilot that sends a HEARTBEAT."""
+        """Adopt the first supported autopilot that sends a HEARTBEAT; set `unfit` for another."""
         system, profile = message.get_srcSystem(), _PROFILES.get(message.autopilot)
         if message.get_srcComponent() != AUTOPILOT or system == self.system:
             return
@@ -313,7 +314,7 @@ class Telemetry:
             self._attitude_from(*quaternion_from_euler(*angles).tolist())
 
     def _attitude_from(self, w: float, x: float, y: float, z: float) -> None:
-        """Store a body-FRD-to-NED quaternion if it is valid."""
+        """Normalize and store a body-FRD-to-NED quaternion if its length is in (0.5, 2)."""
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         if 0.5 < norm < 2.0:
             self._quaternion = flu_enu_from_frd_ned((w / norm, x / norm, y / norm, z / norm))
@@ -338,9 +339,9 @@ class Telemetry:
             self.home_amsl_m = (message.alt - message.relative_alt) / 1e3
 
     def move_origin(self, origin_enu_m: FloatArray) -> None:
-        """Set the origin of the positions (3,). States with another origin are dropped.
+        """Set the origin of the positions, (3,), ENU, m. A change drops all states.
 
-        An origin beyond the limits is ignored.
+        An origin with a coordinate beyond FARTHEST_M is ignored.
         """
         if not is_within(FARTHEST_M, origin_enu_m):
             return
@@ -355,7 +356,7 @@ class Telemetry:
         self._look_for_verdict(self.texts.add(message, self.now_s))
 
     def expire(self) -> None:
-        """Close texts whose missing chunks are overdue."""
+        """Finish texts whose missing chunks are overdue."""
         if self.texts.open:
             self._look_for_verdict(self.texts.expire(self.now_s))
 

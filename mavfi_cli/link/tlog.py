@@ -1,4 +1,4 @@
-"""The .tlog of a flight: all frames in both directions, in the format of ground stations.
+"""Writes and reads the .tlog of a flight: all frames in both directions, as ground stations do.
 
 A record is the time in microseconds since 1970 (8 bytes, big endian) and the unchanged frame.
 Received frames of messages that the `common` dialect lacks are left out.
@@ -25,13 +25,14 @@ from mavfi_cli.link.transport import Transport
 EPOCH_UNIX_S = 1_577_836_800  # 2020-01-01 UTC is stamp 0
 _FLUSH_BYTES = 1 << 16
 _LARGEST = 1 << 30  # largest log that is read, bytes
-_FLUSH_INTERVAL_S = 1.0  # by the stamps
+_FLUSH_INTERVAL_S = 1.0  # difference of stamps between writes
 
 
 def unix_time_of_stamp_0(path: Path) -> float:
-    """Return the Unix time, s, of stamp 0 of a foreign flight, from the first state in its tlog.
+    """Return the Unix time, s, at which a foreign autopilot's clock was 0, from its tlog.
 
-    It is EPOCH_UNIX_S if there is no state. Raises RecordError if the file cannot be read.
+    The first state gives it; without a state it is EPOCH_UNIX_S. Raises RecordError if the file
+    cannot be read.
     """
     for unix_s, message in tlog_messages(path):
         if isinstance(message, dialect.MAVLink_local_position_ned_message):
@@ -55,7 +56,7 @@ def tlog_messages(path: Path) -> Iterator[tuple[float, Message]]:
 
 
 class TlogWriter:
-    """Writes a .tlog. A kill leaves whole records and loses at most the last second or 64 KiB.
+    """Writes a .tlog. A killed process leaves all but the last second or 64 KiB, in whole records.
 
     Records written before `open` are buffered. Every method may raise RecordError.
 
@@ -80,7 +81,7 @@ class TlogWriter:
             raise self._error(error) from None
 
     def continue_in(self, path: Path) -> None:
-        """Continue in a copy of the file, in a fork of the process that opened it."""
+        """Copy the file to `path` and continue there. For a fork of the process that opened it."""
         try:
             shutil.copyfile(self._path, path)
             if self._descriptor is not None:
@@ -91,7 +92,7 @@ class TlogWriter:
         self._path = path
 
     def write(self, stamp_s: float, *frames: bytes) -> None:
-        """Record frames at a stamp. They reach the file within a second or 64 KiB."""
+        """Record frames at a stamp, s. At most 1 s or 64 KiB of records wait to be written."""
         time_us = self._epoch_us + round(stamp_s * 1e6)
         records = time_us.to_bytes(8, "big").join([b"", *frames])
         self._pending.append(records)
@@ -165,12 +166,12 @@ class RecordedLink:
             yield
 
     def continue_in(self, path: Path) -> None:
-        """Continue the tlog in a copy, in a fork of the process. Raises as `recording` does."""
+        """Copy the tlog to `path` and continue there, in a fork. Raises as `recording` does."""
         self._tlog.continue_in(path)
 
     @property
     def rivals(self) -> str:
-        """Text about two autopilots that send to this end; "" if there is no second one."""
+        """Message that names two autopilots that send to this end; "" if there is only one."""
         rival = self._transport.rival_address
         return f"{TWO_AUTOPILOTS}, {self._transport.address} and {rival}" if rival else ""
 
@@ -179,7 +180,7 @@ class RecordedLink:
         return self._transport.receive(timeout_s)
 
     def messages(self, data: bytes, stamp_s: float) -> list[Message]:
-        """Return the messages in received bytes, and record them at the stamp."""
+        """Return the messages that received bytes contain, and record their frames at the stamp."""
         messages = self._codec.decode(data, datagram=self._transport.datagram)
         self._record(stamp_s, list(map(frame_of, messages)))
         return messages

@@ -1,4 +1,4 @@
-"""Transports, opened by URL, that carry bytes to and from one peer, and listeners for several."""
+"""Opens transports by URL, which carry bytes to and from one peer, and listeners for several."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Transport(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """Return the descriptor that is readable when `receive` has data; -1 if there is none."""
+        """Return the descriptor that is readable when data has arrived; -1 without a descriptor."""
 
     @abstractmethod
     def close(self) -> None:
@@ -83,10 +83,10 @@ class Transport(ABC):
 
     @abstractmethod
     def _pull(self) -> bytes:
-        """Return waiting bytes, or b"" if there are none. Raises LinkLost."""
+        """Return bytes that have arrived, without waiting; b"" if none. Raises LinkLost."""
 
     def _await(self, event: int, timeout_s: float) -> bool:
-        """Return True if a poll event or an error occurs within `timeout_s`; inf: no limit."""
+        """Wait at most `timeout_s` (inf: no limit). Return True for the poll event or an error."""
         poller = select.poll()
         poller.register(self.fileno(), event)
         return bool(poller.poll(None if math.isinf(timeout_s) else timeout_s * 1e3))
@@ -96,7 +96,7 @@ class Transport(ABC):
 
 
 class Listener(Protocol):
-    """Peers of one URL: every client of a listening URL, the single peer of any other."""
+    """Accepts the peers of one URL: all clients of a listening one, or the only peer of another."""
 
     def accept_ready(self) -> Sequence[Transport]:
         """Return the peers that appeared since the last call, without waiting."""
@@ -120,13 +120,13 @@ def open_transport(
     Args:
         url: `udpin:[host]:port`, `udpout:host:port`, `tcp:host:port`, `tcpin:[host]:port`,
             `serial:device[:baud]` or `fd:number`; without a host it listens on loopback.
-        signed: The caller signs this link, so it may reach beyond this machine.
-        allow_unsigned: Allow an unsigned link to reach beyond this machine.
+        signed: The caller signs this link, so its address need not be a loopback address.
+        allow_unsigned: Allow addresses other than loopback without signing.
         admits: Returns True if the sender of this datagram may become the peer of `udpin`.
 
     Raises:
-        LinkError: The URL is malformed, its scheme is unknown, its port is in use, no
-            peer listens, the device does not exist, or an unsigned link leaves this machine.
+        LinkError: The URL is malformed, its scheme is unknown, its port is in use, no peer listens,
+            the device cannot be opened, or the address of an unsigned link is not loopback.
     """
     endpoint = parse_endpoint(url)
     if endpoint.scheme == "serial":
@@ -155,7 +155,7 @@ def open_listener(
         url, signed, allow_unsigned: As in `open_transport`. `url` may also be an open transport,
             which is then the single peer, or a listening stream socket.
         admits: Returns True if the sender of this first datagram may become a peer.
-        buffer: Bytes to buffer for a slow client of a listening stream socket.
+        buffer: Bytes to buffer for each slow client, if `url` is a listening stream socket.
     """
     if isinstance(url, Transport):
         return _OnePeer(url)
@@ -185,7 +185,7 @@ class _OnePeer:
 
 
 class _SocketOwner:
-    """Owner of a socket that never blocks."""
+    """Owns a non-blocking socket."""
 
     def __init__(self, opened: socket.socket, url: str) -> None:
         opened.settimeout(0.0)
@@ -205,7 +205,7 @@ class _SocketOwner:
 
 
 def _text_of(address: Any) -> str:
-    """Return host and port of a socket's address; "" for None and a Unix domain socket."""
+    """Return an address as "host:port"; "" for None or an unnamed Unix domain socket."""
     return f"{address[0]}:{address[1]}" if address else ""
 
 
@@ -215,8 +215,8 @@ def _text_of(address: Any) -> str:
 class _Stream(_SocketOwner, Transport):
     """A connected stream socket with one peer.
 
-    A patient stream waits for a slow reader. Any other buffers up to `buffer` bytes for it and
-    drops the oldest sends first, so that the reader gets recent data.
+    A patient stream waits for a slow reader. Any other stream buffers up to `buffer` bytes for it
+    and drops the oldest batches first, so that the reader gets recent data.
     """
 
     def __init__(
@@ -252,7 +252,7 @@ class _Stream(_SocketOwner, Transport):
             self._waiting.popleft()
 
     def _push(self, data: bytes) -> bytes:
-        """Send as much as fits and return the rest."""
+        """Send as much as the socket accepts, and return the rest."""
         try:
             return data[self._socket.send(data) :]
         except BlockingIOError:
@@ -284,7 +284,7 @@ class _StreamListener(_SocketOwner):
         self._peers: list[_Stream] = []
 
     def accept_ready(self, *, patient: bool = False) -> list[_Stream]:
-        """Return the new clients. Patient ones wait for a slow reader."""
+        """Return the new clients, as patient streams or as streams that drop data."""
         clients: list[_Stream] = []
         while True:
             try:
@@ -399,8 +399,9 @@ def _serial_reason(error: Exception, device: str) -> str:
 class _Udp(_SocketOwner, Transport):
     """A UDP socket with one peer.
 
-    A connected socket receives from its peer only. Any other takes the first admitted sender as its
-    peer, and replaces it after some silence. Data sent before the first peer appears is lost.
+    A connected socket receives from its peer only. Any other socket takes the first admitted sender
+    as its peer. After 5 s of silence another sender may take its place. Data sent before the first
+    peer appears is lost.
 
     Args:
         admits: Returns True if the sender of this datagram may become the peer. None for a
@@ -473,7 +474,7 @@ def _send_datagrams(opened: socket.socket, data: bytes, peer: Any) -> None:
 
 
 def _split_frames(data: bytes) -> list[bytes]:
-    """Combine well-formed frames into datagrams that fit an Ethernet packet."""
+    """Group well-formed frames into datagrams that each fit into an Ethernet packet."""
     if len(data) <= _MTU_PAYLOAD:
         return [data]
     datagrams, start, position = [], 0, 0
@@ -488,9 +489,9 @@ def _split_frames(data: bytes) -> list[bytes]:
 
 
 class _UdpListener(_SocketOwner):
-    """A port on which every admitted sender becomes a peer. All peers share one socket.
+    """A UDP port on which every admitted sender becomes a peer. All peers share one socket.
 
-    There are at most MAX_PEERS. An open peer is never replaced.
+    There are at most MAX_PEERS peers, and an open peer is never replaced.
     """
 
     def __init__(self, opened: socket.socket, url: str, admits: Callable[[bytes], bool]) -> None:
@@ -505,7 +506,7 @@ class _UdpListener(_SocketOwner):
         return fresh
 
     def pump(self) -> None:
-        """Sort waiting datagrams by sender; an admitted new sender becomes a peer."""
+        """Give each waiting datagram to its sender's peer. Admitted new senders become peers."""
         judged = 0
         for _ in range(_MAX_WAITING):
             data, sender = _receive_datagram(self._socket, _SMALL_CHUNK)
@@ -567,17 +568,17 @@ class _UdpPeer(Transport):
 
 
 def memory_pair(url: str) -> tuple[_MemoryTransport, _MemoryTransport]:
-    """Return both ends of a new link in memory. Error messages name the URL."""
+    """Return both ends of a new in-memory link. `url` appears in error messages only."""
     ours, theirs = _MemoryTransport(url), _MemoryTransport(url)
     ours._peer, theirs._peer = theirs, ours
     return ours, theirs
 
 
 class _MemoryTransport(Transport):
-    """One end of a link in memory; made in pairs by `memory_pair`.
+    """One end of an in-memory link. `memory_pair` makes both ends.
 
-    Both ends run in one thread, so an end that has nothing to receive never sleeps. It calls its
-    `on_wait`, in which the other end can act.
+    Both ends run in one thread, so an end that has nothing to receive does not sleep. Instead it
+    calls its `on_wait`, in which the other end can act.
     """
 
     def __init__(self, url: str) -> None:
@@ -626,5 +627,5 @@ def signing_from_file(path: str | Path | None) -> Signing | None:
         problem = getattr(error, "strerror", None) or str(error)
         raise ConfigError(f"cannot read the passphrase: {problem}", path=Path(path)) from None
     if not passphrase:
-        raise ConfigError("holds no passphrase", path=Path(path))
+        raise ConfigError("must contain a passphrase, but is empty", path=Path(path))
     return Signing(key_from_passphrase(passphrase), clock=time.time)

@@ -34,10 +34,10 @@ class LinkInjector(Injector):
 
     Args:
         shortest_flight_s, listener: As for `Injector`.
-        signing: Key for signing a struck frame again.
+        signing: Key with which struck frames are signed again; None for an unsigned link.
 
     Attributes:
-        units: Unit of each struck field by name; for a whole message, its name with no unit.
+        units: Unit of each struck field by name; for a whole message, its name with an empty unit.
         side: Sender of the struck messages; None before the first strike.
     """
 
@@ -138,7 +138,7 @@ class Throttle(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """Stop and continue the program until `end`."""
+        """Alternately stop and resume the program until `end`."""
         stopped_s = (1.0 - self._share) * _PERIOD_S if self._share else None
         while not self._over.wait(self._share * _PERIOD_S):
             self._signal(signal.SIGSTOP)
@@ -162,7 +162,7 @@ class CompanionFault(NoInjection):
 
     Attributes:
         running: The started programs by name.
-        link: Strikes messages; None for a fault in a process.
+        link: Injector for messages; None for a fault in a process.
         ends: How a struck process died, by the name of its program.
     """
 
@@ -171,10 +171,10 @@ class CompanionFault(NoInjection):
     ends: Mapping[str, NodeEnds] = MappingProxyType({})
 
     def aim_at(self, shortest_flight_s: float) -> None:
-        """Draw the fault, with a random trigger within the shortest flight time, s."""
+        """Draw the fault. A random trigger time lies within `shortest_flight_s` after take-over."""
 
     def tick(self, moment: Moment) -> None:
-        """Strike a process when the fault is due, and end the effect after its duration."""
+        """Strike a process when the fault is due, and end a temporary effect on time."""
 
 
 class CompanionInjection(CompanionFault, SourceInjection):
@@ -227,7 +227,7 @@ class CompanionInjection(CompanionFault, SourceInjection):
             self._throttle.end()
 
     def _on_strike(self, strike: Strike) -> None:
-        """Record the first strike before it takes effect, then strike a targeted process."""
+        """Record the first strike before it takes effect. If it targets a process, strike that."""
         first = self._state == "planned"
         super()._on_strike(strike)
         if first and not strike.changes:
@@ -248,13 +248,14 @@ class CompanionInjection(CompanionFault, SourceInjection):
 
 
 def check_companion_fault(config: FaultConfig, programs: Mapping[str, Any]) -> None:
-    """Reject a fault unfit for a user's companion. Raises what `CompanionInjection` raises."""
+    """Reject a fault unsuited to a user's companion. Raises what `CompanionInjection` raises."""
     if config.wire_target is not None:
         config.draw_wire()
     elif config.killed_node is not None:
         config.check_program(programs)
     else:
         raise FaultSpecError(
-            f"{config.target}: the target in a user's companion must be a MAVLink message such as "
-            "SET_POSITION_TARGET_LOCAL_NED.vx, or process.PROGRAM (PROGRAM at instruction level)"
+            f"{config.target}: a user's companion has no such target: give a MAVLink message or "
+            "field such as SET_POSITION_TARGET_LOCAL_NED.vx, or process.PROGRAM (an "
+            "instruction-level fault takes just PROGRAM)"
         )

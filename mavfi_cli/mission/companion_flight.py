@@ -1,13 +1,13 @@
-"""One flight of a user's own companion, which mavfi starts, connects and judges.
+"""One flight of a user's companion: mavfi starts and connects it, and judges the flight.
 
 The vehicle's clock is simulated time. Programs run on the wall clock, so a flight is not
 repeatable.
 
 A flight in lockstep is repeatable if its companion is. The vehicle sends all messages of a tick,
 ending with LOCAL_POSITION_NED, and waits. The companion sends its messages, ending with a
-SET_POSITION_TARGET_LOCAL_NED of the same time_boot_ms, and the next tick begins. Programs, fault
-and outcome are checked only at a tick or while the companion is gone, so the wall clock only
-determines when to give up.
+SET_POSITION_TARGET_LOCAL_NED with the same time_boot_ms. Then the next tick begins. Programs, fault
+and outcome are checked only at a tick or while the companion is gone, so the wall clock determines
+only when to give up.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class CompanionFlight:
     """One flight, from the start of the first program to its outcome.
 
     Args:
-        link: Open link to the vehicle, which the caller closes.
+        link: Open link to the vehicle. The caller closes it.
         interrupts: Received signals that request the end.
 
     Attributes:
@@ -105,7 +105,7 @@ class CompanionFlight:
         self._goal_enu_m: FloatArray | None = None
 
     def _open_companion(self, url: str) -> str | Transport:
-        """Return the companion's end of the router."""
+        """Return the router's link to the companion: its URL, or an open transport."""
         return url
 
     def _planned_gate(self) -> SetpointGate | None:
@@ -134,7 +134,7 @@ class CompanionFlight:
         """Fly until there is an outcome.
 
         Args:
-            depth: Socket of the vehicle's depth frames; None if it has none.
+            depth: Path of the socket with the vehicle's depth frames; None if it has none.
 
         Raises:
             MavfiError: A program cannot be started, or the record cannot be written.
@@ -181,7 +181,7 @@ class CompanionFlight:
     def _placeholders(
         self, folder: RunFolder, briefing: Briefing, depth: Path | None
     ) -> dict[str, str]:
-        """Return the text of every placeholder of a command."""
+        """Return the text that replaces each placeholder in a program's command, by placeholder."""
         end = parse_endpoint(self._companion.url)
         port = self._router.port if end.scheme in LISTENING else end.port
         called = end.scheme in LISTENING
@@ -395,7 +395,7 @@ class LockstepFlight(CompanionFlight):
                 raise ConfigError("needs a companion with time = 'wall'", key=key)
 
     def _turn(self) -> None:
-        """Start the program and await its connection; later await the next answer or tick."""
+        """Start the program and await its connection. After that, await the next answer or tick."""
         if self._crew.ready:
             self._router.turn(_TURN_S, time.monotonic() + _SERVE_S)
             self._look_after()
@@ -406,7 +406,7 @@ class LockstepFlight(CompanionFlight):
         self._judge()
 
     def _look_after(self) -> None:
-        """Give up too long a wait, and let the vehicle continue once the companion has ended."""
+        """End the flight after too long a wait; let it continue once the companion has ended."""
         waited_s, limit_s = time.monotonic() - self._since_s, self._companion.answer_limit_s
         if self.outcome is not None:
             pass
@@ -490,12 +490,12 @@ class _Verdict:
 
     Attributes:
         goal_enu_m: Goal (3,).
-        landed: The vehicle stands on the ground, disarmed, after a flight.
-        flew: It has been in the air.
+        landed: True if the vehicle has flown and stands disarmed on the ground.
+        flew: True once the vehicle has been in the air.
 
     Raises:
-        RecordError: The golden flight of the corridor cannot be read.
-        ConfigError: It has no path.
+        RecordError: The golden flight that defines the corridor cannot be read.
+        ConfigError: The golden flight has no path.
     """
 
     def __init__(self, success: SuccessConfig, crew: Crew) -> None:
@@ -538,12 +538,15 @@ class _Verdict:
 
     @property
     def strayed(self) -> bool:
-        """Whether the vehicle has left the corridor."""
+        """True if the vehicle has left the corridor."""
         corridor_m = self._success.corridor_m
         return corridor_m is not None and self.deviation_m > corridor_m
 
     def is_over(self) -> bool:
-        """Return True if all given conditions except that of the corridor hold."""
+        """Return True if all given conditions except the corridor hold.
+
+        If there are none, return True once every program has ended.
+        """
         success = self._success
         ends = (
             *([self._rests] if success.goal_m is not None else ()),
@@ -557,8 +560,8 @@ def path_of(folder: Path) -> FloatArray:
     """Read the path (n, 3) of a flight from its run folder, ENU, m.
 
     Raises:
-        RecordError: Its trace cannot be read.
-        ConfigError: It has no path.
+        RecordError: The trace cannot be read.
+        ConfigError: The trace has fewer than two positions.
     """
     trace = read_parquet(RunFolder(folder).trace, "golden trace")
     try:

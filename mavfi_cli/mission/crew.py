@@ -20,7 +20,7 @@ from mavfi_cli.spec.companion import CompanionConfig, ProgramConfig
 _PORT_LOOK_S = 0.1
 
 Note = Callable[[float, str, str, VehicleState | None], None]
-"""Logs an event: stamp (s), kind, text, and the vehicle's state."""
+"""Function that logs an event, given its stamp (s), kind, text, and the vehicle's state."""
 
 
 class Crew:
@@ -29,9 +29,9 @@ class Crew:
     Attributes:
         begun_s: Stamp of the start of the first program; infinite before.
         running: Started programs by name.
-        heartbeat: A MAVLink heartbeat has arrived from the companion.
-        connected: The program in lockstep has connected; always true without lockstep.
-        unready: Why the companion did not become ready; empty while it still may.
+        heartbeat: True once a MAVLink heartbeat has arrived from the companion.
+        connected: True once the program in lockstep has connected; always true without lockstep.
+        unready: Why the companion cannot become ready; empty if it is or still may.
     """
 
     def __init__(self, companion: CompanionConfig, note: Note) -> None:
@@ -63,7 +63,7 @@ class Crew:
             throttle.end()
 
     def manage(self, stamp_s: float, state: VehicleState | None) -> None:
-        """Log starts and ends of programs, and start the next one if the newest is ready.
+        """Log the starts and ends of programs. Start the next program if the newest is ready.
 
         Raises:
             MavfiError: A program cannot be started.
@@ -106,7 +106,7 @@ class Crew:
         )
 
     def _is_open(self, port: int) -> bool:
-        """Return True if a local TCP port accepts connections."""
+        """Return True if a local TCP port accepts connections. Checks at most every 0.1 s."""
         if time.monotonic() < self._looked_s + _PORT_LOOK_S:
             return False
         self._looked_s = time.monotonic()
@@ -144,7 +144,7 @@ class Crew:
         return ""
 
     def ended(self) -> str:
-        """Return which program has ended, even if it will restart; empty if all are running."""
+        """Describe a program that has ended, even if it will restart; empty if all are running."""
         for name, program in self.running.items():
             if program.codes and program.pid is None:
                 return f"the program {name} is gone"
@@ -156,7 +156,7 @@ class Crew:
 
 
 def _how(code: int) -> str:
-    """Describe the end of a process."""
+    """Describe the end of a process, given its exit code."""
     if code >= 0:
         return f"ended with code {code}"
     with contextlib.suppress(ValueError):

@@ -55,8 +55,8 @@ _LAND_AFTER = (Outcome.SUCCESS, Outcome.NO_PATH, Outcome.TIMEOUT, Outcome.INTERR
 class ForeignClock:
     """Estimates a foreign vehicle's time from the stamps of its states and the wall clock.
 
-    Between two states the vehicle's clock is estimated. It runs at the flight's pace so far, but no
-    faster than the wall clock, because a simulator may be slower than real time.
+    Between two states, the vehicle's clock is assumed to run at its average pace in the flight so
+    far, but no faster than the wall clock. A simulator may be slower than real time.
 
     Args:
         wall: Returns wall-clock time, s.
@@ -76,7 +76,7 @@ class ForeignClock:
         self.heard = False
 
     def believes(self, stamp_s: float, limit_s: float) -> bool:
-        """Return False for a state's stamp that is not newer or that jumps beyond a limit.
+        """Return False for a stamp that is not newer, or that jumps ahead by more than a limit.
 
         A jump is accepted as a new clock if a second state follows the first within the limit.
         """
@@ -175,7 +175,7 @@ class Flight:
 
         Raises:
             NoAutopilot: No heartbeat arrived.
-            LinkLost: The other end closed the connection.
+            LinkLost: The other end closed the connection, or the simulated vehicle is silent.
             Interrupted: The user pressed Ctrl-C before the flight.
         """
         while self._session.phase is Phase.CONNECTING:
@@ -186,7 +186,7 @@ class Flight:
             raise self._session.failure
 
     def brief(self, briefing: Briefing, recorder: Recorder | None) -> Companion:
-        """Set goal and camera mounting, and create the companion.
+        """Adopt the briefing, draw the fault, and create the companion.
 
         Args:
             recorder: Records the briefing and the inputs of the nodes.
@@ -206,7 +206,7 @@ class Flight:
         return self.companion
 
     def take(self, config: MissionConfig, tlog: Path) -> None:
-        """Continue as another mission in a fork of the process, with another fault and tlog."""
+        """Continue the flight in a fork of the process as a mission with its own fault and tlog."""
         self._config = config
         self.link.continue_in(tlog)
         self.lose_nodes_as(config)
@@ -219,7 +219,9 @@ class Flight:
             executor.watchdog_s = config.node_watchdog_s
 
     def isolate_late(self, name: str, process: NodeProcess | None = None) -> Executor:
-        """Move a node that has already run to its own process; it restarts with fresh state.
+        """Move a node that has already run to its own process. Return the executor.
+
+        If that process is lost, the node restarts with fresh state.
 
         Args:
             process: As for `Executor.isolate`.
@@ -317,7 +319,7 @@ class Flight:
     # One iteration of the loop --------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Receive messages and run the control tick of every state among them."""
+        """Receive messages, and run the control tick of the newest state among them."""
         self.wall.begin_tick()
         if self._clock is not None:
             self._turn_by_wall(self._clock)
@@ -327,7 +329,7 @@ class Flight:
             raise LinkLost(f"the simulated vehicle sent nothing for {self._patience_s:g} s")
 
     def _turn_by_wall(self, clock: ForeignClock) -> None:
-        """Run a tick for a foreign autopilot, even without a new state, until it counts as lost."""
+        """Take a turn with a foreign autopilot: a tick, or idle messages without a new state."""
         begun_s = time.monotonic()
         data = self._receive(IDLE_S)
         waited_s = time.monotonic() - begun_s
@@ -367,7 +369,7 @@ class Flight:
         return newest_s
 
     def _believes(self, stamp_s: float) -> bool:
-        """Return False for a stamp that is impossible for a foreign vehicle in flight."""
+        """Return False for a stamp that is implausible for a foreign vehicle in flight."""
         if self._clock is None or not self._airborne():
             return True
         return self._clock.believes(stamp_s, self._config.loss_limit_s)

@@ -1,8 +1,9 @@
 """`mavfi gate`: the gate as a process between a companion and an autopilot.
 
-A supervisor opens both links and forks a worker, which routes and judges. When the worker dies, or
-shows no sign of life for 1 s, the supervisor forks another one on the same links, which judges
-nothing: it passes everything (fails open), or everything but setpoints (fails closed).
+A supervisor opens both links and forks a worker, which routes frames and judges setpoints. When
+the worker dies, or shows no sign of life for 1 s, the supervisor forks another on the same links.
+That one judges nothing: it passes everything (fails open), or everything but setpoints (fails
+closed).
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ class GateProcess:
 
     Attributes:
         autopilot, companion: URLs of the two links.
-        mark: Companion for which the model must be made; None for any.
-        process: Process id of the companion, or a file with it; None watches no process.
-        log: File to which one line of JSON per event is appended; None for none.
+        mark: Companion for which the model must have been made; None for any.
+        process: Process id of the companion, or a file that holds it; None to watch no process.
+        log: File to which one line of JSON per event is appended; None to write no log.
         key_file: File with the signing passphrase of both links.
-        allow_unsigned: Allow an unsigned link to reach beyond this machine.
+        allow_unsigned: Allow an unsigned link to another machine.
     """
 
     autopilot: str
@@ -96,7 +97,7 @@ class _Passing:
 
 
 class _Worker:
-    """The work of the forked process."""
+    """The forked process. It routes frames and, unless the gate has failed, judges setpoints."""
 
     def __init__(
         self, process: GateProcess, router: Router, passing: _Passing, log: int | None
@@ -111,7 +112,7 @@ class _Worker:
             os.write(self._log, json.dumps(line).encode() + b"\n")
 
     def work(self, alive: int, *, judges: bool) -> int:
-        """Route until the supervisor ends this process; write to `alive` in every turn."""
+        """Route until the supervisor ends this process. Write to the pipe `alive` in every turn."""
         return exit_code(lambda: self._route(alive, judges=judges))
 
     def _route(self, alive: int, *, judges: bool) -> None:
@@ -149,7 +150,7 @@ def _closed(message: Message, side: Side) -> Sequence[Message]:
 
 
 def _supervise(worker: _Worker, interrupts: Sequence[int], *, judges: bool) -> int | None:
-    """Run a worker. Return its exit code, 0 after an interrupt; None if it died or hung."""
+    """Run a worker. Return its exit code, or 0 if interrupted, or None if it died or hung."""
     reading, writing = os.pipe()
     child = fork(lambda: worker.work(writing, judges=judges))
     os.close(writing)
@@ -178,7 +179,7 @@ class _Watch:
         self._next_s, self._gone = 0.0, ""
 
     def gone(self) -> str:
-        """Return why the process is gone; empty while it runs, or without a process."""
+        """Return why the process is gone; empty while it runs or if none is watched."""
         if self._process is None or time.monotonic() < self._next_s:
             return self._gone
         self._next_s = time.monotonic() + _LOOK_S
@@ -194,6 +195,6 @@ class _Watch:
 
 
 def require_process(process: str | None) -> None:
-    """Raise MavfiError if a process cannot be watched."""
+    """Raise MavfiError if the process to be watched is not running."""
     if why := _Watch(process).gone():
         raise MavfiError(why)

@@ -48,7 +48,7 @@ def record_inputs(config: MissionConfig) -> tuple[KernelInputs, ...]:
     }
     frames, clouds, ticks = given.values()
     if min(len(frames), len(clouds), len(ticks)) < 2 * INPUTS_A_KERNEL:
-        raise TargetError(name, "is too short to record kernels")
+        raise TargetError(name, "the flight is too short to record the inputs of kernels")
     params = tracking.TrackingParams(v_max_mps=config.v_max_mps, a_max_mps2=config.a_max_mps2)
     kernels = zip(
         _spread(frames),
@@ -85,12 +85,12 @@ def _flown(config: MissionConfig) -> Recorder:
 
 
 def _spread(of: Sequence[_Any], number: int = INPUTS_A_KERNEL) -> list[_Any]:
-    """Return equally spaced members, including the middle one if the number is odd."""
+    """Return `number` equally spaced members, including the middle one if `number` is odd."""
     return [of[(2 * k + 1) * len(of) // (2 * number)] for k in range(number)]
 
 
 def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
-    """Return checked trajectories, including some with a collision if there are any."""
+    """Return inputs of the collision check, including some with a collision if there are any."""
     free: list[CollisionInputs] = []
     foreseen: list[CollisionInputs] = []
     for check, stamp_s in recorder.orders.get("collision_check", []):
@@ -101,7 +101,7 @@ def _checks(name: str, recorder: Recorder) -> list[CollisionInputs]:
             (foreseen if report.collision else free).append(alone)
     some = min(_FORESEEN, len(foreseen))
     if len(free) < INPUTS_A_KERNEL - some:
-        raise TargetError(name, "checked too few trajectories")
+        raise TargetError(name, "too few trajectories were checked for collisions")
     return _spread(free, INPUTS_A_KERNEL - some) + _spread(foreseen, some)
 
 
@@ -114,12 +114,12 @@ def _problems(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
         tasks += _hard_tasks(another, _flown(another))
     raise TargetError(
         _flight_name(config),
-        "has too few plans around obstacles, even with the flights of the next seeds",
+        "there are too few plans around obstacles, even in the flights with the next seeds",
     )
 
 
 def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]:
-    """Return the planning requests that a straight line does not solve."""
+    """Return the planning requests with free ends that a straight line does not solve."""
     assert recorder.briefing is not None
     hard = []
     for (request, snapshot), _ in recorder.orders["planner"]:
@@ -143,10 +143,10 @@ def _hard_tasks(config: MissionConfig, recorder: Recorder) -> list[PlanningTask]
 def _tracked(
     ticks: list[ControlInput], params: tracking.TrackingParams
 ) -> list[tuple[tracking.TrackingState, tracking.TrackingInputs]]:
-    """Return states and inputs of the controller at ticks with a path."""
+    """Return states and inputs of the controller at ticks with a trajectory."""
     following = [index for index, tick in enumerate(ticks) if tick.inputs.trajectory is not None]
     if not following:
-        raise TargetError("golden flight", "never followed a trajectory")
+        raise TargetError("golden flight", "the vehicle never followed a trajectory")
     first = ticks[0]
     state = tracking.TrackingState(yaw_rad=first.yaw_rad, stamp_s=first.inputs.stamp_s)
     chosen, tracked = _spread(following), []
@@ -159,12 +159,13 @@ def _tracked(
 def kernel_targets(
     kernels: Iterable[str], config: MissionConfig, folder: Path, tolerance: float = 0.0
 ) -> list[KernelTarget]:
-    """Return targets for the named kernels, with inputs of a golden run.
+    """Return targets for the named kernels, with inputs from a golden run.
 
-    The inputs come from the folder, or from a flight whose inputs are then stored there.
+    The inputs are read from the folder. If it has none, they are recorded in a flight and stored
+    there.
 
     Raises:
-        ConfigError: The folder holds inputs of another flight.
+        ConfigError: The folder holds inputs from another flight.
     """
     path = folder / INPUTS
     if not path.is_file():
@@ -174,7 +175,7 @@ def kernel_targets(
         save_inputs(path, inputs)
     (known, *_), sha256 = load_inputs(path)
     if known.flight != _flight_name(config):
-        raise ConfigError(f"holds inputs of a {known.flight}", path=path)
+        raise ConfigError(f"the inputs come from another flight, the {known.flight}", path=path)
     return [
         KernelTarget(
             kernel=kernel,

@@ -1,4 +1,4 @@
-"""Checks of this machine, with findings and remedies."""
+"""Checks whether this machine can run mavfi. Each check gives a finding and a remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAILED = "failed"  # missions do not work
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """One check of the report, with a remedy unless the verdict is OK."""
+    """The result of one check, with a remedy unless the verdict is OK."""
 
     name: str
     verdict: str
@@ -145,7 +145,7 @@ def _loopback() -> Check:
 
 
 def _physics() -> Check:
-    """Start the vehicle's process, which loads JSBSim and its compiled kernels."""
+    """Fly the vehicle for 2 s in a separate process, which loads JSBSim and compiled kernels."""
     with ScratchFolder("doctor") as folder:
         run = subprocess.run(
             [*PYTHON, "-c", _LOAD_VEHICLE], capture_output=True, text=True, cwd=folder,
@@ -190,7 +190,7 @@ def check_tracing(mechanism: Mechanism | None = None) -> Check:
 
 
 def _counting() -> Check:
-    """Report the mechanism that counts executions; try the fallback if it is needed."""
+    """Report the mechanism that counts executions. Test the fallback if it is needed."""
     from mavfi_cli.fi.tracer.tracee import Mechanism, perf_allowed
 
     refused = perf_allowed()

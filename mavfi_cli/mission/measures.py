@@ -1,10 +1,10 @@
 """The quality of a flight, and the sections and measures of its result.json.
 
-Only this module reads a result.json. Every measure is a column of a table of flights. A mission
-that crashed or hung before it could write its record has few fields; measures of missing fields are
-None. If a source-level fault struck several components, the measures join their values by ";" in a
-common order, and `struck_bits` has a list of bits for every component. If a fault strikes several
-times, the measures describe the first strike.
+Only this module interprets a result.json. Every measure is a column of a table of flights. A
+mission that crashed or hung before it could write its record has few fields; measures of missing
+fields are None. If a source-level fault struck several components, the measures join their values
+by ";" in a common order, and `struck_bits` has a list of bits for every component. If a fault
+strikes several times, the measures describe the first strike.
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ class FlightRecord:
     Attributes:
         pilot: None in a flight of a user's companion.
         plan_failures: Number of failed plans by reason.
-        state_fault, instruction_fault: The section `fault`, by its level.
-        recorded_fault: The whole section as plain values.
+        state_fault, instruction_fault: The section `fault` of a fault at this level.
+        recorded_fault: The whole section `fault` as plain values.
         in_lockstep: True for a flight of a user's companion in lockstep.
         referee: None if the vehicle provided no truth.
         seeds: Seeds of the mission (`root`) and of its fault.
@@ -152,7 +152,7 @@ class FlightRecord:
 
     @property
     def strikes(self) -> Sequence[Strike]:
-        """The recorded strikes of a fault in a state."""
+        """The recorded strikes of a source-level fault."""
         return () if self.state_fault is None else self.state_fault.strikes
 
     @property
@@ -162,7 +162,7 @@ class FlightRecord:
 
     @property
     def interrupted(self) -> bool:
-        """True if the user interrupted the flight, so that the mission has no outcome."""
+        """True if the user interrupted the flight, so that its outcome is unknown."""
         return self.outcome == Outcome.INTERRUPTED.value
 
     @property
@@ -198,7 +198,7 @@ def measures_of(flight: FlightRecord) -> dict[str, object]:
 
 
 def fields_of(flight: FlightRecord) -> dict[str, float | None]:
-    """Return the measures that are fields of a record."""
+    """Return the measures that are copied from fields of a record."""
     detection, physics = flight.detection, (flight.referee or {}).get("physics") or {}
     return {
         **asdict(flight.quality_of_flight),
@@ -320,7 +320,7 @@ RECOMPUTED = {
     Stage.PLANNING.value: ("planner",),
     Stage.CONTROL.value: ("control",),
 }
-# Note for every comparison of checks with simulated time, as no factor between hosts is known.
+# Note for comparisons of checks with simulated time, because no factor between hosts is known.
 HOST_CHECKS = "checks take the time of the host that flew, not scaled to the platform"
 _AGAIN = ("recompute", "hold")  # responses to an alarm that cause a recomputation
 
@@ -336,8 +336,8 @@ class DetectionCost:
     Attributes:
         flight_s: Flight time, or simulated time of the whole mission if the former is unknown, s.
         recomputations: Number of recomputations per stage. The record lists the first alarms and
-            only counts the others, which are distributed over the stages in the same ratio.
-            Numbers may therefore be fractions.
+            only counts the others. Those are distributed over the stages in the same ratio, so
+            numbers may be fractions.
         recovery_s: Simulated time of the recomputations per stage at the mean latency of the
             stage's kernels in this flight, s.
     """

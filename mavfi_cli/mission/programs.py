@@ -54,7 +54,7 @@ class Programs:
         self._running: dict[str, RunningProgram] = {}
 
     def start(self, name: str, task: Mapping[str, Any]) -> RunningProgram:
-        """Start a program. `task` has the keys of `perform`'s task.
+        """Start a program. `task` is that of `perform` without "out".
 
         Raises:
             MavfiError: It cannot be started.
@@ -83,7 +83,7 @@ class RunningProgram:
     """A started program, as its worker reports it.
 
     Attributes:
-        pid: Its process, which leads a process group; None while it does not run.
+        pid: Id of its process, which leads a process group; None while it does not run.
         codes: Exit codes of its processes so far; a negative one is a signal.
         ready: True once its ready line has appeared.
     """
@@ -131,7 +131,7 @@ class RunningProgram:
         return True
 
     def terminate(self) -> None:
-        """Continue the program if it is stopped, and ask it to end."""
+        """Resume the program if it is stopped, and ask it to end."""
         for number in (signal.SIGCONT, signal.SIGTERM):
             self.signal(number, group=True)
 
@@ -170,11 +170,11 @@ def perform(task: Mapping[str, Any], _folder: Path) -> NoReturn:
                 break
             _pump(kept, report, None, time.monotonic() + float(task["restart_s"]))
         _pump(kept, report, None, time.monotonic() + _LONGEST_S)
-    raise MavfiError("the flight outlasted its programs")
+    raise MavfiError("the flight exceeded the time limit for its programs")
 
 
 class _Kept:
-    """A file that keeps an output up to a limit."""
+    """A file that keeps the beginning of an output, up to _MOST_BYTES."""
 
     def __init__(self, undo: contextlib.ExitStack, path: Path) -> None:
         self._file: BinaryIO = undo.enter_context(
@@ -238,7 +238,7 @@ def _pump(
     until_s: float,
     process: subprocess.Popen[bytes] | None = None,
 ) -> None:
-    """Store the outputs until a process has ended, or until a given time."""
+    """Store outputs and report readiness until a process has ended or until a given time."""
     ended = None if process is None else os.pidfd_open(process.pid)
     try:
         while (left_s := until_s - time.monotonic()) > 0.0:
@@ -267,7 +267,7 @@ def _open_pipes(kept: Mapping[str, _Kept]) -> Iterator[int]:
 
 
 def _read(pipe: int, output: _Kept) -> bytes:
-    """Return the waiting bytes of a pipe; close it at its end."""
+    """Return the bytes waiting in a pipe. Close the pipe at EOF."""
     with contextlib.suppress(BlockingIOError):
         if data := os.read(pipe, _CHUNK):
             return data

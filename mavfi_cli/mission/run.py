@@ -52,7 +52,7 @@ from mavfi_cli.mission.vehicle import StartVehicle, Vehicle, other_end
 from mavfi_cli.spec.companion import CompanionConfig
 from mavfi_cli.spec.mission import MissionConfig
 
-_ALLOCATIONS = 100_000  # growth in live objects after which cycles are collected
+_ALLOCATIONS = 100_000  # growth in live objects that starts the garbage collector
 COMPILING = "compiling the kernels, once on this machine: this takes a while"
 
 
@@ -76,11 +76,11 @@ def fly_mission(
     Args:
         out: parent of the run folder.
         recorder: records the inputs of the nodes.
-        repeat: the record of an instruction-level fault to repeat, instead of drawing one.
-        profiles: folder of the profiles of instruction-level faults; None for one in `out`.
+        repeat: record of the instruction-level fault to repeat; None draws a new fault.
+        profiles: folder for the profiles of instruction-level faults; None for one in `out`.
         for_debugger: called once the node waits for a debugger at the injected instruction.
         launch: starts the simulated vehicle.
-        shared: missions to be forked from this flight, which writes no record itself.
+        shared: missions to fork from this flight; the flight itself then writes no record.
         host: further entries of the record's host section.
 
     Raises:
@@ -187,10 +187,10 @@ def _fly_companion(
 
 @contextlib.contextmanager
 def _rare_collections() -> Iterator[None]:
-    """Make Python's collector of cycles run rarely during a flight.
+    """Make Python's cyclic garbage collector run rarely during a flight.
 
     The collector traverses the growing traces repeatedly, which takes a tenth of a flight's CPU
-    time, but a flight leaves only a few thousand objects in cycles.
+    time. A flight leaves only a few thousand objects in cycles.
     """
     usual = gc.get_threshold()
     gc.set_threshold(_ALLOCATIONS, *usual[1:])
@@ -268,7 +268,7 @@ def _fly(flight: Flight, tlog: Path) -> str | None:
 def _host(
     config: MissionConfig, flight: Flight | CompanionFlight, truth: FlightTruth | None
 ) -> Json:
-    """Return measurements of this machine, which differ between repetitions."""
+    """Return properties and measurements of this machine, which may vary between repetitions."""
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     of_vehicle = {} if truth is None else truth.stage_wall_s
     walls = {"stage_wall_s": flight.wall.totals, "vehicle_stage_wall_s": of_vehicle}
@@ -390,7 +390,7 @@ def _nodes(companion: Companion) -> dict[str, NodeEnds]:
 
 
 def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
-    """Return median and 95th percentile of the response time."""
+    """Return the median and 95th percentile of the response times, s, and their number."""
     times = np.array([r.setpoint_stamp_s - r.frame_stamp_s for r in reactions])
     times = times[np.isfinite(times)]
     if not len(times):
@@ -406,10 +406,10 @@ def response_times(reactions: Sequence[Reaction]) -> ResponseTime:
 
 
 def fly_to_end(config: MissionConfig, out: Path, **options: Any) -> Run:
-    """Fly a mission that must not be interrupted. The options are those of `fly_mission`.
+    """Fly a mission; an interruption is an error. The options are those of `fly_mission`.
 
     Raises:
-        Interrupted: The user interrupted it. Nothing of it is kept.
+        Interrupted: The user interrupted the mission. Nothing of it is kept.
         MavfiError: As for `fly_mission`.
     """
     flown = load_run(fly_mission(config, out, Watcher(), **options).path)
@@ -459,8 +459,8 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
     """Repeat a run to capture the inputs of its nodes. Raises what `fly_again` raises.
 
     Returns:
-        Inputs of all nodes, and whether the repetition has the same trace. It differs only if the
-        software or the machine differs.
+        Inputs of all nodes, and whether the repetition has the same trace. The trace differs only
+        if the software or the machine differs.
     """
     recorder = Recorder()
     with ScratchFolder("again") as scratch:
@@ -470,7 +470,7 @@ def watch_again(run: Run) -> tuple[Recorder, bool]:
 
 
 def paired_golden(run: Run, note: Callable[[str], None] = lambda _: None) -> Run:
-    """Return the golden run of a run, which is flown once and kept in the run's folder.
+    """Return a run's golden run. It is flown once and then kept in the run's folder.
 
     Args:
         run: Run with a fault.

@@ -52,7 +52,7 @@ _NEEDED = (
 )  # fmt: skip
 _PLAN = {"stamp_s": np.float64, "trajectory_seq": np.int32, "future_collision_seq": np.int32}
 BRIEFING = "briefing.json"
-# Numbers in a briefing's file. The camera itself reports its field of view.
+# Arrays in a briefing's file, with their lengths. The camera itself reports its field of view.
 BRIEFED = {"start_enu_m": 3, "goal_enu_m": 3, "bounds_enu_m": 6, "camera_offset_flu_m": 3}
 COMPANION_VARIES = "a flight of a user's companion does not repeat"
 _RESPONSE = "response"  # rows of reactions, from the frame's stamp to the setpoint's
@@ -77,7 +77,7 @@ class RunFolder:
 
     @classmethod
     def new(cls, parent: Path, world: str, seed: int) -> RunFolder:
-        """Create an empty folder `<world>-<seed>-<number>`. Parallel missions may do so safely.
+        """Create an empty folder `<world>-<seed>-<number>`. Safe for parallel missions.
 
         Characters of the world's name that are unfit for paths are replaced.
 
@@ -121,7 +121,7 @@ class RunFolder:
         write_parquet(self.plans, pa.table(columns))
 
     def read_plans(self) -> list[Trajectory]:
-        """Read plans, except plans without waypoints, which the file does not contain.
+        """Read the plans. Plans without waypoints are missing, because they have no row.
 
         Raises:
             RecordError: The file is missing, damaged, or of another format.
@@ -196,7 +196,7 @@ _KINDS: tuple[type[Message], ...] = (CollisionReport, Trajectory, Command)
 
 
 class Trace:
-    """Collects rows in memory, about 200 bytes per tick or 36 MB per hour of flight."""
+    """Collects the trace's rows in memory: about 200 bytes per tick, or 36 MB per flight hour."""
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
@@ -227,7 +227,7 @@ class Trace:
         return len(self._stamps)
 
     def motion(self) -> dict[str, FloatArray]:
-        """Return received stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s, ENU."""
+        """Return the received stamps (n,) s, positions (n, 3) m and velocities (n, 3) m/s, ENU."""
         vehicle = np.array(self._vehicle, dtype=np.float64).reshape(-1, len(_STATE_COLUMNS))
         return {
             "stamp_s": np.array(self._stamps),
@@ -291,7 +291,7 @@ _Entry = tuple[Message, int] | None  # a message and the index of its waypoint
 
 
 def _distinct(entries: Sequence[_Entry]) -> tuple[list[_Entry], list[int]]:
-    """Return the entries without consecutive repetitions, and each row's index in them."""
+    """Return the entries without consecutive repetitions, and for each row its entry's index."""
     kept: list[_Entry] = []
     rows, last = [], (0, 0)
     for entry in entries:
@@ -328,7 +328,7 @@ class Run:
     """A run read from its folder.
 
     Attributes:
-        to_html: Renders summary and picture of a run; set by `mavfi_cli.library`.
+        to_html: Function that renders a run's summary and picture; set by `mavfi_cli.library`.
     """
 
     to_html: ClassVar[Callable[[Run], str] | None] = None
@@ -400,15 +400,18 @@ class Run:
     ) -> _Parting | None:
         """Find the first difference between the traces of two runs; None if they are equal.
 
-        Within a tick the columns are compared in the order of the pipeline: perception, planning,
-        control, then the vehicle. The referee's truth is ignored by default. Columns in
-        `leave_out`, and columns that one run lacks, are also ignored.
+        If several columns first differ in the same tick, the earliest in the pipeline is returned:
+        perception, planning, control, then the vehicle. If the traces are equal as far as both go,
+        outcomes and numbers of ticks are compared. The referee's truth is ignored by default.
+        Columns in `leave_out`, and columns that one run lacks, are also ignored.
 
         Raises:
             RecordError: A run has no trace.
         """
         if self.trace is None or other.trace is None:
-            raise RecordError(f"{(self if self.trace is None else other).folder.path}: no trace")
+            raise RecordError(
+                f"{(self if self.trace is None else other).folder.path}: the run has no trace"
+            )
         names = [name for name in self.trace.column_names if name in other.trace.column_names]
         columns = [name for name in BY_NAME if name in names]
         columns += [name for name in names if name not in BY_NAME and name != "stamp_s"]
@@ -468,9 +471,9 @@ def load_run(path: str | Path) -> Run:
     result = read_json(folder.result, _LARGEST_RESULT)
     trace = read_parquet(folder.trace, "trace") if folder.trace.is_file() else None
     if result.get("schema") != 1:
-        raise RecordError(f"{folder.result}: written by another version of mavfi")
+        raise RecordError(f"{folder.result}: the file was written by another version of mavfi")
     if missing := [key for key in _NEEDED if key not in result]:
-        raise RecordError(f"{folder.result}: damaged (missing: {', '.join(missing)})")
+        raise RecordError(f"{folder.result}: the file is damaged (missing: {', '.join(missing)})")
     # Runs recorded before stacks were introduced used the stack FIRST.
     with reading(folder.result):
         result["config"] = {"stack": FIRST, "world_seed": None, **result["config"]}

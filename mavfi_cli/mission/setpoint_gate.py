@@ -1,8 +1,8 @@
 """The gate between any companion and its autopilot: withholds anomalous setpoints.
 
-It judges every setpoint together with the vehicle's state. A setpoint that raises an alarm does not
-reach the autopilot, and the setpoint sent in its place is the reference for the next. Every
-other frame passes unchanged.
+The gate judges every setpoint together with the vehicle's state. A setpoint that raises an alarm
+does not reach the autopilot, unless the gate only watches. A setpoint sent in its place is the
+reference for the next one. Every other frame passes unchanged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class SetpointGate:
     """The gate of one link.
 
     Args:
-        mark: Companion for which the model must be made; None for any.
+        mark: Companion for which the model must have been made; None for any.
         note: Receives one line per event.
         signing: Key of the link, for signing replacement setpoints and the gate's own messages.
         gone: Returns why the companion's process is gone; empty while it runs.
@@ -88,7 +88,7 @@ class SetpointGate:
 
     @staticmethod
     def warm_up(detector: DetectorConfig, mark: StackMark | None) -> None:
-        """Load and compile what a gate runs, ahead of time. Raises what the constructor raises."""
+        """Load and compile all code of a gate in advance. Raises what the constructor raises."""
         gate = Gate(detector.build_for_companion(mark))
         still = Command(stamp_s=0.0, velocity_enu_mps=np.zeros(3), yaw_rad=0.0)
         plan = Trajectory(
@@ -156,7 +156,7 @@ class SetpointGate:
         return self._standstill(message)
 
     def _staleness(self, message: Message, now_s: float) -> str:
-        """Describe what is gone if the setpoints no longer change; empty otherwise."""
+        """Return why setpoints that no longer change are stale; empty if they are not."""
         content = tuple(
             getattr(message, name) for name in message.fieldnames if name != "time_boot_ms"
         )
@@ -171,7 +171,7 @@ class SetpointGate:
         return "the companion's heartbeat is gone" if silent else ""
 
     def _again(self, message: Message) -> list[Message]:
-        """Return the last accepted setpoint with the header and time of a message."""
+        """Return the last accepted setpoint with the header and time of a withheld one."""
         assert self._accepted is not None
         if self._accepted.get_msgId() != message.get_msgId():
             return []

@@ -1,4 +1,4 @@
-"""A companion's setpoints and the states they are based on, as samples for a detector.
+"""Converts a companion's setpoints, and the states they are based on, to detector samples.
 
 A detector has 13 inputs (`detect.preprocess`). The 7 of the waypoint take the vehicle's state: its
 position, yaw and velocity. The 4 of the command take the setpoint: its yaw, and the displacement
@@ -41,7 +41,7 @@ _DEGREE_M = 1e-7 * 111_319.5  # one unit of lat_int
 
 
 class SetpointView:
-    """The newest state of the autopilot, which setpoints refer to."""
+    """The autopilot's newest state, to which setpoints refer."""
 
     def __init__(self) -> None:
         self.telemetry = Telemetry()
@@ -73,7 +73,7 @@ class SetpointView:
 def command_of(
     setpoint: Message, state: VehicleState | None, global_position: Message | None = None
 ) -> Command:
-    """Return the displacement and yaw that a setpoint requests for 1 s, ENU; see the module.
+    """Return the yaw, and the displacement within 1 s, that a setpoint requests, in ENU.
 
     Args:
         state: Newest state of the vehicle.
@@ -145,7 +145,7 @@ def samples_of_tlog(path: Path, world: str, seed: int) -> FlightSamples:
     """Return the samples of the setpoints in the .tlog of a fault-free flight.
 
     Args:
-        world, seed: Identity of the flight in its data set.
+        world, seed: World and seed that identify the flight in its data set.
 
     Raises:
         RecordError: The file cannot be read.

@@ -75,7 +75,7 @@ class _Struck(Exception):
     """Raised to end a strike in the shared flight, after its mission was forked and has ended."""
 
 
-Branch = tuple[MissionConfig, Path]  # a mission, and the folder for its run folder
+Branch = tuple[MissionConfig, Path]  # a mission, and the parent of its run folder
 
 
 class SharedFlight(NoInjection):
@@ -129,7 +129,7 @@ class SharedFlight(NoInjection):
 
     @property
     def _own(self) -> NoInjection | None:
-        """The injection of this fork's mission."""
+        """The injection of this fork's mission; None in the shared flight."""
         return None if self.config is None else next(iter(self._injections.values()))
 
     @property
@@ -192,7 +192,7 @@ class SharedFlight(NoInjection):
         return self.config, self.folder
 
     def further(self) -> Iterator[SharedFlight]:
-        """Yield the further flights for missions whose nodes changed, ended or hung."""
+        """Yield the flights still needed for missions whose fault changed, ended or hung a node."""
         deaths: dict[tuple[object, ...], dict[int, StruckNode]] = {}
         for number, node in self._struck.items():
             how = node.how or f"fault {number}"  # no two faults change a node in the same way
@@ -212,7 +212,7 @@ class SharedFlight(NoInjection):
         return {number: self._branches[number] for number in numbers}
 
     def _strike(self) -> dict[int, StruckNode]:
-        """Inject the instruction-level faults. Return those that are masked."""
+        """Inject the instruction-level faults in rehearsals. Return those that are masked."""
         if self._strike_nodes is None or self.recorder is None or not self.recorder.sequence:
             return {}
         config, _ = next(iter(self._branches.values()))
@@ -368,7 +368,7 @@ class _Injectors(NoInjector):
         self._injections = injections
 
     def _injectors(self) -> Iterator[NoInjector]:
-        """Yield the injectors that are left; a fork needs no other after its own."""
+        """Yield the remaining injectors. In a fork, stop after the fork's own."""
         for number in list(self._injections):
             if number in self._injections:
                 yield self._injections[number].injector

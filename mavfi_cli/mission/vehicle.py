@@ -2,7 +2,7 @@
 
 Either way, companion and vehicle exchange bytes over a MAVLink link. The vehicle provides its
 briefing before its first message and the referee's truth at the end: as objects in this process, or
-as files from another. This is the only module on the companion's side that imports the vehicle's.
+as files from another. No other module on the companion's side imports the vehicle's code.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Vehicle(ABC):
     Attributes:
         link: The companion's end of the link.
         truth: The referee's log; None before the end, or if the vehicle died.
-        depth: Unix domain socket with depth frames as arrays, which exists if a user's companion
-            uses it; None for a vehicle in this process.
+        depth: Path of the Unix domain socket that sends depth frames as arrays to a user's
+            companion, if that uses it; None unless mavfi started the vehicle's process.
     """
 
     link: Transport
@@ -66,7 +66,7 @@ class Vehicle(ABC):
 
     @staticmethod
     def at(url: str, briefing: Path) -> StartVehicle:
-        """Return a function that connects to a vehicle in lockstep started by another process.
+        """Return a function that connects to a vehicle that another process runs in lockstep.
 
         Args:
             url: Endpoint of the link.
@@ -76,7 +76,7 @@ class Vehicle(ABC):
 
     @abstractmethod
     def briefing(self) -> Briefing:
-        """Return start, goal, bounds and camera, which the world determines.
+        """Return the briefing: start, goal, flight bounds and camera mount.
 
         Raises:
             VehicleProcessError: There is no briefing.
@@ -84,26 +84,30 @@ class Vehicle(ABC):
 
     @staticmethod
     def read_briefing(path: Path) -> Briefing:
-        """Read a briefing that the vehicle's side has written.
+        """Read a briefing that the vehicle's process has written.
 
         Raises:
-            VehicleProcessError: There is none, or it is damaged.
+            VehicleProcessError: The briefing is missing or damaged.
         """
         try:
             data = json.loads(path.read_text())
             arrays: Any = {name: np.array(data[name], np.float64) for name in BRIEFED}
             for name, values in arrays.items():
                 if values.shape != (BRIEFED[name],) or not is_within(REMOTE_M, values):
-                    raise ValueError(f"{name} must be {BRIEFED[name]} numbers below {REMOTE_M:g}")
+                    raise ValueError(
+                        f"{name} must be {BRIEFED[name]} numbers of magnitude up to {REMOTE_M:g}"
+                    )
             return _at_flight_levels(Briefing(**arrays))
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise VehicleProcessError(f"{path.name}: there is no briefing ({error})") from None
+            raise VehicleProcessError(
+                f"{path.name}: the briefing cannot be read ({error})"
+            ) from None
 
     def await_briefing(self, interrupts: Sequence[int]) -> Briefing:
         """Wait for the vehicle's first bytes, and return its briefing.
 
         Raises:
-            VehicleProcessError: It has sent nothing in time, or has ended.
+            VehicleProcessError: The vehicle has sent nothing in time, or has ended.
             Interrupted: The user interrupted the start.
         """
         deadline_s = time.monotonic() + _START_LIMIT_S
@@ -128,7 +132,7 @@ class Vehicle(ABC):
 
 
 class VehicleInProcess(Vehicle):
-    """The vehicle in this process, which simulates while the companion waits for it.
+    """A vehicle in this process. It is simulated while the companion waits for it.
 
     Raises:
         MavfiError: The world, the vehicle, the start or the goal is invalid.
@@ -179,14 +183,14 @@ class VehicleInProcess(Vehicle):
 
 
 def _at_flight_levels(briefing: Briefing) -> Briefing:
-    """Return a briefing whose bounds are those of the flight, not of the world."""
+    """Return a briefing whose height bounds are the flight levels, not those of the world."""
     bounds = briefing.bounds_enu_m.copy()
     bounds[2::3] = LOWEST_M, HIGHEST_M
     return replace(briefing, bounds_enu_m=bounds)
 
 
 def _read_truth(folder: Path) -> FlightTruth | None:
-    """Read the truth that a vehicle process wrote; None if there is none."""
+    """Read the truth that a vehicle process has written; None if there is none."""
     report, host = folder / "truth.json", folder / "host.json"
     if not report.is_file():
         return None
@@ -197,10 +201,10 @@ def _read_truth(folder: Path) -> FlightTruth | None:
 
 
 class VehicleProcess(Vehicle):
-    """`python -m sitl` in lockstep, like `VehicleInProcess`. Closing the socket ends it.
+    """A vehicle in its own process, `python -m sitl`. Closing the socket ends the process.
 
     Raises:
-        VehicleProcessError: It cannot be started.
+        VehicleProcessError: The process cannot be started.
     """
 
     _name = "vehicle"
@@ -232,7 +236,7 @@ class VehicleProcess(Vehicle):
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
-        """Return module and arguments of the process, given the descriptor of its link."""
+        """Return the module and arguments of the process, given its link's descriptor."""
         line = ["sitl", *_arguments(config)]
         if config.companion is not None:
             return [*line, "--link", f"onboard=fd:{descriptor}", "--speed", repr(config.speed)]
@@ -276,7 +280,7 @@ class VehicleProcess(Vehicle):
 
 
 class _LockstepProcess(VehicleProcess):
-    """The vehicle of a user's companion in lockstep; the flight limits the time for an answer."""
+    """A vehicle in lockstep with a user's companion. The flight limits the time for an answer."""
 
     @staticmethod
     def _line(config: MissionConfig, descriptor: int) -> list[str]:
@@ -305,7 +309,7 @@ class _VehicleElsewhere(Vehicle):
 
 
 class _EyesProcess(VehicleProcess):
-    """`python -m sitl.camera`: camera and referee of a foreign autopilot, and the link to it."""
+    """`python -m sitl.camera`: camera, referee and link of a foreign autopilot."""
 
     _name = "camera"
 

@@ -150,6 +150,7 @@ class Document:
     problems: Sequence[str]
     claims: Sequence[JudgedClaim]
     families: Sequence[Family]
+    populations: Mapping[str, str]
     forest: Picture | None
     disagreements: Sequence[Disagreement]
     protections: Sequence[Safeguard]
@@ -228,6 +229,7 @@ def document(evidence: Evidence, upsets_per_hour: float = 1.0, step: Step = str)
         problems=evidence.problems,
         claims=claims,
         families=Family.of(claims),
+        populations={stack: those.population for stack, those in flights.items() if len(those)},
         forest=_forest(claims, stacks),
         disagreements=disagreements(claims, stacks[0]),
         protections=guards,

@@ -154,6 +154,8 @@ def _require_same(plan: FlightsPlan, stored: FlightsPlan | None) -> None:
         problem = "holds a campaign that is not a reproduction"
     elif stored.stack != plan.stack:
         problem = f"flies the stack {stored.stack}, not {plan.stack}"
+    elif stored.worlds != plan.worlds:
+        problem = f"was begun with --worlds {stored.worlds}"
     elif plan.scale < stored.scale:
         problem = f"was begun at --scale {stored.scale:g}, which cannot shrink to {plan.scale:g}"
     else:

@@ -144,12 +144,14 @@ class FlightsPlan:
 
     Attributes:
         scale: fraction of the paper's number of missions.
+        worlds: `fixed`, one world of each environment, or `many`, one for each seed.
         out: folder of all reproductions; each stack has its own folder in it.
     """
 
     items: Sequence[Item]
     stack: str
     scale: float = 1.0
+    worlds: str = "fixed"
     out: Path = OUT
 
     @classmethod
@@ -158,7 +160,8 @@ class FlightsPlan:
         text = ledger.meta(_META)
         if text is None:
             return None
-        return cls(items=ITEMS, out=ledger.folder.parent, **json.loads(text))
+        stored = {"worlds": "many", **json.loads(text)}  # a plan before there were fixed worlds
+        return cls(items=ITEMS, out=ledger.folder.parent, **stored)
 
     @property
     def folder(self) -> Path:
@@ -168,13 +171,14 @@ class FlightsPlan:
     @property
     def meta(self) -> dict[str, str]:
         """The part of the plan that the ledger of the flights stores."""
-        stored = {"stack": self.stack, "scale": self.scale}
+        stored = {"stack": self.stack, "scale": self.scale, "worlds": self.worlds}
         return {"name": self.folder.name, _META: json.dumps(stored)}
 
     @property
     def command(self) -> str:
         """The command that flies all items on the plan's stack."""
-        options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--out", str(self.out))
+        options = ("--stack", self.stack, "--scale", f"{self.scale:g}", "--worlds", self.worlds,
+                   "--out", str(self.out))  # fmt: skip
         return shlex.join(["mavfi", "reproduce", *options])
 
     def missions(self, *items: Item) -> list[PlannedMission]:
@@ -223,7 +227,9 @@ class FlightsPlan:
         """Return the campaigns of items without duplicates, in the order of ITEMS."""
         wanted = set(items) or set(self.items)
         presets = dict.fromkeys(item.preset for item in ITEMS if item in wanted and item.preset)
-        specs = (load_spec(preset).scaled(scale) for preset in presets)
+        specs = [load_spec(preset).scaled(scale) for preset in presets]
+        if self.worlds == "many":
+            specs = [replace(spec, fixed_world=None) for spec in specs]
         return [replace(spec, fixed={**spec.fixed, "stack": self.stack}) for spec in specs]
 
 

@@ -39,7 +39,11 @@ def of_flights(name: str, flights: Flights) -> PaperTable:
     if name in _ONLY_COMPARABLE:
         flights = flights.comparable.shared("world")
     rows = [*OF_FLIGHTS[name](flights)]
-    notes = [*_unpaired(flights), *(_unknown_costs(flights) if name == "table5" else [])]
+    notes = [
+        flights.population,
+        *_unpaired(flights),
+        *(_unknown_costs(flights) if name == "table5" else []),
+    ]
     table = BY_NAME[name].table(rows, flights.worlds, notes)
     return replace(table, result=_RESULTS[name](table))
 

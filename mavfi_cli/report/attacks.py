@@ -1,4 +1,4 @@
-"""Counts, shares and intervals of a campaign, with everything that the numbers depend on."""
+"""Counts, shares and intervals of attacks on kernels or a program, and the plan behind them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _share(runs: TargetRuns, hits: Iterable[bool], *, of_all: bool = False) -> S
 
 
 def _share_entry(share: Share) -> Json:
-    """Return a share as in `kernels.json`, in which the share of no runs is None."""
+    """Return a share as an entry of `kernels.json`; the share of zero runs is None."""
     return {
         "count": share.count, "of": share.total, "share": _finite(share.share),
         "wilson95": [share.low, share.high],
@@ -102,7 +102,7 @@ class _TargetCounts:
 
     @property
     def differing(self) -> float:
-        """Upper 95 % bound of the share of runs that differ without a flip."""
+        """Upper 95 % bound of the share of runs whose output differs even without a flip."""
         return unseen_share(self.null_runs.reached)
 
     def as_dict(self) -> Json:
@@ -384,9 +384,10 @@ def _input(runs: TargetRuns, number: int) -> Json:
 def save_runs(
     folder: Path, summary: KernelsSummary | ProgramSummary, campaign: Sequence[TargetRuns]
 ) -> Sequence[str]:
-    """Write kernels.csv, kernels.json and, for kernels, a picture; one CSV line per run.
+    """Write kernels.csv, kernels.json and, for a campaign on kernels, a picture.
 
-    Entries without a value are empty. The JSON of a program has its golden run and all runs.
+    The CSV file has one line per run; cells without a value are empty. The JSON file of a program
+    also contains its golden run and all other runs.
 
     Returns:
         The names of the files.
@@ -430,7 +431,7 @@ _LABELS = {"benign": "benign", "crash": "crash", "hang": "hang", "sdc": "SDC"}
 
 
 def _kernel_figure(summary: KernelsSummary) -> Figure:
-    """Draw a figure with one bar per kernel and the shares of its injected runs in per cent."""
+    """Draw one bar per kernel, divided into the outcomes of its injected runs in per cent."""
     kernels = summary.kernels
     figure = new_figure(max(5.2, 1.8 + 1.05 * len(kernels)), 4.4)
     axes = figure.add_subplot()
@@ -455,7 +456,7 @@ def _kernel_figure(summary: KernelsSummary) -> Figure:
 
 
 def _bar(axes: Axes, place: int, outcomes: Mapping[str, Share]) -> None:
-    """Stack the segments upwards. All but the last have an interval at their upper edge."""
+    """Stack the segments of a bar. All but the last have an interval at their upper edge."""
     base, below = 0.0, -_LINE / 2  # keeps numbers off the axis
     for number, (name, colour) in enumerate(_COLOURS.items()):
         row = outcomes[name]

@@ -55,7 +55,7 @@ class CampaignReport:
 
     Attributes:
         stopped: settings that the stopping rule has ended early.
-        fixed_world: None without one.
+        fixed_world: the fixed world of all missions; None if there is none.
         quality, overhead, failures: None unless requested.
     """
 
@@ -89,7 +89,7 @@ class CampaignReport:
 
         Raises:
             UnknownName: no setting has such a label.
-            MavfiError: an error of `flight_overheads` or `setting_failures`.
+            MavfiError: as `flight_overheads` and `setting_failures`.
         """
         spec, settings = stored_spec(ledger), groups(ledger, by)
         return cls(
@@ -121,11 +121,10 @@ class CampaignReport:
 
 
 def state_lines(ledger: Ledger) -> list[str]:
-    """Name the fixed world and the settings that the stopping rule has ended early."""
+    """Return lines on the fixed world and on settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
-    world = [] if spec is None or spec.fixed_world is None else [spec.fixed_world.describe()]
     return [
-        *world,
+        *filter(None, [spec.describe_worlds() if spec else ""]),
         *(f"stopped early, because known well enough: {name}" for name in stopped(ledger)),
     ]
 
@@ -226,7 +225,7 @@ def _comparison_lines(settings: SettingColumns, comparisons: Sequence[Comparison
 
 
 def _comparison_cells(row: Comparison) -> list[str]:
-    """Return success, time and worst cases; that over the mean golden flight only if protected."""
+    """Return the cells of a comparison; the last one is empty without a recovered share."""
     time = row.differences["flight_time_s"]
     return [
         f"{row.success.pairs}",
@@ -322,7 +321,7 @@ def _recovery_cells(row: FlightOverhead) -> list[str]:
 
 
 def _overhead_percent(share: Interval, *, ends: bool = True) -> str:
-    """Format per cent with four decimals, as in the paper's table; tiny positive values as "<"."""
+    """Format per cent with four decimals, as in the paper's table; tiny values as "<0.0001"."""
     value, *between = spread(share, 4, 100.0).split(" ", 1)
     value = "<0.0001" if 0.0 < share.value < 0.5e-6 else value
     return " ".join([value, *between]) if ends else value

@@ -53,7 +53,7 @@ class Picture:
     def of(
         cls, name: str, title: str, figure: Figure, csv: str, narrow: Figure | None = None
     ) -> Picture:
-        """Return the chart of a figure, with one for narrow screens, in the page's style."""
+        """Convert a figure, and one for narrow screens if given, to a chart in the page's style."""
         wide, small = (_markup(part) if part else "" for part in (figure, narrow))
         return cls(name=name, title=title, markup=wide, csv=csv, narrow=small)
 
@@ -145,7 +145,7 @@ def draw_forest(rows: Sequence[ForestRow], stacks: Sequence[str], columns: str =
 
 
 def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, verdict: str) -> None:
-    """Draw an effect with its interval; that of the first stack has the colour of the verdict."""
+    """Draw an effect with its interval; the first stack's effect has the verdict's colour."""
     colour = _VERDICTS.get(verdict, NOTE) if not place else NOTE
     height = y - 0.14 if not place else y + 0.26
     width, size = (1.3, 3.2) if not place else (0.6, 2.2)
@@ -162,7 +162,7 @@ def _effect(axes: Axes, y: float, effect: Interval, scale: float, place: int, ve
 def draw_delays(
     panels: Mapping[str, Sequence[Curve]], golden_s: Sequence[float], columns: str = "two"
 ) -> Figure:
-    """Draw the share of flights that are longer by more than a time, in seconds and per cent.
+    """Draw the share of flights delayed by more than a given time, in seconds and per cent.
 
     Args:
         columns: `one` on a narrow screen, otherwise `two`.
@@ -241,7 +241,7 @@ _FATES = {"never read": "#dfe5ec", "same flight": "#b9c6d4", "changed flight": "
 
 
 def draw_flows(flows: Mapping[str, Mapping[str, Share]]) -> Figure:
-    """Draw the share of each fate of struck kernels, by kernel."""
+    """Draw a bar per struck kernel, divided into the shares of its fates."""
     figure = new_figure(WIDTHS_IN["one"], 0.9 + 0.26 * len(flows))
     axes = figure.add_subplot()
     print_axes(axes)

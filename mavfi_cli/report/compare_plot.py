@@ -47,7 +47,7 @@ _RATIOS = (
 
 
 def _draw_comparison(comparison: PlatformComparison) -> Figure:
-    """Draw a figure of five panels with one colour per platform, times in s, shares in %."""
+    """Draw a figure of five panels, with one colour per platform."""
     figure = new_figure(12.0, 8.0)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     panels = figure.subplot_mosaic("TTTTSS;RRMMWW")
@@ -204,7 +204,7 @@ def _response(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, 
 
 
 def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
-    """Draw the paired ratios of each platform to the first, golden filled and faulty hollow."""
+    """Draw each platform's ratios to the first, by mission: golden filled, faulty hollow."""
     drawn = [row for row in comparison.ratios if row.setting in (_GOLDEN, _NONE)]
     titles = {row.platform: row.title for row in comparison.plan.platforms}
     first = comparison.plan.platforms[0].title
@@ -236,7 +236,7 @@ def _ratios(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, st
 
 
 def _costs(axes: Axes, comparison: PlatformComparison, colours: Mapping[str, str]) -> None:
-    """Draw how much faults lengthen the golden flight time: worst and 95th percentile."""
+    """Draw the largest and the 95th-percentile increase of flight time due to faults."""
     settings = [name for name in comparison.plan.settings if name != _GOLDEN]
     places, width = _places(comparison, settings)
     rows = [row for row in comparison.costs if row.pairs]
@@ -312,9 +312,9 @@ _LATE, _ANSWER_LATE = 0.93, 0.7  # fractions of the window beyond which text goe
 
 
 def _draw_timeline(comparison: PlatformComparison) -> Figure:
-    """Draw a figure with simulated time since the frame on x and a lane per kernel.
+    """Draw a panel per platform, with a lane per kernel over simulated time since the depth frame.
 
-    All platforms share the time axis, so equal lengths are equal times.
+    The panels share the time axis, so equal lengths mean equal times.
     """
     rows = comparison.timeline.platforms
     known = {row.platform: row for row in comparison.plan.platforms}
@@ -398,7 +398,7 @@ def _time(seconds: float) -> str:
 
 
 def _steps(axes: Axes, row: Timeline) -> None:
-    """Link each end to the start that it triggered, with a level line while a message waits."""
+    """Link the end of each invocation to the next start; a level line shows a waiting message."""
     places = {kernel: lane for lane, kernel in enumerate(_LANES)}
     links = [("point_cloud", "octomap"), ("octomap", "collision_check"),
              ("collision_check", "control")]  # fmt: skip

@@ -1,4 +1,4 @@
-"""An evaluation of detectors as text, CSV and pictures; the loss curve of a training."""
+"""An evaluation of detectors as text, CSV and pictures; an autoencoder's loss curve."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _share(share: Share) -> str:
 
 
 def detector_csv(*pairs: pa.Table) -> str:
-    """Return one row per pair: first the pairs without a fault, then those with one."""
+    """Return CSV text with one row per pair: first pairs without a fault, then those with one."""
     rows = (row for table in pairs for row in table.select([*CSV]).to_pylist())
     return Table.of_records(rows, [*CSV]).csv()
 
@@ -208,7 +208,7 @@ def detector_csv(*pairs: pa.Table) -> str:
 
 
 def _draw_roc(evaluation: Evaluation) -> Figure:
-    """Draw ROC curves on the left, and precision over recall on the right.
+    """Draw ROC curves on the left, and precision against recall on the right.
 
     A dot marks each detector at its own threshold.
     """
@@ -258,7 +258,7 @@ def _square(axes: Axes, x: str, y: str) -> None:
 
 
 def _draw_recovery(evaluation: Evaluation) -> Figure:
-    """Draw a figure of recovered harmful faults by stage and worst flights by world."""
+    """Draw the share of harmful faults undone, by stage, and the worst flights by world."""
     rows = evaluation.faults
     names = list(dict.fromkeys(row.detector for row in rows))
     colours = detector_colours(names)
@@ -295,7 +295,7 @@ def _bars(
     measure: Any,
     count: Any,
 ) -> None:
-    """Draw grouped bars: a group per value of the rows, a bar per detector, shares in per cent.
+    """Draw grouped bars in per cent: a group per value of the rows, with a bar per detector.
 
     Args:
         measure: Function from a row to its value and interval; NaN if there is none.

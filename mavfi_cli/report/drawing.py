@@ -24,14 +24,14 @@ _STAMPS: dict[str, dict[str, str | None]] = {  # metadata that does not depend o
     "png": {"Software": "mavfi"},
 }
 _DPI = 300
-_TURN = 0.6180339887498949  # golden ratio
+_TURN = 0.6180339887498949  # inverse of the golden ratio
 
 Look = Mapping[str, Any]  # keywords of matplotlib
 DASHED = (0, (5, 3))  # style of reference lines
 INK = "#1d232b"
 NOTE = "#5b6573"
 GRID = "#edf0f4"
-# The same thing has the same colour in all pictures. No two kinds of things share a colour.
+# The same thing has the same colour in all pictures.
 OBSTACLE = "#c9ced6"
 PLAN = "#7a8699"
 GOAL = "#1b7f4b"
@@ -72,7 +72,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -> None:
-    """Hide the upper and right lines of the frame; draw a grid along an axis or along `both`."""
+    """Hide the top and right of the frame; add a title, and a grid along one axis or `both`."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
         axes.grid(visible=True, axis=grid, color=GRID, linewidth=0.6)  # type: ignore[arg-type]
@@ -82,7 +82,7 @@ def open_frame(axes: Axes, title: str = "", grid: str = "", **title_look: Any) -
 
 
 def legend_above(figure: Figure, *what: Any, **look: Any) -> None:
-    """Draw the legend above a figure, by default for all its labels."""
+    """Draw a legend above a figure, by default for all its labelled artists."""
     shape = {"loc": "outside upper center", "ncols": 4, "frameon": False, "fontsize": 8}
     figure.legend(*what, **{**shape, **look})
 

@@ -85,7 +85,7 @@ def _with_rows(report: ModelReport | FlightsReport) -> Json:
 
 
 def _cells_of(row: SchemeResult | FlownScheme) -> Json:
-    """Return the cells of a scheme by the names of their columns; lists are tuples."""
+    """Return the cells of a scheme by column name; a cell with several texts is a tuple."""
     if isinstance(row, SchemeResult):
         cells = asdict(row)
         problem = cells.pop("problem")
@@ -387,7 +387,7 @@ _LABELS = {1: "one board", 2: "two boards (DMR)", 3: "three boards (TMR)"}
 
 
 def _draw_roofline(model: ModelReport) -> Figure:
-    """Draw throughput in Hz and velocity in m/s on logarithmic axes, a panel per vehicle."""
+    """Draw safe velocity over action throughput, both logarithmic, with a panel per vehicle."""
     vehicles = model.vehicles
     figure = new_figure(max(6.4, 4.9 * len(vehicles)), 4.9)
     panels = figure.subplots(1, len(vehicles), squeeze=False, sharey=True)[0]
@@ -503,7 +503,7 @@ def _cost_panel(axes: Axes, vehicle: VehicleReport) -> None:
 
 
 def _beside(place: float, number: int, count: int, width: float) -> float:
-    """Return the centre of one of `count` bars around a place."""
+    """Return the centre of bar `number` of `count` bars, which are centred on `place`."""
     return place + (number - (count - 1) / 2) * width
 
 

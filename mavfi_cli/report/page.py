@@ -24,7 +24,7 @@ _FOLDER = Path(__file__).parent
 
 
 def require_page(path: Path) -> None:
-    """Check the requirements of a page before its numbers are computed.
+    """Check, before the numbers are computed, that a page can be written.
 
     Raises:
         MavfiError: jinja2, which the extra `report` installs, is missing.

@@ -51,7 +51,7 @@ class PaperCell:
 
     @classmethod
     def of_share(cls, share: Share, paper: Printed = None) -> PaperCell:
-        """Return a share in per cent."""
+        """Return the cell of a share, in per cent."""
         if not share.total:
             return cls(paper=paper)
         ends = {"value": share.share, "low": share.low, "high": share.high}
@@ -59,12 +59,12 @@ class PaperCell:
 
     @classmethod
     def of_mean(cls, values: Sequence[float] | FloatArray, paper: Printed = None) -> PaperCell:
-        """Return a mean with its bootstrap interval."""
+        """Return the cell of a mean, with its bootstrap interval."""
         return replace(cls.of_interval(interval(values, resamples=TABLE_RESAMPLES)), paper=paper)
 
     @classmethod
     def of_interval(cls, mean: Interval, scale: float = 1.0) -> PaperCell:
-        """Return a mean with its interval, both multiplied by `scale`."""
+        """Return the cell of a mean with its interval, both multiplied by `scale`."""
         ends = {"value": mean.value, "low": mean.low, "high": mean.high}
         return cls(**{k: scale * v for k, v in ends.items()}, count=mean.count)
 
@@ -159,7 +159,7 @@ class PaperTable:
 
     @property
     def table(self) -> Table:
-        """Labels, n, then our numbers, each always on the same page as the paper's."""
+        """Labels, n and our numbers, each on the same page as the paper's number."""
         head = [*self.labels, "n"]
         parts = [1 + self.printed_in(place) for place in range(len(self.columns))]
         for column, part in zip(self.columns, parts, strict=True):
@@ -209,7 +209,8 @@ _PAPER: Look = {
     "marker": "D", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK,
     "markeredgewidth": 0.9, "linestyle": "none",
 }  # fmt: skip
-_OUTLIER, _LINEAR = 200.0, 20.0  # %; with values above the first, logarithmic above the second
+# In %. If a value exceeds _OUTLIER, the axis is logarithmic beyond _LINEAR.
+_OUTLIER, _LINEAR = 200.0, 20.0
 _LINE_IN, _NEXT_LINE_IN = 0.19, 0.11  # height of a row, and of each further line of its name
 _NAME = 36  # characters in a line of a row's name
 

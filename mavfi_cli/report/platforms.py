@@ -251,7 +251,7 @@ _NUMBERS: Mapping[str, Sequence[tuple[str, str, str, str, str]]] = {
 
 
 def platform_csv(comparison: PlatformComparison) -> str:
-    """Return one row per number: quantity, platform, setting, unit, value and interval."""
+    """Return CSV text with one row per number: platform, setting, quantity, value and interval."""
     rows = [_NAMES]
     for table, numbers in _NUMBERS.items():
         title = "costs" if table == "cost_differences" else table
@@ -278,7 +278,7 @@ def _statistics(
 
 
 def _number_cells(value: Interval | Share | float, count: int | None) -> list[str]:
-    """Return value, ends of the interval and sample size, empty if there are none."""
+    """Return value, ends of the interval and sample size; a missing one is empty."""
     if isinstance(value, Share):
         value = value.effect
     if isinstance(value, Interval):

@@ -21,7 +21,7 @@ UNPAIRED = (
 
 
 class SettingRow(NamedTuple):
-    """The labels and the name of a setting with its cells of a table."""
+    """The labels and the name of a setting, and its cells in a table."""
 
     labels: Labels
     name: str
@@ -69,7 +69,7 @@ class SettingColumns:
         return [f"in all settings that have it: {label_text(self.common)}"] if self.common else []
 
     def lines(self, head: Sequence[str], rows: Iterable[SettingRow]) -> list[str]:
-        """Return one line per setting, in several tables if the screen is too narrow.
+        """Return one line per setting, in several tables if one would be wider than WIDTH.
 
         Args:
             head: headings of the cells.
@@ -78,7 +78,7 @@ class SettingColumns:
         return Table([[*self.heads, *head], *table], labels=len(self.heads)).lines(WIDTH)
 
     def cells(self, labels: Labels, name: str) -> list[str]:
-        """Return the cells of a setting's labels; the first empty one gets the rest of its name."""
+        """Return the cells of a setting's labels; the first empty one has the rest of its name."""
         if not self.keys:
             return [name]
         cells = _cells(labels, self.keys)

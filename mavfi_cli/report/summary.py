@@ -53,7 +53,7 @@ def outcome_line(flight: FlightRecord) -> str:
 
 
 def summary_lines(flight: FlightRecord) -> list[str]:
-    """Return outcome, quality of flight, pipeline figures and cost on this machine."""
+    """Return lines on outcome, mission, flight, faults, detection, response time and host time."""
     config = flight.config
     with_what = f"planner {config['planner']}, platform {config['platform']}"
     with_what += f", stack {config['stack']}"
@@ -211,7 +211,7 @@ def folder_lines(run: Run, picture: Path | None) -> list[str]:
 
 
 def run_html(run: Run) -> str:
-    """Return summary and picture as HTML, with escaped text, because the record may be foreign.
+    """Return summary and picture as HTML; text is escaped, because the record is not trusted.
 
     The picture is drawn from the record and embedded as an image, in which browsers run no script.
     """

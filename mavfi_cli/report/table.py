@@ -1,7 +1,7 @@
 """A table as text, Markdown, LaTeX, CSV or HTML, and formats for the numbers in its cells.
 
-The text does not use rich, which folds or truncates the cells of a table that is too wide. Here the
-columns continue in a further table that repeats the labels, so a file can be searched line by line.
+Text does not use rich, which folds or truncates the cells of a table that is too wide. Here, excess
+columns follow in another table that repeats the labels, so a file can be searched line by line.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ _LEAST_ROOM = 20  # characters; minimum width of the prose column
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells that are already formatted, headings first if there are any.
+    """Rows of formatted cells; the headings, if there are any, come first.
 
     Attributes:
         rows: may differ in length; missing cells are empty.
         labels: number of left-aligned columns; the others are right-aligned. None aligns all left.
-        kept: number of columns after the labels that every page of a wide table repeats with them.
+        kept: number of columns after the labels that, like these, every page of a wide table
+            repeats.
         parts: sizes of the groups of other columns that stay on one page; empty if every column is
             a group of its own.
         prose: whether the last column is wrapped at the width.
@@ -50,7 +51,7 @@ class Table:
 
     @classmethod
     def of_records(cls, records: Iterable[Mapping[str, Any]], names: Sequence[str] = ()) -> Self:
-        """Return one row per record, below the names of the columns, with unrounded numbers.
+        """Return a table with one row per record below the column names; numbers are not rounded.
 
         Args:
             names: names of the columns; if empty, the keys of all records, in order.
@@ -96,7 +97,8 @@ class Table:
     def latex(self) -> str:
         """Return a float with a plain tabular, which needs no package.
 
-        It is as wide as one of two columns, or as the page, in the largest font size that fits.
+        It is as wide as one column of a two-column page, or as the whole page, in the largest font
+        size that fits.
         """
         head, *rows = self._padded()
         form = "".join("l" if left else "r" for left in self._left(len(head)))
@@ -154,7 +156,7 @@ class Table:
         return [self.labels is None or place < self.labels for place in range(columns)]
 
     def _wrapped(self, width: int) -> list[list[str]]:
-        """Return the rows, with further ones for the lines of prose that is too wide."""
+        """Return the rows, with additional ones for prose that continues on further lines."""
         cells = self._padded()
         room = width - sum(column + _GAP for column in _widths(cells)[:-1])
         rows = []
@@ -222,7 +224,7 @@ _PLACES = (("table", 252.0), ("table*", 516.0))
 
 
 def _latex_place(widths: Sequence[int]) -> tuple[str, str, float]:
-    """Return the narrowest float and largest size that hold a table, and the gap; or the last."""
+    """Return float, font size and column gap: the narrowest float that fits, else the last."""
     for place, width_pt in _PLACES:
         for size, character_pt, gap_pt in _SIZES:
             if sum(widths) * character_pt + len(widths) * gap_pt <= width_pt:

@@ -105,7 +105,7 @@ def _path_of(run: Run) -> _Path:
 
 
 def _draw_obstacles(axes: Axes, world: Json, positions: np.ndarray) -> None:
-    """Draw the boxes of a world, pale if they end below the positions (n, 3) m of the flight."""
+    """Draw the boxes of a world; those that end below the positions (n, 3), m, are pale."""
     from matplotlib.patches import Rectangle
 
     flight_height_m = float(np.median(positions[:, 2])) if len(positions) else 5.0
@@ -363,7 +363,7 @@ class Trajectories:
 
 
 def _colours(flights: Iterable[tuple[str, Run]]) -> dict[str, str]:
-    """Return a colour per name: its detector's if still unused, else the next free one."""
+    """Return a colour per name: its detector's if still unused, else the next of FLIGHTS."""
     colours: dict[str, str] = {}
     turn = itertools.cycle(FLIGHTS)
     for name, run in flights:

@@ -62,7 +62,7 @@ class ProgramConfig:
 
     def __post_init__(self) -> None:
         if not _words(self.command):
-            raise ConfigError("must name a program", key="command")
+            raise ConfigError("must name a program, but is empty", key="command")
         if self.restart not in RESTARTS:
             raise UnknownName("restart rule", self.restart, RESTARTS)
         _require_range("restart_s", self.restart_s, 0.0, _LONGEST_S)
@@ -118,7 +118,9 @@ class SuccessConfig:
         _require_range("goal_m", self.goal_m, 0.1, 50.0)
         _require_range("corridor_m", self.corridor_m, 0.01, 1e4)
         if (self.corridor_m is None) != (self.golden is None):
-            raise ConfigError("needs both corridor_m and golden, a run folder", key="corridor_m")
+            raise ConfigError(
+                "corridor_m and golden (a run folder) must be given together", key="corridor_m"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +155,7 @@ class GateConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionConfig:
-    """A companion: its programs by name, its link, and its success.
+    """A companion: its programs by name, its link, and its conditions of success.
 
     Attributes:
         program: Programs in the order in which they start; each waits until the one before is
@@ -193,7 +195,9 @@ class CompanionConfig:
             raise ConfigError("must have at least one program", key="program")
         for name in self.program:
             if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
-                raise ConfigError(f"must be letters, digits, - or _, got {name!r}", key=name)
+                raise ConfigError(
+                    f"the name must be 1 to 40 letters, digits, - or _, got {name!r}", key=name
+                )
         _require_range("time_limit_s", self.time_limit_s, 1.0, 86_400.0)
         _require_range("flight_s", self.flight_s, 0.1, 86_400.0)
         if self.success.exit is not None and self.success.exit not in self.program:
@@ -240,7 +244,7 @@ class CompanionConfig:
         return StackMark(name=f"{COMPANION}{self.name}", digest=digest)
 
     def uses(self, placeholder: str) -> bool:
-        """Return True if the command of a program has a placeholder."""
+        """Return True if the command of any program contains this placeholder."""
         return any(
             placeholder in _PLACEHOLDER.findall(own.command) for own in self.program.values()
         )

@@ -30,11 +30,11 @@ class DetectorConfig:
 
     Attributes:
         name: gad, aad, range, l2 or the name of a plug-in.
-        protect: Stages with watched states.
+        protect: Stages whose states are watched.
         threshold: Replaces the model's threshold; a number of sigmas for gad.
         model: Path of a model file; None selects the one shipped for the mission's stack.
-        alarms_max: Number of consecutive alarms of planning or control at which the vehicle holds
-            and replans; also the maximum number of consecutive reports that are withheld.
+        alarms_max: Number of consecutive alarms in planning or control after which the vehicle
+            holds and replans; also the maximum number of consecutive reports that are withheld.
         any_stack: Allow a model that was fitted to another stack.
         watch: Watched states: `paper` for the 13 states, `extended` adds three more.
     """
@@ -49,14 +49,16 @@ class DetectorConfig:
 
     def __post_init__(self) -> None:
         if not self.protect:
-            raise ConfigError("must name a stage", key="protect")
+            raise ConfigError("must name at least one stage", key="protect")
         for stage in self.protect:
             if stage not in STAGES:
                 raise UnknownName("stage", stage, STAGES)
         if self.threshold is not None and not (
             math.isfinite(self.threshold) and self.threshold > 0.0
         ):
-            raise ConfigError(f"must be above 0, got {self.threshold:g}", key="threshold")
+            raise ConfigError(
+                f"must be a finite number above 0, got {self.threshold:g}", key="threshold"
+            )
         if not 1 <= self.alarms_max <= 1000:
             raise ConfigError(
                 f"must be between 1 and 1000, got {self.alarms_max}", key="alarms_max"
@@ -158,13 +160,16 @@ class DetectorConfig:
             return detector
         fit = "fit one with mavfi train --companion"
         if path is None:
-            raise ModelError(f"{self.name} needs --model, a model of the companion; {fit}")
+            raise ModelError(f"{self.name} needs --model, a model fitted to the companion; {fit}")
         if not made_for.name.startswith(COMPANION):
-            raise ModelError(f"made for the stack {made_for.name!r}; {fit}", path=path)
+            raise ModelError(
+                f"this model was fitted to the stack {made_for.name!r}, not to a companion; {fit}",
+                path=path,
+            )
         if mark is not None and mark.digest != made_for.digest:
             raise ModelError(
-                f"made for {made_for.name!r}, not for {mark.name!r} as it is now; {fit}, or allow "
-                "it with --any-stack-model",
+                f"this model was fitted to {made_for.name!r}, not to {mark.name!r} with its "
+                f"present commands; {fit}, or allow this model with --any-stack-model",
                 path=path,
             )
         return detector

@@ -1,4 +1,4 @@
-"""Configuration of a fault, as plain values for the record: at source or at instruction level."""
+"""Configuration of a fault at source or instruction level, as plain values for the record."""
 
 from __future__ import annotations
 
@@ -193,13 +193,15 @@ class FaultConfig:
         target = self.wire_target[1]
         trigger, corruption = self.trigger(), self.corruption()
         if trigger.when is When.FORESEEN:
-            raise FaultSpecError(f"{self.target}: at must not be foreseen, got {self.at}")
+            raise FaultSpecError(
+                f"{self.target}: a fault in a MAVLink message cannot have the trigger {self.at}"
+            )
         fields = WireFields.of(target.partition(".")[0])
         if corruption.effect in OF_MESSAGES:
             if "." in target:
                 raise FaultSpecError(
-                    f"{self.target}: {corruption.effect.value} must have a whole message as "
-                    "target, got a field"
+                    f"{self.target}: the effect {corruption.effect.value} needs a whole message as "
+                    "its target, got a field"
                 )
             return fields, None
         require_effect(self.target, corruption.effect, (*OF_VALUES, *OF_MESSAGES))
@@ -235,7 +237,9 @@ class FaultConfig:
 
         kind, _, value = self.at.partition("=")
         if not value and kind.replace(".", "", 1).isdigit():
-            raise FaultSpecError(f"at {kind}: must name its kind, as in time={kind} (s)")
+            raise FaultSpecError(
+                f"at {kind}: the kind of trigger is missing; write time={kind} for a time in s"
+            )
         when = named_member(When, "trigger", kind)
         if when in (When.RANDOM, When.FORESEEN):
             return Trigger(when=when)
@@ -247,16 +251,16 @@ class FaultConfig:
             return Trigger(when=when, number=float(value))
         except ValueError:
             raise FaultSpecError(
-                f"at {kind}: must have a number, as in {kind}=12, got {self.at!r}"
+                f"at {kind}: needs a number, as in {kind}=12, got {self.at!r}"
             ) from None
 
     def corruption(self) -> Corruption:
-        """Return the corruption of the value. Raises UnknownName and FaultSpecError."""
+        """Build the corruption. Raises UnknownName or FaultSpecError if a setting is invalid."""
         effect, _, amount = self.effect.partition("=")
         try:
             number = float(amount or 0.0)
         except ValueError:
-            raise FaultSpecError(f"effect {effect}= must have a number, got {amount!r}") from None
+            raise FaultSpecError(f"effect {effect}= needs a number, got {amount!r}") from None
         return Corruption(
             effect=named_member(Effect, "effect", effect),
             amount=number,
@@ -280,7 +284,9 @@ class FaultConfig:
             if not target.startswith("waypoint_"):
                 raise UnknownName("state of control's queue", target, _QUEUED)
             if self.trigger().when is When.INVOCATION:
-                raise FaultSpecError(f"{self.target}: at must not be an invocation, got {self.at}")
+                raise FaultSpecError(
+                    f"{self.target}: a fault in control's queue cannot have the trigger {self.at}"
+                )
         return draw_fault(
             target,
             seed=self.seed,
@@ -396,7 +402,7 @@ class InstructionConfig:
         return self.target.partition("/")[2] or None
 
     def moment(self) -> FaultConfig:
-        """Return a fault in the program's process at the moment when counting starts."""
+        """Return a fault in the program's process with the trigger that starts the counting."""
         return FaultConfig(target=f"{PROCESS}.{self.program}", seed=self.seed, at=self.at)
 
     def check_program(self, programs: Collection[str]) -> None:
@@ -419,7 +425,7 @@ class InstructionConfig:
         return f"{bits} in an instruction of {struck or self.target}{where}".replace("_", " ")
 
     def node(self) -> str:
-        """Return the target node.
+        """Return the target node, drawn from the target's nodes if the target is a stage.
 
         Raises:
             UnknownName: The node or stage does not exist.

@@ -42,7 +42,7 @@ _OF_LOST_NODES: Mapping[str, Any] = {"node_restart_s": 1.0, "node_watchdog_s": 5
 NOT_OF_GOLDEN: Mapping[str, Any] = {
     "fault": None, "instruction": None, "detector": None, "isolate": (), **_OF_LOST_NODES,
 }  # fmt: skip
-"""Settings that a golden mission does not have or need, and their values in it."""
+"""Settings that a golden mission lacks or does not need, with their values in such a mission."""
 
 LOWEST_M, HIGHEST_M = 2.0, 10.0  # flight levels above home; MAVBench plans between 1 and 10 m
 REMOTE_M = 1.0e7  # beyond this, float64 is coarser than a nanometre
@@ -204,7 +204,7 @@ class MissionConfig:
             if self.speed != 1.0:
                 raise ConfigError("needs --companion", key="speed")
             if self.fault is not None and self.fault.wire_target is not None:
-                raise ConfigError("a MAVLink message needs --companion", key="inject")
+                raise ConfigError("a fault in a MAVLink message needs --companion", key="inject")
             return
         for name in ("link", "realtime", "isolate", "land"):
             if getattr(self, name):
@@ -270,9 +270,8 @@ class MissionConfig:
     def shared_flight(self) -> MissionConfig | None:
         """The flight from which the mission can be forked: the mission without its fault.
 
-        The settings for lost nodes do not matter in it and have their defaults.
-
-        It is None if other processes or the wall clock affect the mission's flight.
+        The settings for lost nodes have their defaults, because they do not matter without a fault.
+        The result is None if other processes or the wall clock affect the mission's flight.
         """
         alone = (
             self.isolate
@@ -287,7 +286,7 @@ class MissionConfig:
 
     @property
     def seed_of_world(self) -> int:
-        """Seed of the world."""
+        """Seed of the world: `world_seed`, or `seed` if that is None."""
         return self.seed if self.world_seed is None else self.world_seed
 
     @property
@@ -301,7 +300,10 @@ class MissionConfig:
         return files + tuple(name for name in (model, self.firmware, companion) if name)
 
     def loaded_stack(self) -> Stack:
-        """Load the stack of the mission, with its goal tolerance. Errors as in `load_stack`."""
+        """Load the mission's stack. The mission's goal tolerance, if set, replaces the stack's.
+
+        Raises the errors of `load_stack`.
+        """
         stack, own_m = load_stack(self.stack), self.goal_tolerance_m
         return stack if own_m is None else replace(stack, goal_tolerance_m=own_m)
 

@@ -3,8 +3,8 @@
 A file either gives the latency of every kernel, or names a shipped platform as its `base` and
 gives a factor, `scale`, for individual kernels or for all of them.
 
-`measured:FACTOR` needs no file. Its latencies are the kernel times measured on the host in
-flight, times the factor. Such a flight is not repeatable.
+`measured:FACTOR` needs no file. Its latencies are the kernel times measured on the host in flight,
+multiplied by the factor. Such a flight is not repeatable.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def _measured(factor: float) -> PlatformProfile:
 def _kernels(
     file: _PlatformFile, base: PlatformProfile | None, path: Path
 ) -> dict[str, _KernelLatency]:
-    """Return the latencies of the kernels: from their entries, or the base's times `scale`."""
+    """Return each kernel's latency: from its entry, or else `scale` multiplied by the base's."""
     based = {} if base is None else base.kernels
     scaled = _KernelEntry(scale=file.scale, source=file.sources.get("scale", ""))
     kernels = {}

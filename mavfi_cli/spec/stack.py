@@ -116,7 +116,7 @@ class Stack:
     turns_before_departure: bool
     rejected_plan_pause_s: float
     slows_where_blind: bool
-    # Files and models of older versions do not have the keys with a default.
+    # Files and models of older versions lack the keys that have a default.
     smoother: str = SMOOTHERS[0]
     slice_period_s: float = 0.01
     restores_counters: bool = False
@@ -178,7 +178,7 @@ class Stack:
     def mark(self) -> StackMark:
         """Return the identity of the stack, which a detector's model stores.
 
-        It excludes keys with their default, so adding a key later does not change any identity.
+        Keys with their default value are excluded, so a key added later changes no identity.
         """
         settings = self.settings_of(Stack)
         same = [key for key, value in _DEFAULTS.items() if settings[key] == value]
@@ -211,8 +211,8 @@ _DEFAULTS = {
 def load_stack(text: str) -> Stack:
     """Load a stack by `NAME`, `FILE.toml`, or either with `:KEY=VALUE,KEY=VALUE`.
 
-    The name is that of a shipped stack. Values have TOML syntax and replace those of the stack; a
-    word needs no quotes.
+    NAME is a shipped stack. The values have TOML syntax, except that a word needs no quotes, and
+    replace those of the stack.
 
     Raises:
         UnknownName: No shipped stack has this name, and it is not a path to a TOML file.

@@ -1,6 +1,6 @@
-"""Bootstrap intervals of flight time, distance, energy, replans, and of their paired differences.
+"""Bootstrap intervals of flight time, distance, energy, replans and their paired differences.
 
-SciPy resamples, with a fixed seed, so the same numbers give the same interval.
+SciPy resamples with a fixed seed, so equal values give equal intervals.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 RESAMPLES = 9999
 TABLE_RESAMPLES = 1999  # for the many intervals of a table
 FEW = 10  # with fewer values a 95 % interval covers the true mean in less than 90 % of cases
-LARGE = 500  # with so many values the mean is normal and the bootstrap only slower
+LARGE = 500  # with this many values the mean is nearly normal, and a bootstrap is only slower
 _CHUNK = 4_000_000  # numbers drawn at once
 IntArray = NDArray[np.int64]
 Statistic = Callable[[FloatArray], FloatArray]  # (..., n) -> (...)
@@ -44,17 +44,18 @@ def interval(
     seed: int = 1,
     weights: FloatArray | None = None,
 ) -> Interval:
-    """Return a statistic with its bootstrap interval, or a normal one for a mean of many values.
+    """Return a statistic with its bootstrap interval, or a mean of many values with a normal one.
 
     The interval is BCa (bias-corrected and accelerated; B. Efron, JASA 82, 1987). It is the
     percentile interval if BCa is not defined, as for the median of tied values, or if there are
-    more values than resamples, because BCa leaves out each value in turn. The mean of LARGE values
-    or more has the normal interval.
+    more values than resamples, because BCa leaves out each value in turn. The mean of LARGE or more
+    values has the normal interval.
 
     Args:
-        values: (n,) one value per mission; the differences for a paired difference.
+        values: (n,) one value per mission; for paired differences, one difference per mission.
         statistic: reduces the last axis of an array.
-        weights: (n,) weights of a stratified sample, for its weighted mean; None for equal ones.
+        weights: (n,) weights of a stratified sample; None for equal ones. If they differ, the
+            statistic is always the weighted mean.
     """
     sample = np.asarray(values, dtype=np.float64)
     count = len(sample)
@@ -108,7 +109,7 @@ def interval_of_rows(
     resamples: int,
     confidence: float = 0.95,
 ) -> Interval:
-    """Return a statistic of several columns with its interval, by resampling whole rows.
+    """Return a statistic over several columns with its interval, found by resampling whole rows.
 
     Args:
         statistic: takes row indices (..., n) and reduces the last axis.

@@ -1,12 +1,13 @@
-"""Two treatments: tests, the worst case, effects with intervals, and the verdict on a claim.
+"""Comparison of two treatments: tests, the worst case, and effects with their intervals.
 
-The worst case and its recovery follow the paper's section VII-A. For Factory, it gives a worst-case
-flight time with faults 73.8 % above that of the golden run. The recovery is 64.2 % in section VII-A
-and 87.1 % in Fig. 14. As 64.2 / 73.8 = 87.0 %, the first is in percentage points of the golden run
-and the second is a share of the increase. Both are computed here.
+The worst case and its recovery follow the paper's section VII-A. For Factory, that section reports
+a worst-case flight time with faults that is 73.8 % above the golden run's. The recovery is 64.2 %
+in section VII-A and 87.1 % in Fig. 14. Because 64.2 / 73.8 = 87.0 %, the first number must be in
+percentage points of the golden run, and the second must be a share of the increase. Both are
+computed here.
 
-An effect is one number of a comparison: a difference of two rates, or the share of a loss that
-protection recovers.
+An effect is a single number that summarises a comparison: the difference of two rates, or the share
+of a loss that protection recovers.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from mavfi_cli.core.types import FloatArray
 from mavfi_cli.stats.shares import NO_INTERVAL, Interval, z_of
 
 BoolArray = NDArray[np.bool_]
-OWN = (1.0,)  # golden values of `WorstCase.of` if each value is relative to its own golden flight
-_PATTERNS = 9999  # patterns of signs in `sign_flips`
+OWN = (1.0,)  # `golden` of `WorstCase.of` if each value is relative to its own golden flight
+_PATTERNS = 9999  # maximum number of sign patterns in `sign_flips`
 _CHUNK = 1_000_000  # signs drawn at once; larger arrays leave the processor's cache
-_DIGITS = 9  # of a sum relative to the largest; equal sums differ only by rounding
+_DIGITS = 9  # decimals to which relative sums are compared; equal ones may differ by rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +36,7 @@ class McNemar:
     Attributes:
         both, neither: pairs in which both or neither succeeded.
         only_first, only_second: pairs in which only one succeeded.
-        p_value: two-sided, exact.
+        p_value: two-sided; see `of`.
     """
 
     both: int
@@ -52,10 +53,11 @@ class McNemar:
         weights: FloatArray | None = None,
         clusters: NDArray[np.int64] | None = None,
     ) -> McNemar:
-        """Run McNemar's exact test (Psychometrika 12, 1947): differing pairs are fair coin tosses.
+        """Run McNemar's exact test (Psychometrika 12, 1947) on the pairs that differ.
 
-        With weights, the p-value is that of `sign_flips` on the weighted differences. With
-        clusters, it is that of `sign_flips` on the sum of the differences in each cluster.
+        Without an effect, these are fair coin tosses. With weights, the p-value is that of
+        `sign_flips` for the weighted differences. With clusters, it is that of `sign_flips` for the
+        sums of the differences in each cluster.
 
         Args:
             first, second: success of each mission under each treatment, (n,).
@@ -94,13 +96,13 @@ class McNemar:
 
     @property
     def difference(self) -> float:
-        """Success rate of the second minus that of the first; NaN without pairs."""
+        """Success rate under the second treatment minus that under the first; NaN without pairs."""
         return (self.only_second - self.only_first) / self.pairs if self.pairs else math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightedMcNemar(McNemar):
-    """Counts of pairs, and a difference by the weights of a stratified sample."""
+    """Counts of pairs in a stratified sample, with their weighted difference."""
 
     difference: float = field()
 
@@ -108,10 +110,10 @@ class WeightedMcNemar(McNemar):
 def sign_flips(differences: Sequence[float]) -> float:
     """Return the two-sided p-value of Fisher's randomisation test of paired differences.
 
-    Without an effect both signs of a difference are equally likely. The test assumes no
-    distribution, so it is valid if most differences are zero and a bootstrap interval is too
-    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). All patterns of signs
-    are tried if there are at most _PATTERNS, otherwise _PATTERNS seeded random ones.
+    Without an effect, both signs of a difference are equally likely. The test assumes no
+    distribution, so it stays valid if most differences are zero, where bootstrap intervals are too
+    narrow (R. A. Fisher, The Design of Experiments, 1935, section 21). It tries all sign patterns
+    if there are at most _PATTERNS; otherwise it tries _PATTERNS random ones from a fixed seed.
 
     Args:
         differences: one for each independent pair; zeros have no effect.
@@ -137,7 +139,7 @@ def sign_flips(differences: Sequence[float]) -> float:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values corrected for a family of tests (S. Holm, Scand. J. Statistics 6, 1979).
 
-    The order is kept. Reject if the corrected value is below the level.
+    The values keep their order. Reject a hypothesis if its corrected value is below the level.
     """
     count = len(p_values)
     corrected = [0.0] * count
@@ -150,15 +152,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorstCase:
-    """Worst values of successful flights, compared with the golden ones; NaN without flights.
+    """Worst values of successful flights, compared with golden flights; NaN without flights.
 
     Attributes:
         golden: the reference, the mean of the golden flights.
         golden_worst, faulty_worst, protected_worst: the largest values.
-        increase: faulty worst case divided by the reference, minus 1; 0.738 in the example.
-        recovered: reduction by protection, in the same unit; 0.642.
-        recovered_share: recovered part of the increase, 0.87; NaN unless the faulty worst case
-            exceeds the worst golden one.
+        increase: faulty worst case divided by the reference, minus 1; 0.738 for Factory.
+        recovered: reduction by protection, divided by the reference; 0.642 for Factory.
+        recovered_share: `recovered` / `increase`, 0.87 for Factory; NaN unless the faulty worst
+            case exceeds the worst golden one.
     """
 
     golden: float
@@ -176,7 +178,8 @@ class WorstCase:
         """Compare the flight times, or energies, of the successful missions of each setting.
 
         Args:
-            golden: OWN if each value is divided by that of the same mission's golden flight.
+            golden: OWN if the other values are already divided by those of their missions' golden
+                flights.
         """
         known = bool(golden and faulty)
         reference = math.fsum(golden) / len(golden) if known else math.nan
@@ -208,7 +211,7 @@ def paired_difference(
     second: Sequence[bool] | BoolArray,
     clusters: Sequence[Hashable],
 ) -> Interval:
-    """Return the rate of the second minus that of the first, on the same missions.
+    """Return the second treatment's rate minus the first's, on the same missions.
 
     The interval is that of D. G. Bonett and R. M. Price (J. Educational and Behavioral Statistics
     37, 2012): one pair is added to each of the two kinds of differing pairs, so the interval has a
@@ -243,10 +246,10 @@ def net_share(
     """Return the hits that a treatment undoes minus those it causes, as a share of the hits before.
 
     It is (hits before - hits after) / hits before on the same missions. It is below 0 if the
-    treatment causes more than it undoes. The ends of the interval are percentiles of random draws:
-    the share of missions that are hits before, and the shares of hits and of others that change,
-    are each drawn from their posterior distribution under Jeffreys' prior. The numbers of missions
-    are divided by the design effect of the clusters.
+    treatment causes more than it undoes. The ends of the interval are percentiles of random draws.
+    Each draw takes three shares from their posterior distributions under Jeffreys' prior: missions
+    that are hits before, hits that are undone, and other missions that become hits. The numbers of
+    missions are divided by the design effect of the clusters.
 
     Args:
         before, after: whether each mission is a hit without and with the treatment, (n,).
@@ -272,7 +275,7 @@ def net_share(
 
 
 def _cluster_effect(values: NDArray[np.int64], clusters: Sequence[Hashable]) -> float:
-    """Return the ratio of a mean's variance to that with as many independent values; at least 1."""
+    """Return the ratio of a mean's variance to that for independent values; at least 1."""
     residuals = values - values.mean()
     squares = float((residuals**2).sum())
     sums: dict[Hashable, float] = {}
@@ -290,8 +293,8 @@ def recovered_share(
     """Return the share of the lost success that protection recovers, from three independent rates.
 
     It is a ratio of two differences. The three rates are drawn from their posterior distributions
-    under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that a rate of 100 of 100 varies as
-    well. The ends of the interval are percentiles of the ratio, including draws in which the
+    under Jeffreys' prior, Beta(wins + 1/2, losses + 1/2), so that even a rate of 100 out of 100
+    varies. The ends of the interval are percentiles of the ratio, including draws in which the
     faults cost nothing.
 
     Args:

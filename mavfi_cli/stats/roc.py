@@ -1,11 +1,11 @@
 """Receiver operating characteristic, precision and recall, over all thresholds.
 
 A flight's score is the highest score of its messages. A threshold t raises an alarm on flights
-whose score is above t. The area under the ROC curve is the Mann-Whitney statistic, with ties
-halved. Its interval uses the variance of Hanley and McNeil (Radiology 143, 1982), evaluated at the
-end of the interval instead of at the estimate, so that an area of 1 has an interval too (R. G.
-Newcombe, Statistics in Medicine 25, 2006). The area under the precision-recall curve is the average
-precision, the sum of precision times the gain in recall.
+whose score is above t. The area under the ROC curve is the Mann-Whitney statistic, in which a tie
+counts one half. Its interval uses the variance of Hanley and McNeil (Radiology 143, 1982),
+evaluated at each end of the interval instead of at the estimate, so that an area of 1 has an
+interval too (R. G. Newcombe, Statistics in Medicine 25, 2006). The area under the precision-recall
+curve is the average precision, the sum of precision times the gain in recall.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _NEAR = 1e-9  # search offset from the area itself, because areas of 0 and 1 hav
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """Curves over the thresholds, in units of the detector's own threshold; (m,) each.
+    """Curves, (m,) each, over thresholds in units of the detector's own threshold.
 
-    Without flights of one kind, the curves are empty and the numbers are NaN.
+    If there are no flights of one kind, the curves are empty and the numbers are NaN.
 
     Attributes:
-        positives, negatives: number of scores of harmful faults and of error-free flights.
+        positives, negatives: number of harmful faults and of error-free flights with a score.
         thresholds: in descending order, beginning with one that raises no alarm.
         false_positive_rate: share of error-free flights with an alarm.
         recall: share of harmful faults with an alarm.
-        precision: share of harmful faults among all with an alarm; 1 at the first threshold.
-        area, area_low, area_high: under the ROC curve, with its 95 % interval.
-        average_precision: area under the precision-recall curve; it depends on the mix of flights
-            and is positives / (positives + negatives) by chance.
+        precision: share of harmful faults among flights with an alarm; 1 at the first threshold.
+        area, area_low, area_high: area under the ROC curve, and the ends of its 95 % interval.
+        average_precision: area under the precision-recall curve. It depends on the mix of flights;
+            a detector that guesses has positives / (positives + negatives).
         operating_point: false positive rate and recall at the detector's own threshold.
     """
 
@@ -93,7 +93,7 @@ class Curves:
 
 
 def _area_interval(area: float, positives: int, negatives: int) -> tuple[float, float]:
-    """Return the ends of the 95 % interval: areas whose own spread just reaches the estimate."""
+    """Return the ends of the 95 % interval: areas whose own half width just reaches `area`."""
     from scipy.optimize import brentq
 
     z = z_of(0.95)

@@ -1,4 +1,4 @@
-"""Tests and intervals that hold however often one looks: asymptotic confidence sequences.
+"""Tests and intervals that stay valid however often one looks: asymptotic confidence sequences.
 
 I. Waudby-Smith, D. Arbour, R. Sinha, E. H. Kennedy and A. Ramdas, Annals of Statistics 52, 2024,
 theorem 2.2, the normal mixture of H. Robbins. With u = n rho^2, an estimate from n observations
@@ -6,8 +6,8 @@ that lies z standard errors from a value gives the following evidence against th
 
     e = exp(z^2 u / (2 (u + 1))) / sqrt(u + 1).
 
-The probability that it ever exceeds 1/a is at most a, if the value is true. So 1/e is a p-value at
-any look, and the values with e < 1/a form an interval that holds at all looks together.
+If the value is true, the probability that e ever exceeds 1/a is at most a. So 1/e is a valid
+p-value at any look, and the values with e < 1/a form an interval valid at all looks at once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ _LEVEL = 0.05  # level for which it is narrowest there
 
 
 def anytime_p(z: float, count: int) -> float:
-    """Return the p-value at any look of an estimate from `count` values, z standard errors away."""
+    """Return the anytime-valid p-value of an estimate from `count` values.
+
+    The estimate lies z standard errors from the tested value.
+    """
     u = _u(count)
     exponent = -0.5 * z * z * u / (u + 1.0)
     return min(1.0, math.sqrt(u + 1.0) * math.exp(exponent))
@@ -35,7 +38,7 @@ def anytime_z(count: float, level: float = _LEVEL) -> float:
 
 
 def anytime_interval(effect: Interval) -> Interval:
-    """Return an effect's 95 % interval for all looks together, given the one for a single look."""
+    """Widen an effect's 95 % interval for a single look until it is valid at all looks at once."""
     if not effect.count:
         return effect
     wider = anytime_z(effect.count) / z_of(1.0 - _LEVEL)
@@ -47,20 +50,21 @@ def anytime_interval(effect: Interval) -> Interval:
 
 
 def anytime_count(z: float, count: int, level: float) -> float:
-    """Return the count at which `anytime_p` falls below a level, if the effect stays as it is.
+    """Return the count at which `anytime_p` falls below a level, if the effect stays the same.
 
     Args:
-        z, count: current distance in standard errors, and number of observations.
+        z, count: current distance from the tested value, in standard errors, and current number of
+            observations.
 
     Returns:
-        Infinite if z is 0.
+        The count; infinite if z or `count` is 0.
     """
     if not z or not count:
         return math.inf
     from scipy.optimize import brentq
 
     def short(number: float) -> float:
-        """Return the standard errors still missing at this number of observations."""
+        """Return how many standard errors the effect still lacks at this number of observations."""
         return anytime_z(number, level) - z * math.sqrt(number / count)
 
     enough = float(count)

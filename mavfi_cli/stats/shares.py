@@ -1,10 +1,10 @@
 """Proportions of independent runs and of clusters, with intervals; sample sizes; cross-layer rates.
 
-Each run strikes a cluster: a sampled window of executed instructions. Clusters are drawn uniformly
-from a stratum, such as the windows that begin at one function. The formulas are those of W. G.
-Cochran, Sampling Techniques, 3rd edition, 1977. A few clusters estimate their own spread poorly, so
-the quantiles are Student's, with the degrees of freedom of F. E. Satterthwaite (Biometrics Bulletin
-2, 1946).
+In a clustered sample, each run strikes one cluster: a sampled window of executed instructions.
+Clusters are drawn uniformly from a stratum, such as the windows that begin at one function. The
+formulas are those of W. G. Cochran, Sampling Techniques, 3rd edition, 1977. The spread of a few
+clusters is a poor estimate, so the quantiles are Student's, with the degrees of freedom of F. E.
+Satterthwaite (Biometrics Bulletin 2, 1946).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEAST = 1e-6  # smaller margins and differences need more missions than anyone 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
-    """A statistic with its interval; NaN if there are too few values."""
+    """A statistic with the ends of its interval; NaN if there are too few values."""
 
     value: float
     low: float
@@ -33,7 +33,7 @@ class Interval:
     count: int
 
     def minus(self, other: Interval) -> Interval:
-        """Return the difference of independent effects: distances add in quadrature (MOVER)."""
+        """Subtract an independent effect; the distances to the ends add in quadrature (MOVER)."""
         value = self.value - other.value
         below = math.hypot(self.value - self.low, other.high - other.value)
         above = math.hypot(self.high - self.value, other.value - other.low)
@@ -44,7 +44,7 @@ class Interval:
     def welch(first: FloatArray, second: FloatArray, confidence: float = 0.95) -> Interval:
         """Return the second mean minus the first (B. L. Welch, Biometrika 34, 1947).
 
-        NaN if a sample is empty; the ends are NaN if one has a single value.
+        The result is NaN if a sample is empty. Its ends are NaN if a sample has a single value.
 
         Args:
             first, second: (n,) and (m,) independent values.
@@ -79,7 +79,7 @@ class Share:
 
     @property
     def effective(self) -> int:
-        """Number of uniformly drawn observations that give an equally narrow interval."""
+        """Number of uniformly drawn observations that would give an equally wide interval."""
         return self.total
 
     @property
@@ -95,8 +95,9 @@ class Share:
     def minus(self, other: Share) -> Interval:
         """Return the difference of two independent rates, with the hybrid score interval.
 
-        R. G. Newcombe, Statistics in Medicine 17, 1998, method 10: the distances to the ends of the
-        two Wilson intervals, added in quadrature. NaN if one has no observations.
+        This is method 10 of R. G. Newcombe, Statistics in Medicine 17, 1998, which adds the
+        distances to the ends of the two Wilson intervals in quadrature. The result is NaN if a rate
+        has no observations.
         """
         if not (self.total and other.total):
             return NO_INTERVAL
@@ -117,9 +118,10 @@ class Share:
         return float(fisher_exact([hits, misses]).pvalue)
 
     def per_hour(self, upsets_per_hour: float) -> tuple[float, float, float]:
-        """Return failed missions per flight hour, with low and high, for this share of failures.
+        """Return the failed missions per flight hour for this share of failures: value, low, high.
 
-        The extrapolation assumes at most one upset per mission, as harmful as in the campaign.
+        The extrapolation assumes at most one upset per mission, and that an upset does as much harm
+        as a fault of the campaign.
 
         Args:
             upsets_per_hour: bit flips that reach the attacked kernels per flight hour.
@@ -144,8 +146,8 @@ def wilson(
 ) -> Share:
     """Return the Wilson score interval (E. B. Wilson, JASA 22, 1927).
 
-    Without observations the interval is [0, 1] and the share is NaN. A design effect divides the
-    number of observations, which SciPy's `proportion_ci` does not support.
+    Without observations, the interval is [0, 1] and the share is NaN. The number of observations is
+    divided by the design effect; SciPy's `proportion_ci` does not support this.
     """
     if total == 0:
         return Share(count=0, total=0, share=math.nan, low=0.0, high=1.0)
@@ -167,9 +169,10 @@ def score_interval(share: float, number: float, confidence: float) -> tuple[floa
 def unseen_share(total: int, confidence: float = 0.95) -> float:
     """Return the largest share that is compatible with no hit in `total` independent runs.
 
-    It is the one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934; 1 if no runs.
+    It is the one-sided bound of C. J. Clopper and E. S. Pearson, Biometrika 26, 1934. Without runs
+    it is 1.
     """
-    return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0  # exact; SciPy searches
+    return 1.0 - (1.0 - confidence) ** (1.0 / total) if total else 1.0  # exact; SciPy iterates
 
 
 def z_of(confidence: float) -> float:
@@ -181,7 +184,7 @@ def z_of(confidence: float) -> float:
     from scipy.special import ndtri
 
     if not 0.0 < confidence < 1.0:
-        raise ConfigError(f"must be between 0 and 1, got {confidence:g}", key="confidence")
+        raise ConfigError(f"must be above 0 and below 1, got {confidence:g}", key="confidence")
     return float(ndtri(0.5 + confidence / 2.0))
 
 
@@ -189,8 +192,8 @@ def mixture(parts: Sequence[tuple[int, Share]]) -> dict[str, float]:
     """Return `share`, `low` and `high` of a whole from its parts, weighted by their true sizes.
 
     The interval adds the distances to the ends of the parts' Wilson intervals in quadrature (MOVER,
-    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The result is NaN if a
-    part that is not empty was never sampled.
+    G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). If the whole is empty, or a part that
+    is not empty was never sampled, the share is NaN and the interval is [0, 1].
     """
     whole = sum(size for size, _ in parts)
     if not whole:
@@ -213,15 +216,15 @@ def missions_for_margin(margin: float, *, expected: float = 0.5, confidence: flo
         expected: expected rate; 0.5 is the worst case.
 
     Raises:
-        ConfigError: the margin is below a millionth or not below 0.5, or the rate is not between
-            0 and 1.
+        ConfigError: the margin is below a millionth or not below 0.5, the expected rate is not in
+            [0, 1], or the confidence is not between 0 and 1.
     """
     if not _LEAST <= margin < 0.5:
         raise ConfigError(
             f"must be at least {_LEAST:g} and below 0.5, got {margin:g}", key="margin"
         )
     if not 0.0 <= expected <= 1.0:
-        raise ConfigError(f"must be between 0 and 1, got {expected:g}", key="expected")
+        raise ConfigError(f"must be at least 0 and at most 1, got {expected:g}", key="expected")
     z2 = z_of(confidence) ** 2
     a, b, c = 0.25 - margin**2, expected * (1.0 - expected) - 2.0 * margin**2, -(margin**2)
     u = (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
@@ -233,12 +236,12 @@ def pairs_for_difference(
 ) -> int:
     """Return how many pairs McNemar's test needs to detect a difference of success rates.
 
-    (z_a sqrt(q) + z_b sqrt(q - d²))² / d², with q the share of pairs whose outcomes differ and d
-    the difference (R. J. Connor, Biometrics 43, 1987).
+    It is (z_a sqrt(q) + z_b sqrt(q - d²))² / d², where q is the share of pairs whose outcomes
+    differ and d is the difference (R. J. Connor, Biometrics 43, 1987).
 
     Raises:
-        ConfigError: the difference is below a millionth, or the share of differing pairs does not
-            allow it.
+        ConfigError: the difference is below a millionth or exceeds the share of differing pairs,
+            that share exceeds 1, or the confidence or the power is not between 0 and 1.
     """
     from scipy.special import ndtri
 
@@ -249,7 +252,7 @@ def pairs_for_difference(
             key="difference",
         )
     if not 0.0 < power < 1.0:
-        raise ConfigError(f"must be between 0 and 1, got {power:g}", key="power")
+        raise ConfigError(f"must be above 0 and below 1, got {power:g}", key="power")
     z_a, z_b = z_of(confidence), float(ndtri(power))
     root = z_a * math.sqrt(discordant) + z_b * math.sqrt(discordant - difference**2)
     return math.ceil(root**2 / difference**2 - 1e-9)
@@ -275,13 +278,14 @@ class CrossLayer:
 def cross_layer(
     corrupted: int, kernel_faults: int, failed: int, mission_faults: int, confidence: float = 0.95
 ) -> CrossLayer:
-    """Estimate the probability that a mission fails, given an SDC of a kernel.
+    """Estimate the probability that a mission fails, given an SDC in a kernel.
 
     Both campaigns must sample the same population: the same kernel, level and sampling rule.
 
     Args:
         corrupted, kernel_faults: SDCs and injected faults of the isolated kernel (`mavfi kernels`).
-        failed, mission_faults: mission failures beyond the golden ones, and applied faults.
+        failed, mission_faults: missions that fail although their golden flights succeed, and the
+            faults injected in missions.
     """
     corruption = wilson(corrupted, kernel_faults, confidence=confidence)
     failure = wilson(failed, mission_faults, confidence=confidence)
@@ -305,7 +309,7 @@ Sampled = Mapping[Any, int]
 def clustered_share(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> Share:
-    """Return the share of hits with its 95 % interval.
+    """Return the share of hits among clustered runs, with its 95 % interval.
 
     Args:
         clusters: stratum and cluster of each run; None for a run that is its own cluster.
@@ -321,7 +325,7 @@ def clustered_share(
 def design_effect(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled | None = None
 ) -> float:
-    """Return the ratio of a share's variance to that with as many independent runs; at least 1."""
+    """Return the ratio of a share's variance to that for independent runs; at least 1."""
     share = sum(hits) / len(hits) if hits else 0.0
     if not 0.0 < share < 1.0:
         return 1.0
@@ -333,12 +337,13 @@ def design_effect(
 def _spread(
     hits: Sequence[bool], clusters: Sequence[Cluster | None], sampled: Sampled
 ) -> tuple[float, list[tuple[int, float]]]:
-    """Return the variance of the hit count: of lone runs, and per stratum with its cluster count.
+    """Return the variance of the hit count: of all lone runs, and of each stratum.
 
-    The share is a ratio of two estimated totals (Cochran, sections 6.4 and 9A), so the residuals of
-    a cluster's runs from the overall share are summed. The spread of these sums shows how
-    far the share would move with other clusters. It covers the similarity of a cluster's runs, the
-    unequal sizes of clusters, and the error of the estimated weights of strata.
+    The variance of a stratum follows its number of clusters. The share is a ratio of two estimated
+    totals (Cochran, sections 6.4 and 9A), so the residuals from the overall share are summed in
+    each cluster. The spread of these sums shows how far the share would move if other clusters were
+    drawn. It accounts for the similarity of a cluster's runs, the unequal sizes of clusters, and
+    the error of the estimated weights of strata.
     """
     share = sum(hits) / len(hits) if hits else 0.0
     strata: dict[Hashable, dict[Hashable, float]] = {}
@@ -361,12 +366,14 @@ def _spread(
 def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
     """Estimate the total over strata, from members drawn uniformly from each stratum.
 
-    The interval has the correction for a finite population (Cochran, section 5.4). It is that
-    of the logarithm, because window lengths are skewed, and is never below the observed total. If
-    a single member of several was drawn, its error is unknown and there is no upper end.
+    The interval has the correction for a finite population (Cochran, section 5.4). It is symmetric
+    on a logarithmic scale, because window lengths are skewed. Its lower end is never below the
+    observed total. If only one of a stratum's several members was drawn, the error is unknown and
+    the upper end is infinite.
 
     Args:
-        strata: the values of the drawn members, all above 0, and the number of all members.
+        strata: for each stratum, the values of the drawn members, all above 0, and the number of
+            all members.
     """
     total = seen = 0.0
     variances, freedom, drawn = [], [], sum(len(values) for values, _ in strata)
@@ -385,7 +392,7 @@ def estimated_total(strata: Sequence[tuple[Sequence[float], int]]) -> Interval:
 
 
 def _student(variances: Sequence[float], freedom: Sequence[int]) -> float:
-    """Return the 97.5 % quantile of Student's t for a sum of variances with degrees of freedom."""
+    """Return the 97.5 % quantile of Student's t for a sum of variances (Satterthwaite)."""
     from scipy.special import stdtrit
 
     doubt = sum(own**2 / n for own, n in zip(variances, freedom, strict=True))

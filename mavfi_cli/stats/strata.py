@@ -1,9 +1,9 @@
-"""Stratified samples: how many missions each stratum gets, which ones, and weighted rates.
+"""Stratified samples: the number of missions for each stratum, and weighted rates.
 
 A stratum is a part of the population, such as the flips of exponent bits. The weight of a mission
 is the number of uniformly drawn missions that it stands for, so that the weights of a sample add up
 to its size. The estimate of a total is the sum of weights times values (D. G. Horvitz and D. J.
-Thompson, JASA 47, 1952). It is unbiased whatever the numbers of missions in the strata.
+Thompson, JASA 47, 1952). It is unbiased for any numbers of missions in the strata.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from mavfi_cli.stats.shares import (
     z_of,
 )
 
-DEFENCE = 0.25  # share of the missions that is allocated by size alone, which bounds weights by 4
+DEFENCE = 0.25  # share of the missions that is allocated by size alone; bounds the weights by 4
 _UNIT = 1 << 40  # integer that stands for 1 in `rounded`, so that sums are exact
-_LEAST_MARGIN = 1e-6  # narrower intervals have no effective number
+_LEAST_MARGIN = 1e-6  # for narrower intervals no effective number is computed
 
 
 def spread(hits: int, missions: int) -> float:
@@ -40,9 +40,10 @@ def spread(hits: int, missions: int) -> float:
 def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) -> list[int]:
     """Return the number of missions for each stratum, at least 1.
 
-    It is proportional to size times spread (J. Neyman, J. Royal Statistical Society 97, 1934),
-    except for a share DEFENCE that is proportional to size alone, so that a stratum whose spread
-    was underestimated keeps its missions (T. Hesterberg, Technometrics 37, 1995).
+    Each stratum gets one mission. Most of the others are allocated in proportion to size times
+    spread (J. Neyman, J. Royal Statistical Society 97, 1934). A share DEFENCE of them is allocated
+    in proportion to size alone, so that a stratum whose spread was underestimated still gets
+    missions (T. Hesterberg, Technometrics 37, 1995).
 
     Args:
         sizes: shares of the strata in the population; they add up to 1.
@@ -63,15 +64,16 @@ def allocate(sizes: Sequence[float], spreads: Sequence[float], missions: int) ->
 
 
 def rounded(table: Sequence[Sequence[float]], rng: np.random.Generator) -> list[list[int]]:
-    """Round the cells of a table up or down at random, keeping the sums of rows and columns.
+    """Round the cells of a table at random, so that no row or column sum changes by 1 or more.
 
-    The expectation of every cell is its value, and the sum of a row or column is rounded up or down
-    as well (L. H. Cox, J. American Statistical Association 82, 1987). An extra row and column make
-    all sums whole. While some cells are not whole, a cycle of such cells, alternately along rows
-    and columns, is raised and lowered in turn by the same amount until one of them is whole.
+    Each cell is rounded up or down, and its expected value stays the same (L. H. Cox, J. American
+    Statistical Association 82, 1987). An additional row and column make all sums integers. While a
+    cell is not an integer, the function finds a cycle of such cells that alternates between rows
+    and columns. It raises and lowers them in turn by the same amount, so that at least one of them
+    becomes an integer.
 
     Args:
-        table: values of at least 0, with equally long rows.
+        table: rows of equal length, with values of at least 0.
     """
     cells = [[round(value * _UNIT) for value in row] for row in table]
     cells = [[*row, -sum(row) % _UNIT] for row in cells]
@@ -91,7 +93,7 @@ def rounded(table: Sequence[Sequence[float]], rng: np.random.Generator) -> list[
 
 
 def _cycle(cells: Sequence[Sequence[int]], row: int) -> list[tuple[int, int]]:
-    """Return a cycle of cells that are not whole, along rows and columns in turn, two in each."""
+    """Return a cycle of non-integer cells along rows and columns in turn, two cells in each."""
     lines, path = [(0, row)], list[tuple[int, int]]()  # a line is a row (0) or a column (1)
     while True:
         axis, index = lines[-1]
@@ -120,13 +122,13 @@ def weighted_share(
 
     The interval adds the distances to the ends of the strata's Wilson intervals in quadrature
     (MOVER; G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so that a stratum without
-    hits still has a width. A stratum counts as its effective number, `kish`. The stratum's
-    share of the counted missions is estimated too. This adds the square of (share of hits in the
-    stratum - share of hits) times the variance of that share.
+    hits still has a width. The sample size of a stratum is its effective number, `kish`. The
+    fraction of a stratum that is counted is also an estimate. Its error, times the difference
+    between the stratum's share of hits and the overall share, is added in quadrature too.
 
     Args:
-        hits, counted, weights, strata: (n,) one value for each flown mission; the strata are None
-            in a uniform sample, which gives Wilson's interval.
+        hits, counted, weights, strata: (n,) one value for each flown mission. In a uniform sample
+            the strata are None, and the interval is Wilson's.
 
     Returns:
         The share, with the unweighted numbers of missions and hits, and the effective number.
@@ -165,5 +167,5 @@ def weighted_share(
 
 
 def kish(weights: Sequence[float]) -> float:
-    """Effective number of weighted values, (sum w)^2 / sum w^2 (L. Kish, Survey Sampling, 1965)."""
+    """Return the effective sample size, (sum w)^2 / sum w^2 (L. Kish, Survey Sampling, 1965)."""
     return math.fsum(weights) ** 2 / math.fsum(weight**2 for weight in weights)

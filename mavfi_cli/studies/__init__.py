@@ -1,4 +1,4 @@
-"""Studies: the missions that answer a question, and their analysis."""
+"""Studies: each flies the missions that answer one question, and analyses them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def fly(
     options: Options,
     spectator: Spectator,
 ) -> pa.Table:
-    """Fly the missions that the folder lacks; return the table of all of them.
+    """Fly those `missions` that the folder does not have yet; return the table of all `missions`.
 
-    Missions that an interrupted larger plan has left in the folder's list are not flown.
+    Other missions on the folder's list, left by a larger plan that was interrupted, are not flown.
 
     Raises:
         CampaignStopped, RecordError, Interrupted: as `run_campaign`.

@@ -1,7 +1,7 @@
 """`mavfi compare`: the same missions on several platforms, as in the preset fig16.
 
-The folder holds a campaign. Its subfolder `timeline` holds a campaign of one golden flight per
-platform, with complete records.
+The folder holds a campaign. Its subfolder `timeline` holds another one, with the complete records
+of one golden flight per platform.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ SCHEMA = 2  # of compare.json
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparePlan:
-    """Plan of a comparison. The defaults are the preset fig16: the paper's Fig. 16.
+    """Plan of a comparison. The defaults equal the preset fig16 in many worlds (Fig. 16).
 
     Attributes:
-        platforms: names or files; the others are compared with the first.
+        platforms: names or files; the first one is the reference for the others.
         inject: stages, states or groups to corrupt, one per flight; if empty, only
             golden flights are flown.
         detectors: names; `none` is always flown, named or not.
@@ -83,7 +83,7 @@ class ComparePlan:
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The settings of each platform: golden, `none`, and the detectors."""
+        """The settings of each platform: golden and, with faults, `none` and the detectors."""
         protectors = tuple(name for name in self.detectors if name != NONE)
         return (GOLDEN, NONE, *protectors) if self.inject else (GOLDEN,)
 
@@ -120,7 +120,7 @@ class ComparePlan:
 def compare(
     plan: ComparePlan, folder: Path, options: Options, spectator: Spectator
 ) -> PlatformComparison:
-    """Fly the missing missions of the folder, and compare the platforms.
+    """Fly the missions that the folder does not have yet, and compare the platforms.
 
     Raises:
         ConfigError: the folder holds another comparison.

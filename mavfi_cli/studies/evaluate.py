@@ -1,8 +1,9 @@
 """`mavfi detect evaluate`: evaluate detectors on missions outside the training data.
 
-The folder contains the campaign `bare` without detectors, and in `protected` one campaign for each
-model of a detector. `bare` keeps its traces, because detectors are replayed on them. `protected`
-keeps only records. Its missions depend on which faults do harm without a detector.
+The folder contains the campaign `bare`, which is flown without detectors, and the subfolder
+`protected` with one campaign for each detector model. `bare` keeps its traces, which are replayed
+through the detectors. `protected` keeps only records. Its missions depend on which faults do harm
+without a detector.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ SCHEMA = 2
 BARE, PROTECTED = "bare", "protected"
 WORLDS = ("sparse", "dense", "factory", "farm")
 DETECTORS = (NONE, "range", "l2", "gad", "aad")
-INTEGER = "integer"  # all bits of states that have no sign, exponent and mantissa
+INTEGER = "integer"  # all bits of states that have no sign, exponent or mantissa
 FIELDS = (Field.SIGN.value, Field.EXPONENT.value, Field.MANTISSA.value, INTEGER)
 _NODES = {
     "octomap": Stage.PERCEPTION,
@@ -60,7 +61,7 @@ _NODES = {
     "control": Stage.CONTROL,
 }
 SOURCE, INSTRUCTION = "source", "instruction"
-_DRAWS = 1000  # number of fault seeds to try until one draws a state of the required type
+_DRAWS = 1000  # maximum number of fault seeds tried to draw a state of the required type
 
 
 # Fields of a plan that its description copies unchanged.
@@ -80,10 +81,10 @@ class EvaluationPlan:
 
     Attributes:
         detectors: names; `none` is always flown, named or not.
-        flights: missions per world that are flown with a fault at each site, one per flight.
-        harmless_flights: number of these missions, starting with the first, whose faults are all
-            flown with the detectors; for the others, only harmful faults are.
-        golden_flights: error-free missions per world; the first ones also get faults.
+        flights: missions per world that are flown with faults: once for each site, with one fault.
+        harmless_flights: number of these missions, starting with the first, in which all faults are
+            repeated with the detectors; in the others, only harmful faults are.
+        golden_flights: error-free missions per world; the first `flights` of them also get faults.
         first_seed: first seed of the missions; training seeds start at 10 000.
         models: folder of model files `NAME.json`; None means those shipped for the stack of `base`.
         level: source or instruction.
@@ -117,7 +118,7 @@ class EvaluationPlan:
 
     @property
     def protectors(self) -> tuple[str, ...]:
-        """The detectors without `none`."""
+        """The detectors other than `none`."""
         return tuple(name for name in self.detectors if name != NONE)
 
     @property
@@ -138,9 +139,9 @@ class EvaluationPlan:
         return DetectorConfig.with_model(detector, self.models, self.protect)
 
     def require_held_out(self) -> None:
-        """Reject detectors that cannot be loaded, and missions on which a model was trained.
+        """Reject detectors that cannot be loaded, and seeds on which a model was trained.
 
-        Seeds are compared across worlds, because two worlds may use the same random numbers.
+        A seed is rejected whatever its world, because two worlds may use the same random numbers.
 
         Raises:
             ModelError: a model cannot be used, or was trained on one of these missions.
@@ -176,7 +177,7 @@ class EvaluationPlan:
         )
 
     def places(self) -> list[_Site]:
-        """Return where faults strike: nodes at instruction level, else a stage and a bit field."""
+        """List the sites of faults: nodes at instruction level, else stages with a bit field."""
         if self.level == INSTRUCTION:
             return [_Site(stage.value, node, Field.ANY.value) for node, stage in _NODES.items()]
         return [
@@ -188,7 +189,7 @@ class EvaluationPlan:
     def missions(
         self, detector: str = NONE, harmful: Collection[tuple[Any, ...]] = ()
     ) -> list[PlannedMission]:
-        """List golden flights, then flights with a fault, with or without a detector.
+        """List the golden missions, then those with a fault, all with the given detector.
 
         Args:
             harmful: world, seed, stage, target and field of the faults that do harm without a
@@ -237,12 +238,12 @@ class EvaluationPlan:
 def evaluate(
     plan: EvaluationPlan, folder: Path, options: Options, spectator: Spectator
 ) -> tuple[Evaluation, tuple[pa.Table, pa.Table]]:
-    """Fly the missing missions of the folder, and evaluate the detectors.
+    """Fly the missions that the folder does not have yet, and evaluate the detectors.
 
     A larger plan of the same kind extends a smaller one.
 
     Returns:
-        The evaluation, and its pairs: those without faults, and those with one.
+        The evaluation, and its two tables of pairs: without faults, and with one.
 
     Raises:
         UnknownName, VehicleProcessError: a world or platform does not exist.
@@ -254,7 +255,7 @@ def evaluate(
     for world in plan.worlds:
         check_names(replace(plan.base, world=world, seed=plan.first_seed))
     spectator.on_note("flights without detectors")
-    profiles = folder / BARE / PROFILES  # flights with detectors share the golden flights
+    profiles = folder / BARE / PROFILES  # of the golden flights, which all detectors share
     options = replace(options, profiles=profiles)
     tables = [fly(plan.missions(), folder / BARE, Keep.ALL, options, spectator)]
     _, faults = pairs_of([flown(tables[0])], [NONE], plan.complete)
@@ -279,7 +280,7 @@ def evaluate(
 def evaluation_of(
     plan: EvaluationPlan, pairs: tuple[pa.Table, pa.Table], errors: Sequence[str], scored: Scored
 ) -> Evaluation:
-    """Return the results of these pairs.
+    """Compute the results of these pairs.
 
     Args:
         scored: see `analysis.detectors.results`.

@@ -1,7 +1,7 @@
-"""`mavfi vpm --fly`: fly every row of the model, one plan per vehicle and scheme, and compare.
+"""`mavfi vpm --fly`: fly every vehicle of the model with every scheme, and compare.
 
-The simulated vehicle and platform are TOML files that a mission names by path. Their names contain
-a digest of their contents, so that equal names mean equal flights.
+The simulated vehicle and platform are TOML files, which a mission refers to by path. The name of
+each file contains a digest of its contents, so equal names mean equal flights.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class FlightPlan:
     """Plan of the flights of a vehicle with a scheme.
 
     Attributes:
-        mission: without world and seed.
-        files: files of vehicle and platform, with their contents.
+        mission: the mission; `RedundancyPlan.missions_of` sets its world and seed.
+        files: contents of the files of vehicle and platform, by path.
     """
 
     mission: MissionConfig
@@ -164,7 +164,7 @@ def _platform(platform: PlatformProfile, factor: float) -> dict[str, Any]:
 
 
 def _within(key: str, wanted: float, what: str, unit: str) -> tuple[float, str]:
-    """Return the nearest value that a mission allows, and a message if it differs."""
+    """Return the nearest value that a mission allows, and a phrase if that is not `wanted`."""
     low, high = LIMITS[key]
     taken = min(max(wanted, low), high)
     change = f"{what} {taken:g} {unit} instead of {wanted:.4g} {unit}"
@@ -185,13 +185,13 @@ class RedundancyPlan:
         missions: number per scheme and world.
         folder: folder of flights and pictures; recorded missions are not flown again.
         models: folder of the detectors' models; None means the shipped ones.
-        train: number of flights in each training world to which each vehicle's detectors are
-            fitted; 0 fits none.
+        train: number of error-free flights per training world for fitting the detectors of each
+            vehicle; 0 fits none.
         stack: stack of all flights.
 
     Raises:
-        ConfigError, UnknownName: no world is named, one is named twice, or the missions have seeds
-            of training flights, which are reserved in all worlds.
+        ConfigError, UnknownName: no world is named, one is named twice, or the missions use seeds
+            of the training flights, which are reserved in all worlds.
     """
 
     vehicles: Sequence[ModelVehicle]
@@ -227,7 +227,7 @@ class RedundancyPlan:
         return "the shipped ones, fitted to flights of the Solo at 3 m/s"
 
     def missions_of(self, plans: Mapping[Key, FlightPlan]) -> list[PlannedMission]:
-        """List the missions ordered by seed, so that an interrupted campaign has complete pairs."""
+        """List the missions, by seed first, so that an interrupted campaign has complete pairs."""
         seeds = range(self.first_seed, self.first_seed + self.missions)
         return [
             PlannedMission(
@@ -248,12 +248,12 @@ def _plans_of(
     options: Options,
     spectator: Spectator,
 ) -> Iterator[tuple[Key, FlightPlan | str]]:
-    """Yield each scheme's plan, or why there is none; the first scheme is one bare board."""
+    """Yield each scheme's plan, or the reason why it cannot fly; BASE must be the first scheme."""
     platform = plan.choices.platform or load_platform(PLATFORM)
     chain_s = CHAINS[plan.choices.chain][0]([k.latency_s for k in platform.kernels.values()])
     inputs, models = plan.choices.inputs(vehicle), plan.models
     folder = plan.folder.absolute() / FLOWN
-    refused: dict[int, str | None] = {}  # number of boards -> the simulator's answer
+    refused: dict[int, str | None] = {}  # number of boards -> reason why they cannot fly
     for scheme in schemes:
         bare, key = scheme.name == BASE, (vehicle.name, scheme.name)
         try:
@@ -274,9 +274,9 @@ def _plans_of(
 def fitted(
     plan: RedundancyPlan, vehicle: str, flown: FlightPlan, options: Options, spectator: Spectator
 ) -> Path:
-    """Return the folder of detectors fitted to error-free flights of a plan.
+    """Fit detectors to error-free flights of a plan; return the folder of their models.
 
-    Existing models are reused, because the folder's name contains a digest of the mission and of
+    Models that already exist are reused. The folder's name contains a digest of the mission and of
     the number of flights.
 
     Raises:
@@ -298,13 +298,13 @@ def fly_and_report(
     options: Options,
     spectator: Spectator,
 ) -> tuple[ModelReport, FlightsReport]:
-    """Fly all rows of the model; return the report of the model and that of the flights.
+    """Fly all vehicles with all schemes; return the reports of the model and of the flights.
 
     The flights, and the model compared with them, use the given overheads, or else the paper's. The
     report of the model uses the given overheads, or else those measured in the flights.
 
     Args:
-        overheads: per cent and source, by the detector's name.
+        overheads: overhead in per cent and its source, by the detector's name.
 
     Raises:
         MavfiError: as `run_campaign`; or a world or vehicle does not exist.

@@ -1,6 +1,6 @@
 """The spread of repeated fault-free flights of a user's companion: outcome, time and path.
 
-Such a flight does not repeat, so every effect of a fault must be compared with this spread.
+Such a flight is not repeatable, so every effect of a fault must be compared with this spread.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mavfi_cli.stats.shares import wilson
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """The spread of some flights.
+    """The spread of repeated flights.
 
     Attributes:
         outcomes: Number of flights by outcome.
-        succeeded: Share of success, and its 95 % interval (Wilson).
+        succeeded: Success rate, and the ends of its 95 % interval (Wilson).
         flight_time_s: Smallest, median and largest time of a successful flight, s.
         apart_m: Median and maximum, over the later successful flights, of the largest distance
             from the path of the first one, m.
@@ -39,7 +39,7 @@ class Spread:
 
     @classmethod
     def of(cls, runs: Sequence[Run]) -> Spread:
-        """Compare flights. Numbers without flights are NaN."""
+        """Compare flights. A number is NaN if no flight provides it."""
         good = [run for run in runs if run.record.succeeded]
         share = wilson(len(good), len(runs))
         qualities = [run.record.quality_of_flight for run in good]
@@ -80,7 +80,7 @@ def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -
     """Fly the golden mission several times, one after the other, and compare the flights.
 
     Raises:
-        Interrupted: The user interrupted it.
+        Interrupted: The user interrupted the flights.
         MavfiError: As for `fly_mission`.
     """
     runs = []
@@ -91,7 +91,7 @@ def fly_spread(config: MissionConfig, count: int, out: Path, watcher: Watcher) -
 
 
 def _at(values: Sequence[float], share: float) -> float:
-    """Return a quantile of sorted values; between two values, the upper one."""
+    """Return a quantile of sorted values, the upper of two neighbours; NaN without values."""
     return values[min(int(share * len(values)), len(values) - 1)] if values else math.nan
 
 

@@ -39,11 +39,11 @@ class TrainingPlan:
 
     Attributes:
         flights: number per world.
-        first_seed: seed of the first flight; each further flight of any world adds 1.
+        first_seed: seed of the first flight; the seeds are consecutive over all worlds.
         seed: seed of the split and of the initial weights.
-        n_sigma: threshold of the Gaussian model; None means the default.
+        n_sigma: threshold of the Gaussian model; None lets `fit` choose it.
         flown: folder of run folders to fit to; None flies the missions.
-        logs: .tlog files of fault-free flights of a user's companion to fit to instead.
+        logs: .tlog files of a user's companion, from fault-free flights, to fit to instead.
     """
 
     worlds: tuple[str, ...] = TRAINING_WORLDS
@@ -77,11 +77,12 @@ def train(
 
     Returns:
         The data set; model and file of each detector; and the number of flights left out because
-        they did not reach the goal.
+        they were not error-free.
 
     Raises:
-        ModelError: there are too few flights, a kind is unknown, or torch is missing, raised before
-            anything is flown; or too many flights fail, or none is error-free.
+        UnknownName: a kind is unknown; raised before anything is flown.
+        ModelError: there are too few flights, or torch is missing; raised before anything is flown.
+            Or too few of the flights are error-free, or a log contains no setpoint.
         ConfigError: n sigma is out of range, the folder has the flights of another plan, or the
             binary of a real autopilot is not named.
         MavfiError: no mission can be flown in a world.
@@ -91,7 +92,7 @@ def train(
     if plan.logs:
         flights = [samples_of_tlog(path, path.name, place) for place, path in enumerate(plan.logs)]
         if empty := [flight.world for flight in flights if not len(flight.deltas)]:
-            raise ModelError(f"{empty[0]}: contains no setpoint of a companion")
+            raise ModelError(f"{empty[0]}: contains no setpoints from a companion")
         failed, autopilots = 0, {OWN_AUTOPILOT}
         check(plan.kinds, len(flights), plan.n_sigma)
     elif plan.flown is None:
@@ -123,7 +124,7 @@ def train(
 
 
 def _mark_of(plan: TrainingPlan) -> StackMark:
-    """Return the identity of the flown software: a stack, a user's companion, or unknown logs."""
+    """Return the identity of the flown software: its stack, its companion, or a mark for logs."""
     if plan.base.companion is not None:
         return CompanionConfig.load(plan.base.companion).mark
     if plan.logs:

@@ -276,7 +276,7 @@ class PlannerContract:
         goal: FloatArray = GOAL,
         params: PlanningParams = PARAMS,
     ) -> PlanningProblem:
-        """Return the problem of planning from start to goal, (3,), ENU, m, in a map."""
+        """Return the problem of planning a path in a map from start to goal, both (3,), ENU, m."""
         return PlanningProblem.pose(snapshot, start, goal, BOUNDS, params)
 
     @pytest.fixture
@@ -322,7 +322,7 @@ class PlannerContract:
         assert not result.found
         assert len(result.path_enu_m) == 0
         assert result.reason
-        # It can only get as near to the goal as the inside of the box.
+        # The path can approach the goal only as far as the walls of the box allow.
         assert 17.0 < result.nearest_m <= 20.0
 
     def test_free_sight_is_flown_straight(self, name: str) -> None:
@@ -427,7 +427,7 @@ class TransportContract:
 
 
 class StreamTransportContract(TransportContract):
-    """The suite for transports that report a closed end to the other end, such as TCP."""
+    """The suite for transports, such as TCP, in which an end learns that the other has closed."""
 
     def test_a_closed_stream_is_a_lost_link_at_the_other_end(self, pair: Pair) -> None:
         near, far = pair

@@ -1,1 +1,1 @@
-"""The visual performance model: the cost of compute mass and power in speed and flight time."""
+"""The visual performance model: how much speed and flight time a computer's mass and power cost."""

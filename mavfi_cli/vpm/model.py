@@ -2,7 +2,8 @@
 
 A vehicle that senses up to `range_m` and takes `response_s` from sensing to acting must fly slowly
 enough to stop within that range. A board is the computer that it carries. A protection scheme costs
-extra boards or compute time. Vehicles and boards are one TOML file each. All units are SI.
+extra boards or compute time. Each vehicle and each board has its own TOML file. The names of
+numbers end in their units.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ BOARDS = Shipped("board", Path(__file__).parent / "boards")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Calibration:
-    """One unpublished number, set so that the model gives one published ratio."""
+    """An unpublished number, chosen so that the model reproduces one published ratio."""
 
     parameter: str  # one of CALIBRATED
     board: str  # the shipped board of the redundant computers
@@ -45,7 +46,7 @@ class _Calibration:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelVehicle:
-    """A quadrotor of the model; a number is None until it has been calibrated."""
+    """A quadrotor in the model; a number is None if a calibration or a platform gives it."""
 
     name: str  # name of the vehicle
     mass_kg: float  # frame, rotors and battery, without the boards
@@ -57,7 +58,7 @@ class ModelVehicle:
     battery_wh: float  # energy of the full battery
     tilt_deg: float = 0.0  # tilt of the rotors while braking
     board: str = ""  # a shipped board, if no platform is named
-    flies_as: str = ""  # simulated vehicle that flies in its place; empty: one of its size
+    flies_as: str = ""  # simulated vehicle that flies in its place; empty: one of similar mass
     description: str = ""  # for readers of the file
     sources: dict[str, str] = field(default_factory=dict)  # key -> source of its number
     calibration: _Calibration | None = None  # the number that a published ratio determines
@@ -128,12 +129,12 @@ class Board:
 
     @classmethod
     def load(cls, name_or_path: str) -> Board:
-        """Load a shipped board by name or a user's by path. Errors as in `ModelVehicle.load`."""
+        """Load a shipped board by name or a user's by path; raises as `ModelVehicle.load`."""
         return load_toml(BOARDS.path(name_or_path), cls)
 
     @classmethod
     def of_platform(cls, platform: PlatformProfile) -> Board:
-        """Return the board of a platform; a platform on the ground has neither mass nor power."""
+        """Return a platform's board; mass and power are 0 if it stays on the ground."""
         name = f"platform {platform.name}"
         sources = {key: f"{name}: {platform.sources.get(key, 'not given')}" for key in HARDWARE}
         if not platform.carried:
@@ -146,12 +147,12 @@ class Board:
         )
 
 
-REFERENCE = "aad"  # the paper's Fig. 15 compares redundancy with it
+REFERENCE = "aad"  # scheme with which the paper's Fig. 15 compares redundancy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scheme:
-    """One way to protect the computer."""
+    """A way to protect the computer from faults; `none` protects nothing."""
 
     name: str
     title: str
@@ -181,8 +182,8 @@ def schemes_with(overheads: Mapping[str, tuple[float, str]]) -> dict[str, Scheme
             of that number.
 
     Raises:
-        UnknownName: no scheme of this name detects and recovers.
-        ConfigError: an overhead is negative, not finite, or probably in the wrong unit.
+        UnknownName: a name is not that of a scheme with detection and recovery.
+        ConfigError: an overhead is negative, not finite, or so large that its unit must be wrong.
     """
     schemes = dict(SCHEMES)
     for name, (percent, source) in overheads.items():
@@ -231,14 +232,14 @@ def safe_velocity_mps(accel_mps2: float, response_s: Number, range_m: float) -> 
 
 
 def roof_mps(accel_mps2: float, range_m: float) -> float:
-    """Return the velocity that body dynamics allow with an instant response, m/s: sqrt(2 d a)."""
+    """Return the velocity limit of the body dynamics at zero response time, m/s: sqrt(2 d a)."""
     return math.sqrt(2.0 * range_m * accel_mps2)
 
 
 def knee_hz(accel_mps2: float, range_m: float, share: float = KNEE_SHARE) -> float:
     """Return the action throughput, Hz, at which the safe velocity is `share` of the roof.
 
-    Equation 3 solved for the throughput: f = sqrt(a / (2 d)) 2 share / (1 - share^2).
+    It is equation 3 solved for the throughput: f = sqrt(a / (2 d)) 2 share / (1 - share^2).
     """
     return math.sqrt(accel_mps2 / (2.0 * range_m)) * 2.0 * share / (1.0 - share**2)
 
@@ -246,8 +247,8 @@ def knee_hz(accel_mps2: float, range_m: float, share: float = KNEE_SHARE) -> flo
 def hover_power_w(known_w: float, known_kg: float, mass_kg: float) -> float:
     """Return the rotor power in hover at another mass, W, by momentum theory.
 
-    P ~ (m g)^1.5 / sqrt(2 rho A). Disc and figure of merit stay the same, so one known pair of
-    power and mass is enough.
+    P ~ (m g)^1.5 / sqrt(2 rho A). The disc area and the figure of merit do not change, so one known
+    pair of power and mass is enough.
     """
     return float(known_w * (mass_kg / known_kg) ** 1.5)
 
@@ -257,7 +258,7 @@ _J_PER_WH = 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Performance:
-    """Performance with a scheme, at hover power on a straight path."""
+    """Performance of a vehicle with a scheme, on a straight path at hover power."""
 
     thrust_to_weight: float
     acceleration_mps2: float
@@ -287,7 +288,7 @@ class ModelInputs:
     distance_m: float
 
     def carried_kg(self, copies: int) -> float:
-        """Return the mass of the boards and their heat sinks, kg."""
+        """Return the mass of this many boards and their heat sinks, kg."""
         return copies * self.board.total_kg
 
     def mass_kg(self, copies: int) -> float:
@@ -303,7 +304,7 @@ class ModelInputs:
         return max(1.0 / self.vehicle.sensor_hz, self.compute_s * (1.0 + overhead))
 
     def velocity_mps(self, scheme: Scheme) -> float | None:
-        """Return the safe velocity with a scheme, m/s; None if the vehicle cannot lift it."""
+        """Return the safe velocity with a scheme, m/s; None if it makes the vehicle too heavy."""
         accel = self.acceleration_mps2(scheme.copies)
         if accel <= 0.0:
             return None

@@ -55,17 +55,18 @@ class Choices:
     distance_m: float = 50.0
 
     def inputs(self, vehicle: ModelVehicle) -> ModelInputs:
-        """Return the model's inputs for a vehicle with its free number calibrated.
+        """Calibrate the vehicle's free number, if it has one, and return the model's inputs.
 
         Raises:
-            ConfigError: neither the vehicle nor the choices give a needed value.
+            ConfigError: neither the vehicle nor the choices give a required value, or a value
+                cannot be used.
         """
         return _inputs(vehicle, self)[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Parameter:
-    """A number that enters the model."""
+    """A number that the model uses, with its source."""
 
     parameter: str
     value: float
@@ -86,7 +87,7 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SchemeResult:
-    """A vehicle with a scheme; if it is too heavy, `problem` gives the numbers."""
+    """The results for a vehicle with a scheme; if it is too heavy, `problem` explains why."""
 
     scheme: str
     title: str
@@ -130,7 +131,8 @@ class CalibratedNumber:
     """The free number that gives a vehicle its published ratio of flight times.
 
     Attributes:
-        tmr_ratio, predicted_dmr_ratio: ratios to the scheme REFERENCE; the second is not fitted.
+        tmr_ratio, predicted_dmr_ratio: flight time with TMR and with DMR, each over that with the
+            scheme REFERENCE; only the first ratio is fitted.
     """
 
     board: str
@@ -185,7 +187,8 @@ def report(
 
     Raises:
         CannotLift: a vehicle cannot lift even one board.
-        ConfigError: neither the vehicle nor the choices give a needed value.
+        ConfigError: neither the vehicle nor the choices give a required value, or a value cannot be
+            used.
     """
     return ModelReport(
         distance_m=choices.distance_m,
@@ -233,7 +236,8 @@ def _inputs(
 ) -> tuple[ModelInputs, tuple[_Parameter, ...], CalibratedNumber | None]:
     """Return the model's inputs, a table of them with sources, and the calibration if there is one.
 
-    The response time is the first of: the command line's, the platform's, the vehicle's own.
+    The response time comes from the command line, otherwise from the platform, otherwise from the
+    vehicle.
     """
     full, sources, free, calibration = vehicle, dict(vehicle.sources), "", None
     if vehicle.calibration is not None:
@@ -251,13 +255,14 @@ def _inputs(
     elif platform is not None:
         if platform.measured_factor is not None:
             raise ConfigError(
-                f"{platform.name} has latencies only in flight: mavfi fly --realtime",
+                f"{platform.name} has no fixed latencies; it measures them in flight "
+                "(mavfi fly --realtime)",
                 key="platform",
             )
         combined, how = CHAINS[choices.chain]
         compute_s = combined([kernel.latency_s for kernel in platform.kernels.values()])
         if compute_s < SMALLEST:
-            raise ConfigError(f"no kernel of platform {platform.name!r} takes any time")
+            raise ConfigError(f"the response time of platform {platform.name!r} is below 1 us")
         given = f"platform {platform.name}: {how} of {', '.join(platform.kernels)}"
     if given:
         sources["response_s"], free = given, "" if free == "response_s" else free
@@ -296,7 +301,7 @@ def _notes(
     inputs: ModelInputs,
     calibration: CalibratedNumber | None,
 ) -> list[str]:
-    """List the values that did not change with the computer, although a user may expect them to."""
+    """Describe values that another computer did not change, although a user may expect it to."""
     notes, board = [], inputs.board
     own_time = choices.platform is None and choices.response_s is None
     calibrated_time = calibration is not None and calibration.parameter == "response_s"
@@ -457,11 +462,11 @@ def _time_ratio(inputs: ModelInputs, schemes: Mapping[str, Scheme], scheme: str)
 # Calibration: the one free number of a vehicle from one published ratio of flight times --------
 
 _SPAN = 1.0e4  # ratio of the largest to the smallest tried value
-_STEPS = 200  # halvings of the interval; far below a float's resolution
+_STEPS = 200  # halvings of the interval; more than a float can resolve
 
 
 def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> CalibratedNumber:
-    """Find the vehicle's free number that gives its published ratio.
+    """Find the value of the vehicle's free number that gives its published ratio.
 
     The ratio falls as the free number grows, so bisection finds it.
 
@@ -491,8 +496,8 @@ def _calibrated(vehicle: ModelVehicle, board: Board | None = None) -> Calibrated
     least, most = time_ratio(value), time_ratio(low)
     if not least <= wanted <= most:
         raise ConfigError(
-            f"no {parameter} gives {vehicle.name!r} a ratio of {wanted:g}; it can be {least:.3f} "
-            f"to {most:.3f}",
+            f"no {parameter} gives {vehicle.name!r} a ratio of {wanted:g}; possible ratios are "
+            f"{least:.3f} to {most:.3f}",
             key="calibration.tmr_time_ratio",
         )
     for _ in range(_STEPS):

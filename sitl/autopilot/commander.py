@@ -1,4 +1,4 @@
-"""Modes, arming, failsafe and disarming, as in PX4's commander, and the state of the flight.
+"""Manages modes, arming and failsafe as PX4's commander does, and holds the flight's state.
 
 Texts, results and delays are those observed in messages of PX4 v1.17.
 """
@@ -22,7 +22,7 @@ from sitl.vehicle.truth import Truth
 GPS_FIX_US = 2_500_000  # first fix and home position after boot
 POSITION_US = 3_060_000  # global position fused
 READY_US = 4_000_000  # pre-arm checks pass
-_CONTROL_BACK_US = 1_000_000  # time a lost setpoint source must be back to end the failsafe
+_CONTROL_BACK_US = 1_000_000  # how long a lost input must be back before the failsafe ends
 _STILL_MPS = 0.5
 
 _STABILIZE: int = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -145,7 +145,7 @@ class Commander:
 
     @property
     def can_arm(self) -> bool:
-        """PREARM_CHECK health bit."""
+        """True if the pre-arm checks pass; the PREARM_CHECK bit of SYS_STATUS."""
         return (
             self.stamp_us >= READY_US
             and not self.terminated
@@ -370,6 +370,6 @@ class Snapshot:
 
     @property
     def thrust(self) -> float:
-        """Mean motor command; added one by one, as `sum` rounds differently since Python 3.12."""
+        """Mean motor command, 0..1; added one by one, as Python 3.12's `sum` rounds differently."""
         commands = self.truth.motor_commands.tolist()
         return float(functools.reduce(operator.add, commands)) / len(commands)

@@ -1,4 +1,4 @@
-"""Guidance of the flight modes: computes a setpoint from the state of the flight.
+"""Guides the vehicle in each flight mode: computes a setpoint from the state of the flight.
 
 Speeds and heights are PX4's parameters. The sequences (brake, then hold; climb, then cross, then
 descend) are those of PX4's multicopter modes.
@@ -44,7 +44,8 @@ def climbs(out: Setpoint, truth: Truth) -> bool:
 def _approach(delta: Vector, *, speed_mps: float, acceleration_mps2: float) -> Vector:
     """Return a velocity (n,) towards a point at offset `delta` (n,), slow enough to stop there.
 
-    Its norm is the least of limit, position loop and sqrt(2 a d) with half the acceleration as a.
+    Its norm is the least of `speed_mps`, the position gain times the distance d, and sqrt(2 a d),
+    from which the vehicle stops within d at a = `acceleration_mps2` / 2.
     """
     distance = norm(delta)
     if distance < 1e-6:
@@ -83,7 +84,7 @@ class _Anchor:
 
 
 def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guidance:
-    """AUTO.LOITER: flies straight to a distant position, if given, and stays there."""
+    """Return the guidance of AUTO.LOITER: fly straight to the target, if given, and stay there."""
     anchor = _Anchor(_ALL_AXES, target_ned_m)
 
     def fly(now: Snapshot, out: Setpoint) -> None:
@@ -99,9 +100,10 @@ def _hold(target_ned_m: Vector | None = None, yaw_rad: float = math.nan) -> Guid
 
 
 def _take_off(target_down_m: float) -> Guidance:
-    """AUTO.TAKEOFF: climbs straight to a height; its speed ramps up over MPC_TKO_RAMP_T.
+    """Return the guidance of AUTO.TAKEOFF: climb straight to a height.
 
-    LOITER follows at that height, or 0.5 m below the height reached if that is higher.
+    The speed ramps up over MPC_TKO_RAMP_T. LOITER follows, at the target height or 0.5 m below the
+    height reached, whichever is higher.
     """
     anchor, climbing_s = _Anchor(_HORIZONTAL), 0.0
 
@@ -126,7 +128,7 @@ def _take_off(target_down_m: float) -> Guidance:
 
 
 def _land(over: Vector | None = None) -> Guidance:
-    """AUTO.LAND: descends at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, slower near the ground."""
+    """Return the guidance of AUTO.LAND: descend, more slowly below MPC_LAND_ALT1."""
     anchor = _Anchor(_HORIZONTAL, over)
 
     def fly(now: Snapshot, out: Setpoint) -> None:
@@ -142,7 +144,7 @@ def _land(over: Vector | None = None) -> Guidance:
 
 
 def _return() -> Guidance:
-    """AUTO.RTL: climbs, crosses, descends and lands at home."""
+    """Return the guidance of AUTO.RTL: climb, fly home, descend and land there."""
     down_m: float | None = None
     anchor = _Anchor(_HORIZONTAL)
     landing: Guidance | None = None
@@ -189,7 +191,7 @@ def _return_height_m(now: Snapshot) -> float:
 
 
 def _follow_companion(now: Snapshot, out: Setpoint) -> None:
-    """OFFBOARD: the newest accepted setpoint, with zero velocity along an axis without a value."""
+    """Guide OFFBOARD: follow the newest setpoint; stop along an axis without target."""
     values = now.offboard.tolist()
     for axis in range(3):
         if math.isnan(values[axis]) and math.isnan(values[3 + axis]):
@@ -199,7 +201,7 @@ def _follow_companion(now: Snapshot, out: Setpoint) -> None:
 
 
 def _follow_sticks(now: Snapshot, out: Setpoint) -> None:
-    """POSCTL: sticks -1000..1000 give velocity in the heading frame; throttle 500 keeps height."""
+    """Guide POSCTL: sticks of -1000..1000 give the velocity; a throttle of 500 keeps the height."""
     x, y, z, r = now.sticks
     value = now.parameters.effective
     forward, right = (_stick(s) * value("MPC_VEL_MANUAL") for s in (x, y))
@@ -232,7 +234,7 @@ def _go_vertical(now: Snapshot, out: Setpoint, delta_m: float) -> None:
 
 
 def begin(mode: FlightMode, now: Snapshot) -> Guidance:
-    """Return the guidance of a mode at its entry. A LOITER consumes the position to hold."""
+    """Return the guidance of a mode that is being entered. LOITER takes and clears `now.hold`."""
     if mode is FlightMode.OFFBOARD:
         return _follow_companion
     if mode is FlightMode.POSCTL:

@@ -1,4 +1,4 @@
-"""The autopilot's message handlers: commands, setpoints, parameters and small services."""
+"""Handles the autopilot's messages: commands, setpoints, parameters and small services."""
 
 from __future__ import annotations
 
@@ -366,7 +366,7 @@ def _param_request_read(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _param_set(autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Answer on this link, and broadcast a change to all."""
+    """Store a parameter. Answer on this link, and broadcast a changed value to all links."""
     if message.param_id == HASH_NAME:
         link.parameters_left.clear()  # the client's cache is valid and needs no list
         return
@@ -406,7 +406,7 @@ def _timesync(autopilot: Autopilot, message: Any, link: Link) -> None:
 
 
 def _ping(_autopilot: Autopilot, message: Any, link: Link) -> None:
-    """Echo a broadcast ping back to its sender's ids."""
+    """Answer a broadcast ping with an echo that is addressed to its sender."""
     if message.target_system == 0 and message.target_component == 0:
         link.send(dialect.MAVLink_ping_message(message.time_usec, message.seq, *_sender(message)))
 

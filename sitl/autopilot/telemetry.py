@@ -1,7 +1,7 @@
-"""Telemetry: the builders of its messages, and the streams of each client.
+"""Builds telemetry messages, and schedules the streams of each client.
 
-Most messages can be streamed. Those in DESCRIPTIONS, which describe the autopilot, are sent only on
-request.
+Most messages can be streamed. The messages in DESCRIPTIONS, which describe the autopilot, are sent
+only on request.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _heartbeat(s: Snapshot) -> Any:
 
 
 def _sys_status(s: Snapshot) -> Any:
-    """PREARM_CHECK appears in the health bits only, as in PX4."""
+    """Return SYS_STATUS. As in PX4, PREARM_CHECK appears only in the health bits."""
     gps = _GPS if s.commander.has_gps_fix else 0
     health = _HEALTH & ~_GPS | gps
     if s.commander.can_arm:
@@ -94,7 +94,7 @@ def _sys_status(s: Snapshot) -> Any:
 
 
 def _gps_raw_int(s: Snapshot) -> Any:
-    """No fix at first, then a good one."""
+    """Return GPS_RAW_INT: no fix at first, then a good one."""
     if not s.commander.has_gps_fix:
         return dialect.MAVLink_gps_raw_int_message(s.stamp_us, 0, 0, 0, 0, 9999, 9999, 0, 0, 0)
     north, east, down = s.truth.position_ned_m.tolist()
@@ -120,7 +120,7 @@ def _global_position_int(s: Snapshot) -> Any | None:
 
 
 def _servo_output_raw(s: Snapshot) -> Any:
-    """Motor commands of 1000 to 2000 us, 900 if stopped, as in PX4."""
+    """Return SERVO_OUTPUT_RAW: pulses of 1000 to 2000 us, or 900 us with motors off, as in PX4."""
     commands = s.truth.motor_commands.tolist()
     pulses = [_uint16(1000.0 + 1000.0 * c) if s.motors_on else 900 for c in commands]
     stamp_us = s.stamp_us & 0xFFFFFFFF
@@ -149,7 +149,7 @@ def _attitude_target(s: Snapshot) -> Any:
 
 
 def _position_target_local_ned(s: Snapshot) -> Any:
-    """Return the active setpoint, as in PX4."""
+    """Return POSITION_TARGET_LOCAL_NED with the active setpoint, as in PX4."""
     unset = np.isnan(s.setpoint)
     mask = sum(bits for start, bits in _ZERO_MASKS if unset[start : start + 3].all())
     sent = np.where(unset, 0.0, s.setpoint).tolist()
@@ -161,7 +161,7 @@ def _position_target_local_ned(s: Snapshot) -> Any:
 
 
 def _highres_imu(s: Snapshot) -> Any:
-    """Specific force and rates in FRD, without a magnetometer."""
+    """Return HIGHRES_IMU: specific force and rates in FRD, and pressure; no magnetometer."""
     force_ned = s.truth.acceleration_ned_mps2 - np.array([0.0, 0.0, GRAVITY_MPS2])
     height = s.amsl_m(float(s.truth.position_ned_m[2]))
     return dialect.MAVLink_highres_imu_message(
@@ -172,7 +172,7 @@ def _highres_imu(s: Snapshot) -> Any:
 
 
 def _altitude(s: Snapshot) -> Any:
-    """Altitudes above sea, home and the ground, which is flat at the origin's height."""
+    """Return ALTITUDE: above the sea, home and the ground, which is flat at the origin's height."""
     down = float(s.truth.position_ned_m[2])
     amsl, above_home = s.amsl_m(down), float(s.home_ned_m[2]) - down
     return dialect.MAVLink_altitude_message(
@@ -210,7 +210,7 @@ def _home_position(s: Snapshot) -> Any | None:
 
 
 def _odometry(s: Snapshot) -> Any:
-    """Pose in local NED, velocity in the body's FRD."""
+    """Return ODOMETRY: the pose in local NED, the velocity in body FRD."""
     truth = s.truth
     return dialect.MAVLink_odometry_message(
         s.stamp_us, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD,
@@ -276,7 +276,7 @@ BUILDERS: Mapping[int, _Builder] = {
 }
 """Builders of all messages that can be streamed or requested, by message id, in sending order.
 
-A builder returns None while its message has no contents.
+A builder returns None while the contents of its message are unknown.
 """
 
 _NOT_SELECTABLE = 2  # MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
@@ -395,9 +395,9 @@ class Link:
         return bool(self._fast)
 
     def due(self, snapshot: Snapshot, *, between_ticks: bool = False) -> list[Any]:
-        """Return the messages due now, or only those of the fast streams between two ticks.
+        """Return the messages due now; with `between_ticks`, only those of the fast streams.
 
-        A late stream skips missed messages.
+        A late stream skips the messages that it missed.
         """
         stamp_us, messages = snapshot.stamp_us, []
         for stream in self._fast if between_ticks else self._active:

@@ -1,4 +1,4 @@
-"""The depth camera as a MAVLink camera component that takes commands and sends frames.
+"""Implements the depth camera as a MAVLink camera component, which obeys commands and sends frames.
 
 It has no clock, and no socket except its depth stream's. `handle` answers a message, and `poll`
 returns the messages due at a stamp. The same stamps and messages give the same bytes.
@@ -82,7 +82,7 @@ class Camera:
         rate_hz: Default frame rate, at most 50 Hz.
         heartbeat_hz: Heartbeats per second; 0 for none.
         system: MAVLink system id of the vehicle. Commands for other systems are ignored.
-        depth: Stream that gets frames at the default rate while it has readers; None for none.
+        depth: Stream that gets frames at the default rate while it has readers; None for no stream.
 
     Raises ConfigError if the size, field of view or rate is invalid.
     """
@@ -128,7 +128,7 @@ class Camera:
         self._sensors: dict[int, _Schedule] = {}  # those requested by a client, by message id
 
     def handle(self, message: Message) -> list[Message]:
-        """Return the answer to a message, or nothing if it is not for a camera."""
+        """Return the answers to a message; none if it is not a command for this camera."""
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "COMMAND_INT") or message.target_system != self.system:
             return []
@@ -186,9 +186,9 @@ class Camera:
     ) -> list[Message]:
         """Return the messages of one frame in sending order.
 
-        CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels), DATA_TRANSMISSION_HANDSHAKE
-        (size) and ENCAPSULATED_DATA (253 bytes each). This is MAVLink's image transmission protocol
-        (https://mavlink.io/en/services/image_transmission.html).
+        They are CAMERA_IMAGE_CAPTURED (stamp, pose and checksum of the pixels),
+        DATA_TRANSMISSION_HANDSHAKE (size) and ENCAPSULATED_DATA (253 bytes each). Source:
+        https://mavlink.io/en/services/image_transmission.html.
         """
         rows, columns = self._rows, self._columns
         pixels = image.tobytes()

@@ -11,8 +11,8 @@ left, up), with focal length f = (columns / 2) / tan(hfov / 2) in pixels:
 
 so the ray's parameter is the planar depth.
 
-Each box is projected first. Its part in front of the camera bounds the pixels that can see it, and
-only these are tested, so the cost of a frame depends on the visible boxes.
+Each box is projected first. The projection of its part in front of the camera bounds the pixels
+that can see it. Only these are tested, so the cost of a frame depends on the visible boxes.
 """
 
 from __future__ import annotations
@@ -51,8 +51,9 @@ def render_depth(
 
     Args:
         boxes_enu_m: Boxes (n, 6) xmin ymin zmin xmax ymax zmax. The ground z = 0 always exists.
-        position_enu_m: Optical centre (3,). Inside a box, the depth is zero everywhere; below the
-            ground, along every ray that points down. If the pose is not finite, all pixels are 255.
+        position_enu_m: Optical centre (3,). If it is inside a box, the depth is zero everywhere; if
+            it is below the ground, the depth is zero along every ray that points down. If the pose
+            is not finite, all pixels are 255.
         quaternion_flu_enu: Unit quaternion (4,) w x y z, camera forward-left-up to ENU.
         columns, rows: Size of the image, at least 1.
         hfov_rad: Horizontal field of view, between 0 and pi.

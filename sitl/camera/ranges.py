@@ -1,4 +1,4 @@
-"""Range finders at the depth camera: a ring of 72 sectors, one beam forward and one beam down.
+"""Simulates range finders at the depth camera: a ring of 72 sectors, and beams forward and down.
 
 They sit at the optical centre on a levelled mount that turns only with the vehicle's yaw. Ranges
 come from the depth renderer, so they have its resolution of 0.1 m.
@@ -56,7 +56,7 @@ def _sector_ranges_cm(boxes_enu_m: Vector, position_enu_m: Vector, yaw_rad: floa
 def _ring(
     boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
 ) -> list[Message]:
-    """Return OBSTACLE_DISTANCE from a pose (ENU m; FLU to ENU) at a stamp of the boot clock."""
+    """Return an OBSTACLE_DISTANCE message for a pose (ENU m; FLU to ENU) at a boot-clock stamp."""
     yaw_rad = yaw_from_quaternion(quaternion)
     return [
         dialect.MAVLink_obstacle_distance_message(
@@ -70,7 +70,7 @@ def _ring(
 def _beams(
     boxes_enu_m: Vector, stamp_s: float, position: Vector, quaternion: Vector
 ) -> list[Message]:
-    """Return two DISTANCE_SENSOR, forward (id 0) and down (id 1); see `_ring` for the arguments."""
+    """Return two DISTANCE_SENSOR messages, forward (id 0) and down (id 1); arguments as `_ring`."""
     yaw_rad = yaw_from_quaternion(quaternion)
     messages = []
     for number, (orientation, pitch_rad) in enumerate(((_FORWARD, 0.0), (_DOWN, _RIGHT_ANGLE))):

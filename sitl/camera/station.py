@@ -1,4 +1,4 @@
-"""Stand-alone depth camera and referee for the vehicle of a foreign autopilot."""
+"""Runs a stand-alone depth camera and referee for the vehicle of a foreign autopilot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Linked(Peer):
 
     Args:
         slots: Slots of the autopilots at the peer's endpoint, by system id.
-        awaits_frames: False for a companion that has started the camera, until it sends a message.
+        awaits_frames: False for a companion that started this process and has sent no message yet.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Witness:
     """Derives collision, clearance and energy of a foreign vehicle from its pose.
 
     The record begins when the vehicle arms. The energy comes from the regression; the power of the
-    propellers is unknown. Body box and regression are the profile's, in place of the vehicle's.
+    propellers is unknown. The profile's body box and regression stand in for the vehicle's own.
     """
 
     def __init__(self, world: World, profile: VehicleProfile, *, logs: bool) -> None:
@@ -201,7 +201,7 @@ class Witness:
     def observe(
         self, stamp_s: float, position_enu_m: Vector, quaternion_flu_enu: Vector, velocity: Vector
     ) -> Collision | None:
-        """Judge a pose at a stamp of the boot clock. Return a flight's first collision, once."""
+        """Judge a pose at a boot-clock stamp, s. Return the collision when the first one occurs."""
         if self._stamp_s is not None and stamp_s <= self._stamp_s:
             if stamp_s > self._stamp_s - 1.0:
                 return None
@@ -324,7 +324,8 @@ class Station:
     def take(self, message: Any) -> bool:
         """Handle a message. Return True if it is to be forwarded to the other peers.
 
-        Messages to the camera or from another camera are not, so that peers see one camera only.
+        Messages to the camera, or from another camera, are not forwarded, so that peers see only
+        one camera.
         """
         component = message.get_srcComponent()
         if component == COMPONENT_ID and message.get_srcSystem() == self._autopilot:
@@ -383,7 +384,7 @@ class Station:
     def _place(self) -> None:
         """Use the given origin if no camera has sent a better one within a second.
 
-        The autopilot's clock counts, because it may run much faster than the wall clock.
+        The second is measured by the autopilot's clock, which may run much faster than real time.
         """
         stamp_s = self._tracker.attitude_stamp_s
         if self._placed or stamp_s is None:

@@ -1,6 +1,6 @@
-"""Depth frames as arrays of metres over a Unix domain socket.
+"""Sends depth frames over a Unix domain socket, as arrays in metres.
 
-Programs on this machine can read it instead of assembling MAVLink images. A frame is a header and
+Programs on this machine can read them instead of assembling MAVLink images. A frame is a header and
 the depth of every pixel, row by row from the top left, as float32; infinity means that nothing is
 in range. All numbers are little-endian. Readers send nothing.
 """
@@ -80,7 +80,7 @@ class DepthStream:
         quaternion_flu_enu: Vector,
         hfov_rad: float,
     ) -> None:
-        """Send a frame to every reader. It replaces one that still waits for a slow reader.
+        """Send a frame to every reader. It replaces a frame that waits to be sent to a slow reader.
 
         Args:
             pixels: Image (rows, columns) of `render_depth`.

@@ -52,7 +52,7 @@ class ArduPilotLink:
             self._socket.bind((_LOOPBACK, port))
         except OSError as error:
             self._socket.close()
-            raise LinkError(f"udp port {port}: {error.strerror or error}") from None
+            raise LinkError(f"cannot open UDP port {port}: {error.strerror or error}") from None
         self._peer: Any = None
         self._frame = -1
         self._throttles = np.zeros(4)
@@ -115,7 +115,10 @@ class ArduPilotLink:
         self._socket.close()
 
     def _await_servos(self, limit_s: float) -> bool:
-        """Receive the outputs of the next frame. ArduPilot repeats an unanswered frame."""
+        """Wait for the outputs of the next frame, skipping repeated ones. Return True if received.
+
+        ArduPilot repeats the outputs of a frame that was not answered.
+        """
         deadline_s = time.monotonic() + limit_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:
             self._socket.settimeout(remaining_s)

@@ -1,4 +1,4 @@
-"""Real firmware in place of the autopilot: exchanges messages between it and the clients."""
+"""Uses real firmware as the autopilot: runs it and exchanges messages between it and clients."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class FirmwareAutopilot(Links):
 
     @property
     def commander(self) -> FirmwareAutopilot:
-        """The object with the motors' state, `armed` and `terminated`."""
+        """This object, which has the motors' state: `armed` and `terminated`."""
         return self
 
     @property
@@ -115,9 +115,9 @@ class FirmwareAutopilot(Links):
     # The firmware.
 
     def deliver(self) -> None:
-        """Send the clients' messages, and wait until the firmware has read them.
+        """Send the clients' messages. If the firmware echoes, wait until it has read them.
 
-        Raises VehicleProcessError if the firmware closed its link.
+        The wait takes 0.2 s at most. Raises VehicleProcessError if the firmware closed its link.
         """
         if not self._to_firmware:
             return
@@ -201,7 +201,7 @@ FIXED_PARAMETERS, _ = read_toml(Path(__file__).with_name("parameters.toml"))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Boot:
-    """Settings with which a firmware starts."""
+    """The settings with which firmware is started."""
 
     profile: VehicleProfile
     system_id: int
@@ -221,10 +221,10 @@ def _plain(line: str) -> str:
 
 
 class FirmwareProcess:
-    """A running firmware. `end` also kills its children and removes its folder.
+    """A running firmware. `end` also kills its children and removes its scratch folder.
 
-    It runs in that folder, with `environment` added to ours. Raises VehicleProcessError if it
-    cannot be started.
+    The firmware runs in its scratch folder, with `environment` added to our environment. Raises
+    VehicleProcessError if it cannot be started.
     """
 
     def __init__(
@@ -263,7 +263,7 @@ class FirmwareProcess:
         return path.resolve()
 
     def require_running(self) -> None:
-        """Raise VehicleProcessError, with its last lines of output, if it has ended."""
+        """Raise VehicleProcessError with the last lines of output if the firmware has ended."""
         if self._process.poll() is not None:
             raise VehicleProcessError(self._state())
 
@@ -274,7 +274,7 @@ class FirmwareProcess:
         return VehicleProcessError(f"{problem}; {self._state()}")
 
     def _state(self) -> str:
-        """Describe in one line whether it runs or how it ended, with its last lines of output."""
+        """Describe in one line whether the firmware runs or how it ended, and its last output."""
         code = self._process.poll()
         if code is not None:
             self._reader.join(_DEATH_S)  # with a limit, because a child may hold the pipe
@@ -287,7 +287,7 @@ class FirmwareProcess:
         return f"the firmware {self._binary} {how}{last}"
 
     def _keep_tail(self) -> None:
-        """Read its output until the end, and keep the last bytes."""
+        """Read the output until EOF, and keep its last bytes."""
         with self._process.stdout as output:  # type: ignore[union-attr]
             while data := os.read(output.fileno(), _CHUNK):
                 self._tail[:] = (self._tail + data)[-_TAIL_BYTES:]

@@ -211,13 +211,13 @@ class Px4Link:
 
 
 def _throttles(message: Message) -> Vector:
-    """Return the first four motor outputs (4,), zero while disarmed or not finite."""
+    """Return the first four motor outputs (4,) in 0..1; 0 for NaN, all 0 while disarmed."""
     if not message.mode & _ARMED:
         return np.zeros(4)
     return np.clip(np.nan_to_num(np.array(message.controls[:4], dtype=np.float64)), 0.0, 1.0)
 
 
 def _is_running(instance: int) -> bool:
-    """Return True if a PX4 with this number already runs here, so that a second cannot start."""
+    """Return True if the PX4 instance with this number runs already, so it cannot start again."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         return probe.connect_ex(_SOCKET.format(instance)) == 0

@@ -1,4 +1,4 @@
-"""Sensors of a vehicle, which measure its true state with seeded noise."""
+"""Simulates the sensors of a vehicle, which measure its true state with seeded noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vehicle, camera and referee of a flight under real firmware (`--hil`, `--json`)."""
+"""Simulates vehicle, camera and referee of a flight under real firmware (`--hil`, `--json`)."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ class FirmwareSimulation(Simulation):
     def begin(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Wait until the firmware connects and sends a position, or until stopped.
 
-        Raises VehicleProcessError if it has ended, has not connected within a minute, or has sent
-        no position within two minutes.
+        Raises VehicleProcessError if the firmware has ended, has sent no position within two
+        simulated minutes, or, if we started it, has not connected within a minute.
         """
         self._await_call(stopped)
         autopilot = self._firmware

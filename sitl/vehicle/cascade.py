@@ -2,13 +2,13 @@
 
 setpoint -> velocity -> acceleration -> thrust vector -> body rates -> torque -> motors
 
-A reference model with the vehicle's capability follows the velocity setpoint with limited
-acceleration and the lag of the attitude loop. Its acceleration is fed forward, and the feedback
-acts only on the difference between vehicle and model. A setpoint step therefore neither overshoots
-nor winds up the integral.
+A reference model follows the velocity setpoint within the vehicle's capabilities: with limited
+acceleration and the lag of the attitude loop. The model's acceleration is fed forward, and the
+feedback acts only on the difference between vehicle and model. A setpoint step therefore neither
+overshoots nor winds up the integral.
 
-State, measurement and gains are flat arrays: passing one to compiled code takes 0.25 us, a record
-several times that.
+State, measurement and gains are flat arrays. Passing an array to compiled code takes 0.25 us;
+passing a record takes several times as long.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ def _limit_horizontal(vector: Vector, start: int, limit: float) -> None:
 def clean_setpoint(setpoint: Vector, gains: Vector) -> Vector:
     """Return a copy (11,) within the vehicle's limits, with NaN for values that are not finite.
 
-    Velocity is limited to the horizontal speed (norm) and to the climb and descent limits,
-    acceleration and yaw rate to their limits, and yaw to [-pi, pi).
+    Velocity is limited to the horizontal speed (norm) and to the climb and descent limits, and
+    acceleration and yaw rate to their limits. Yaw is wrapped into [-pi, pi).
     """
     clean = np.empty(SETPOINT_SIZE)
     for index in range(SP_YAW):  # position, then velocity and acceleration
@@ -261,8 +261,8 @@ def rotation(measurement: Vector) -> Vector:
 def specific_force(acceleration: Vector, gains: Vector) -> Vector:
     """Return the thrust per mass (3,), NED m/s^2, for an acceleration, with priority for height.
 
-    The vertical part has priority, except for a margin. The horizontal part is reduced to the tilt
-    limit and to the available thrust.
+    The vertical part has priority over all of the horizontal part except for a margin. The
+    horizontal part is limited by the tilt limit and by the remaining thrust.
     """
     gravity = gains[G_GRAVITY]
     largest = THRUST_RESERVE * 4.0 * gains[G_ROTOR_THRUST] / gains[G_MASS]

@@ -127,7 +127,7 @@ class RateLoops:
 
     @classmethod
     def of(cls, profile: VehicleProfile) -> RateLoops:
-        """Return the loops of a vehicle."""
+        """Return the rate loops for a vehicle."""
         gains = gains_for(profile, 0.004)
         shares = np.linspace(0.05, 1.0, 40)
         commands = np.array([cascade.throttle(share, gains) for share in shares])

@@ -69,7 +69,7 @@ def _values(profile: VehicleProfile) -> dict[str, float | str]:
 
 
 def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
-    """Return table rows of a coefficient against advance ratio, up to 1.5 times `ratio`."""
+    """Return table rows of a coefficient for advance ratios from -1 to 1.5 times `ratio`."""
     advances = [step / 20.0 for step in range(-20, 31)]
     return "\n".join(f"{j * ratio:.6f} {static * share(j):.9f}" for j in advances)
 
@@ -77,8 +77,8 @@ def _table(ratio: float, static: float, share: Callable[[float], float]) -> str:
 def thrust_share(relative_advance: float) -> float:
     """Return C_T / static C_T at J / J(zero thrust), a shape common to fixed-pitch propellers.
 
-    It falls slowly at first and then faster. This is an assumption, within 5 % of published 9-inch
-    data.
+    It falls slowly at first and then faster. The shape is an assumption; it agrees within 5 % with
+    published data of 9-inch propellers.
     """
     if relative_advance < 0.0:
         return 1.0 - INFLOW_SLOPE * relative_advance
@@ -169,4 +169,4 @@ def _place(fdm: jsbsim.FGFDMExec, position_ned_m: Vector, heading_rad: float) ->
     fdm["ic/h-sl-ft"] = (radius_m - PLANET_RADIUS_M) / FOOT_M
     fdm["ic/psi-true-rad"] = heading_rad % (2.0 * math.pi)
     if not fdm.run_ic():
-        raise VehicleProcessError("JSBSim refuses the initial state")
+        raise VehicleProcessError("JSBSim rejected the initial state of the vehicle")

@@ -1,4 +1,4 @@
-"""The state of the vehicle at one instant, as one array for physics, controller and referee."""
+"""Holds the vehicle's state at one instant in one array for physics, controller and referee."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRUTH_SIZE = 33
 
 
 class _Scalar:
-    """An attribute of `Truth` that reads one number of its array."""
+    """An attribute of `Truth` that reads one number from the array of the instance."""
 
     def __init__(self, index: int) -> None:
         self._index = index

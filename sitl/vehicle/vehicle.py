@@ -1,4 +1,4 @@
-"""A quadrotor with its flight controller, energy and battery, simulated at a fixed rate."""
+"""Simulates a quadrotor with its flight controller, energy and battery at a fixed rate."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def open_circuit_voltage(remaining: float, parameters: Vector) -> float:
 
 @compiled
 def battery_current(power_w: float, open_circuit_v: float, resistance_ohm: float) -> float:
-    """Return the current, A, at which the loaded pack delivers a power, or its maximum power.
+    """Return the current, A, at which the loaded pack delivers a power, W, or its maximum power.
 
     It is the smaller root of P = I (V - I R), in a form without cancellation.
     """
@@ -188,8 +188,8 @@ def _refresh_and_control(
 class Quadrotor:
     """Deterministic physics and flight controller of one quadrotor.
 
-    It starts at rest, with the yaw counter-clockwise from east. A position (3,) below the standing
-    height, at which the centre of mass is `profile.rest_height_m` above ground, is raised to it.
+    It starts at rest. The yaw is counter-clockwise from east. A start position (3,) lower than
+    `profile.rest_height_m`, the height of the centre of mass on standing legs, is raised to it.
     """
 
     def __init__(

@@ -41,7 +41,7 @@ class _WorldCheck:
 
     clearance_m: float  # requested clearance
     start_clearance_m: float  # horizontal distance to the nearest box; inf without boxes
-    goal_clearance_m: float
+    goal_clearance_m: float  # distance in space to the nearest box; inf without boxes
     straight_m: float  # horizontal distance from start to goal
     path_m: float | None  # length of a shortest path on the grid, straightened; None if none exists
     path_enu_m: Vector  # (n, 3) its corners at flight height; empty if none exists

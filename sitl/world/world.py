@@ -77,7 +77,7 @@ class World:
 
     Raises:
         PlaceError: Start or goal is outside the bounds or blocked.
-        WorldError: A box has no volume.
+        WorldError: A box has no volume, or a coordinate that is not finite.
     """
 
     name: str
@@ -117,7 +117,7 @@ class World:
         return toml_text({"name": self.name, **places, **({"box": boxes} if boxes else {})})
 
     def briefing(self, camera_mount_flu_m: Sequence[float]) -> Briefing:
-        """Return the data that the companion gets before the first message."""
+        """Return the data that the companion gets before its first message."""
         places = (self.start_enu_m, self.goal_enu_m, self.bounds_enu_m, camera_mount_flu_m)
         start, goal, bounds, mount = (np.array(place, np.float64) for place in places)
         return Briefing(

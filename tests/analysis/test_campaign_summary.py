@@ -450,7 +450,7 @@ def test_no_setting_to_count_failures_of_is_told():
 
 def test_kernels_that_other_faults_struck_are_refused(book, tmp_path):
     native(book, range(2), bits=3)
-    with pytest.raises(ConfigError, match=r"kernels.json: faults"):
+    with pytest.raises(ConfigError, match=r"kernels.json: its faults"):
         setting_failures(book.ledger, groups(book.ledger), kernels_folder(tmp_path))
 
 

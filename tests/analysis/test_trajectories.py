@@ -142,7 +142,7 @@ def test_a_pair_that_cannot_be_drawn_is_refused(book):
     with pytest.raises(ConfigError, match=r"mission 5; .* 0 to 4"):
         pair(book.ledger, 5)
     book.plan(GOLDEN, 9)
-    with pytest.raises(RecordError, match="mission 5's pair"):
+    with pytest.raises(RecordError, match="the pair of mission 5"):
         pair(book.ledger, 5)
 
 

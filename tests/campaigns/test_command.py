@@ -273,7 +273,7 @@ def test_a_factor_is_replaced_in_a_folder_of_its_own(monkeypatch, tmp_path):
     again = invoke(command.campaign, ["run", str(changed), "--quiet"])
     assert again.stdout.startswith("short-field=sign-exponent: 0 of 3 missions\n")
     both = invoke(command.campaign, ["run", str(changed), "--set", "world=dense"])
-    assert "--scale, --set, --sampling or --out" in str(both.exception)
+    assert "--scale, --set, --sampling, --worlds or --out" in str(both.exception)
 
 
 def test_a_preset_s_name_that_is_also_a_campaign_s_folder_is_refused(monkeypatch, tmp_path):

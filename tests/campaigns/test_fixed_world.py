@@ -10,7 +10,7 @@ from mavfi_cli.campaigns import begin as beginning
 from mavfi_cli.campaigns.begin import SEARCH, begin, stored_spec
 from mavfi_cli.campaigns.ledger import Ledger
 from mavfi_cli.campaigns.specification import FixedWorld
-from mavfi_cli.campaigns.specification_file import load_spec, parse_spec, replaced
+from mavfi_cli.campaigns.specification_file import PRESETS, load_spec, parse_spec, replaced
 from mavfi_cli.core.errors import ConfigError, UnknownName
 
 SPEC = """
@@ -66,7 +66,7 @@ def test_all_missions_in_a_world_fly_the_first_candidate_that_fits(begun, campai
     assert {config.fault for config in flown} == {None}
     assert sorted({config.seed for config in flown}) == [1, 2, 3]
     told = r": rising 5 \(median 5\); .* from 1 on .* 5 to 6 times \(median of 3\)$"
-    assert re.search(told, rule.describe())
+    assert re.search(told, rule.describe(["rising", "flat"]))
 
 
 def test_a_campaign_that_was_begun_searches_no_more(begun, campaign):
@@ -130,7 +130,7 @@ def test_other_values_of_factors_keep_the_rule(begun):
 @pytest.mark.parametrize(
     ("old", "new", "error", "told"),
     [
-        ("replans = [5, 6]", "", ConfigError, "fixed_world.replans: is missing"),
+        ("replans = [5, 6]", "", ConfigError, "must have replans or world_seed"),
         ("replans = [5, 6]", "replans = [6, 5]", ConfigError, r"replans: .* got \[6, 5\]"),
         ("replans = [5, 6]", "replans = 5", ConfigError, "fixed_world.replans: "),
         ("flights = 3", "flights = 0", ConfigError, "must be at least 1"),
@@ -171,3 +171,32 @@ def test_a_candidate_whose_flights_could_not_begin_does_not_fit():
 def test_boxes_of_a_user_are_one_world_already():
     rule = FixedWorld(replans=(0, 9))
     assert (rule.rules("dense"), rule.rules("mine.toml")) == (True, False)
+
+
+def test_seeds_alone_need_no_rule(begun):
+    named = "[fixed_world.world_seed]\nflat = 7\nelsewhere = 3\n[[setting]]"
+    text = SPEC[: SPEC.index("[fixed_world]")] + named + SPEC[SPEC.index("[[setting]]") + 11 :]
+    spec = spec_of(text)
+    assert spec.describe_worlds() == "world seeds: flat 7 (named)"
+    assert {kind.config.world_seed for kind in spec.kinds()} == {7, None}
+
+
+@pytest.mark.parametrize("preset", PRESETS.names)
+def test_presets_of_the_paper_fly_its_fixed_worlds(preset):
+    spec = load_spec(preset)
+    seeds = {kind.config.world: kind.config.world_seed for kind in spec.kinds()}
+    if preset in {"fig7", "fig8", "fig9", "fig13", "fig14", "fig16", "table3", "table4"}:
+        assert seeds.items() <= spec.fixed_world.world_seed.items()
+        many = spec.in_many_worlds()
+        assert {kind.config.world_seed for kind in many.kinds()} == {None}
+        assert len(many.missions()) == len(spec.missions())
+    else:
+        assert {*seeds.values()} == {None}
+        with pytest.raises(ConfigError, match=r"worlds: .*has no fixed worlds"):
+            spec.in_many_worlds()
+
+
+def test_unknown_fixed_worlds_are_refused():
+    text = SPEC[: SPEC.index("[fixed_world]")] + SPEC[SPEC.index("[[setting]]") :]
+    with pytest.raises(ConfigError, match="unknown fixed worlds 'papre'; did you mean 'paper'"):
+        spec_of('fixed_world = "papre"\n' + text)

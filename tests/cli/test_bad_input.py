@@ -254,13 +254,13 @@ def test_a_full_disk_in_flight(command_line):
 def test_a_folder_that_cannot_be_made(refused, tmp_path):
     (tmp_path / "file").write_text("")
     line = refused(*SHORT_LINE[1:], "--quiet", "--out", "file/runs", code=2)
-    assert "'--out': file/runs: not a folder" in line
+    assert "'--out': file/runs: this folder cannot be created or written" in line
 
 
 @pytest.mark.parametrize(
     ("out", "why"),
     [
-        ("/dev/null", "/dev/null: not a folder"),
+        ("/dev/null", "/dev/null: this folder cannot be created or written"),
         (b"caf\xe9".decode(errors="surrogateescape"), r"'caf\udce9': not a UTF-8 name"),
     ],
 )

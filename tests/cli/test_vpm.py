@@ -116,7 +116,7 @@ def test_files_and_pictures(command_line, tmp_path):
         (("--board", "xaviar"), "--board: .*'xaviar'.* 'xavier'"),
         (("--overhead", "aead=1"), ".*'aead'.* 'aad'"),
         (("--vehicle", "none.toml"), "none.toml: no such file"),
-        (("--out", "file/below"), ".*'--out': file/below: not a folder"),
+        (("--out", "file/below"), ".*'--out': file/below: this folder cannot be created"),
     ],
 )
 def test_bad_input_is_one_line(command_line, tmp_path, arguments, said):

@@ -81,7 +81,7 @@ def test_a_plan_that_was_published_with_the_value_is_seen_when_it_is_new(planned
 def test_looks_ahead_need_to_know_which_plan_is_flown(planned):
     columns, flown = planned
     del columns["trajectory_stamp_s"]
-    with pytest.raises(ModelError, match="no columns trajectory_stamp_s"):
+    with pytest.raises(ModelError, match="needs the columns trajectory_stamp_s"):
         list(replay(columns, None, plans=[flown]))
 
 

@@ -87,7 +87,7 @@ def test_any_text_parses_or_is_refused_in_one_line(text: str, prefix: str) -> No
 )
 def test_beyond_this_machine_signing_is_required(url: str) -> None:
     for opener in (open_transport, open_listener):
-        with pytest.raises(LinkError, match="signing is required"):
+        with pytest.raises(LinkError, match="must be signed"):
             opener(url)
 
 

@@ -61,7 +61,7 @@ def test_the_same_mission_gives_the_same_bytes(config, inputs, tmp_path):
     (target,) = kernel_targets(["control"], config, tmp_path)
     assert target.inputs_sha256 == save_inputs(tmp_path / "again.npz", inputs)
     assert load_inputs(target.inputs)[1] == target.inputs_sha256
-    with pytest.raises(ConfigError, match="holds inputs"):
+    with pytest.raises(ConfigError, match="inputs come from another flight"):
         kernel_targets([], MissionConfig(world="farm"), tmp_path)
 
 

@@ -124,7 +124,7 @@ def test_a_vehicle_that_left_no_briefing(tmp_path, text):
     path = tmp_path / "briefing.json"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(VehicleProcessError, match="no briefing"):
+    with pytest.raises(VehicleProcessError, match="the briefing cannot be read"):
         Vehicle.read_briefing(path)
 
 

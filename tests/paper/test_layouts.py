@@ -48,6 +48,15 @@ def test_table_iv_counts_every_flown_mission_beside_the_papers_rate():
     assert cell(found, "golden", "dense").paper == 85.0
 
 
+def test_a_table_says_for_which_worlds_its_intervals_hold():
+    fixed = flight(20.0, world_seed=16), flight(20.0, world="dense", world_seed=3)
+    many = [flight(20.0), flight(21.0)]
+    (note,) = [note for note in of_flights("table4", flights(fixed)).notes if "worlds:" in note]
+    assert note == "worlds: fixed (dense 3, sparse 16); intervals hold for these worlds only"
+    assert "another one for each seed" in flights(many).population
+    assert "fixed (dense 3, sparse 16) in 2 flights, another" in flights([*fixed, *many]).population
+
+
 def test_fig_12_compares_each_flight_with_its_own_golden_one():
     flown = flights([
         flight(20.0), flight(40.0, pair="b"), flight(None, pair="c"),

@@ -83,7 +83,9 @@ def test_the_rest_of_a_reproduction_is_flown_by_naming_no_item(campaign, tmp_pat
         ledger.set_meta({"reproduction": '{"stack": "mavbench", "scale": 0.5}'})
     (problem,) = Evidence.gather([tmp_path]).problems
     assert "2 of 5 missions" in problem
-    assert f"mavfi reproduce --stack mavbench --scale 0.5 --out {tmp_path} " in problem
+    assert (
+        f"mavfi reproduce --stack mavbench --scale 0.5 --worlds many --out {tmp_path} " in problem
+    )
 
 
 def test_campaigns_of_several_builds_are_told(campaign, tmp_path):

@@ -65,7 +65,7 @@ def test_a_truth_that_cannot_be_written_starts_no_firmware(run, tmp_path, monkey
         "--json", "ardupilot", "--firmware", str(program), "--truth", "/dev/null/truth"
     )
     assert code == 2
-    assert "'--truth': /dev/null/truth: not a folder" in errors
+    assert "'--truth': /dev/null/truth: this folder cannot be created or written" in errors
     assert list(folder.iterdir()) == []
 
 

@@ -75,9 +75,10 @@ def unpack(data: bytes) -> Numbers:
 
 
 def _numbers(golden: Numbers, output: Numbers) -> Difference:
-    """Return the largest difference of a number, relative to the golden one unless that is 0.
+    """Return the largest difference between corresponding numbers, relative and absolute.
 
-    It is noticeable if it is larger than `_SMALL`.
+    Differences are relative to the golden number, or to 1 if that is 0; they are noticeable above
+    `_SMALL`.
     """
     changed, largest, relative = 0, 0.0, 0.0
     for name, expected in golden.items():
@@ -108,7 +109,7 @@ def _nan(array: NDArray[np.generic]) -> NDArray[np.bool_]:
 
 
 def _maps(golden: Numbers, output: Numbers) -> Difference:
-    """Compare two trees by the nodes that only one has or whose log-odds differ.
+    """Compare two trees by the nodes that only one of them has or whose log-odds differ.
 
     The difference is noticeable if the sets of occupied voxels differ, in the tree or in the
     planner's map.
@@ -203,7 +204,7 @@ def _length(path: NDArray[np.float64]) -> float:
 
 
 def _farthest(path: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Return the largest distance of a vertex of one path (n, 3) from the other (m, 3)."""
+    """Return the largest distance from a vertex of one path (n, 3) to the other path (m, 3)."""
     begins, steps = other[:-1], np.diff(other, axis=0)
     if not len(steps):
         begins, steps = other, np.zeros_like(other)
@@ -290,7 +291,7 @@ def _place_nodes(
 ) -> int:
     """Fill codes and depths (n,) of nodes in the order of the file.
 
-    Returns the number of nodes of the tree, or 0 if they do not form a tree.
+    Returns the number of nodes in the tree, or 0 if the nodes do not form a tree.
     """
     stack = np.empty((8 * TREE_DEPTH + 8, 2), np.int64)
     stack[0, 0], stack[0, 1] = 0, 0
@@ -326,7 +327,7 @@ class Kernel:
         prepare: maps the inputs to a call, and does everything that precedes the kernel.
         compare: returns the difference of two outputs.
         tolerance: description of the differences that `compare` treats as unnoticeable.
-        repeatable: true if the call leaves no state behind, so that calling it warms it up.
+        repeatable: true if the call leaves no state behind, so that extra calls can warm it up.
         too_long: true if the kernel is too long to be stepped whole; windows are sampled.
         inner: compiled functions at which windows begin, in addition to those of its scope.
         code: returns entry and scope of a plug-in kernel; called after the kernel has run.
@@ -346,7 +347,7 @@ class Kernel:
 
     @property
     def hang_s(self) -> float:
-        """CPU time beyond that of the golden run after which a run counts as hung, s.
+        """CPU time, beyond a multiple of the golden run's, after which a run counts as hung, s.
 
         A runaway allocation fills the memory in a third of this time, so it crashes first.
         """
@@ -393,7 +394,7 @@ def _collision_check(inputs: KernelInputs) -> Call:
     poses = np.linspace(check.time_s, trajectory.duration_s, _POSES, endpoint=False)
 
     def call() -> Output:
-        """Check the rest of a trajectory from several poses on it."""
+        """Check the rest of a trajectory from each of several poses along it."""
         state, reports = collision.CollisionState(), []
         for time_s in poses.tolist():
             state, report = collision.step(state, replace(check, time_s=time_s), params)
@@ -415,7 +416,7 @@ def _collision_check(inputs: KernelInputs) -> Call:
 
 def _planner(name: str) -> Callable[[KernelInputs], Call]:
     def prepare(inputs: KernelInputs) -> Call:
-        """Prepare a planner's call on the recorded task, with the problem already set up."""
+        """Set up the problem of the recorded task, and return the planner's call on it."""
         task, planner = inputs.task, planners.find(name)
         problem = PlanningProblem.pose(
             task.snapshot, task.start_enu_m, task.goal_enu_m, task.bounds_enu_m, PlanningParams()
@@ -489,7 +490,7 @@ KERNELS = {
 
 @functools.cache
 def find(name: str) -> Kernel:
-    """Find a kernel by its name, or the `KERNEL` of a user's Python file.
+    """Return a kernel by its name, or the `KERNEL` that a user's Python file defines.
 
     Raises:
         UnknownName: there is no such kernel.
@@ -521,7 +522,7 @@ def _own(path: Path) -> Kernel:
 
 
 def select(names: Iterable[str]) -> tuple[str, ...]:
-    """Return kernels by the names that `find` accepts; without names, all built-in ones.
+    """Return the names and files of the chosen kernels; without names, all built-in ones.
 
     Built-in kernels come first, in the order of the pipeline.
 

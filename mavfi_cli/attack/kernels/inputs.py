@@ -32,9 +32,9 @@ class PlanningTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelInputs:
-    """One input of each kernel with its state, each from one invocation of a golden run."""
+    """One input and state per kernel, each recorded at one invocation in a golden run."""
 
-    flight: str  # name of the flight, in words
+    flight: str  # description of the flight
     frame: DepthFrame
     mapped: tuple[PointCloud, ...]  # clouds that the map already contained
     cloud: PointCloud  # the next one
@@ -54,7 +54,7 @@ def save_inputs(path: Path, inputs: Sequence[KernelInputs]) -> str:
     """Write the inputs; return the SHA-256 of the file.
 
     Raises:
-        RecordError: the file could not be written.
+        RecordError: the file cannot be written.
     """
     data = pack(_Stored(tuple(inputs)))
     write_atomically(path, lambda file: file.write(data))

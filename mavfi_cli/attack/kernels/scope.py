@@ -1,4 +1,4 @@
-"""Native entry and code in scope of a kernel, for instruction-level faults.
+"""The native entry of a kernel and its code in scope, for instruction-level faults.
 
 A planner has two scopes. In isolation the kernel is the search, OMPL's `solve`, which always runs.
 In a mission the kernel is the planner node's work for one request, with or without a search
@@ -33,7 +33,7 @@ from mavfi_cli.fi.tracer.image import (
 KERNELS = ("point_cloud", "octomap", "collision_check", *OUR_PLANNERS, "control")
 
 # A planner's code in libompl is contiguous: it is compiled from one source file with its templates.
-# The classes that all planners call belong to it too. Each entry: mangled class name, and its end.
+# Classes that all planners call are in scope too. Each entry: mangled class name, text after it.
 _OMPL = {"rrtstar": ("7RRTstar", ""), "rrt": ("3RRT", "E"), "rrtconnect": ("10RRTConnect", "")}
 _OMPL_SHARED = ("4ompl4base20RealVectorStateSpace", "4ompl4base29PathLengthOptimizationObjective")
 _OCTOMAP_INSERT = (
@@ -112,8 +112,8 @@ def library_scope(library: str, function: str) -> KernelScope:
 def compiled_scope(kernel: str, function: Any) -> KernelScope:
     """Find the entry and the scope of a numba function that has run in this process.
 
-    Python calls this entry. The hash of the compiled object identifies the build, because the code
-    in memory contains addresses of the process.
+    The entry is the wrapper that Python calls. The hash of the compiled object identifies the
+    build, because the code in memory contains addresses of the process.
 
     Args:
         kernel: Name of the kernel.
@@ -137,8 +137,8 @@ def compiled_scope(kernel: str, function: Any) -> KernelScope:
 def node_scope(node: str, planner: str) -> KernelScope:
     """Find the entry and the scope of a mission node's work in this process.
 
-    A planner node first reads the map and builds its obstacle grid; neither is in scope. Everything
-    after that, up to the reply, is in scope: the tests of straight segments and of pieces of the
+    A planner node first reads the map and builds its obstacle grid; neither step is in scope. All
+    later work up to the reply is in scope: the tests of straight segments and of pieces of the
     trajectory, and the search if there is one.
 
     Raises:

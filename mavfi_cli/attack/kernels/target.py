@@ -1,7 +1,7 @@
 """One kernel as a target: a template process that forks itself for every run.
 
-This is the attacker's side of `attack.kernels.template`. It starts a stopped run, then reads its
-output and judges it by what the kernel computes.
+This is the attacker's side of `attack.kernels.template`. It starts a run, which is stopped at
+first, then reads the run's output and judges it with the kernel's own comparison.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class KernelTarget:
     Attributes:
         kernel: name of a built-in kernel, or the file of a user's kernel.
         inputs: file with inputs of one flight, which `flight` describes.
-        tolerance: relative error of an output that still counts as benign.
+        tolerance: largest relative error of an output that still counts as benign.
     """
 
     kernel: str
@@ -74,7 +74,7 @@ class KernelTarget:
         }
 
     def open(self) -> _KernelPlace:
-        """Start the kernel's template."""
+        """Start the kernel's template process, and return the place for its runs."""
         return _KernelPlace(self)
 
 
@@ -122,18 +122,18 @@ class _KernelPlace:
         return scope
 
     def start(self) -> Tracee:
-        """Start a run, attached and stopped before its call of the kernel.
+        """Start a run, attached and stopped before it calls the kernel.
 
         Raises:
             TracingForbidden: the operating system refuses.
-            FaultError: the template has died.
+            FaultError: the template process has died.
         """
         control = self._template.connection
         os.ftruncate(self._output, 0)
         control.send(RUN + bytes([self._number]))
         packet = control.recv(PID_BYTES)
         if len(packet) < PID_BYTES:
-            raise FaultError(f"the process that loads {self.name} has died")
+            raise FaultError(f"the template process of {self.name} has died")
         tracee = Tracee.attach(int.from_bytes(packet, "little"), mechanism=self._target.mechanism)
         control.send(GO)
         return tracee
@@ -157,7 +157,7 @@ class _KernelPlace:
 
         Raises:
             TargetError: the kernel never enters its native code.
-            WindowTooLong: too many instructions.
+            WindowTooLong: a window has too many instructions.
         """
         scope = self.kernel_scope
         return profile_run(
@@ -188,7 +188,7 @@ class _KernelPlace:
         return "" if golden.output == again.output else "their outputs differ"
 
     def left(self) -> Golden | None:
-        """Read the times and the output, or error, of the last run; None if they are incomplete."""
+        """Read the last run's times and its output or error text; None if they are incomplete."""
         data = os.pread(self._output, os.fstat(self._output).st_size, 0)
         if len(data) < TIMES.size:
             return None

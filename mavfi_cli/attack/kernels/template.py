@@ -1,11 +1,12 @@
 """A warm process with one kernel and its inputs loaded, which forks itself for every run.
 
-The first message holds the kernel's name and its inputs; the reply is their number. Later requests
-are bytes on the same socket. The reply to `ASK_SCOPE` is the kernel's scope. `RUN` and the number
-of an input fork a child: it sends its process id (4 bytes), waits for `GO`, calls the kernel once,
-writes its output to standard output, which is a file, and ends. The next request must not come
-before the child has ended. The file holds CPU time and duration of the call (two float64, s), then
-the packed output, or the text of the error if the exit code is `RAISED`.
+The first message holds the kernel's name and its inputs; the reply holds the number of inputs and
+`newest_cache_ns`. Later requests are bytes on the same socket. The reply to `ASK_SCOPE` is the
+kernel's scope. On `RUN`, followed by the number of an input, this process forks a child. The child
+sends its process id (4 bytes), waits for `GO`, calls the kernel once, writes the output to standard
+output, which is a file, and ends. The next request must not come before the child has ended. The
+file holds the CPU time and the duration of the call (two float64, s), then the packed output, or
+the text of the error if the exit code is `RAISED`.
 
 Every run starts from the same memory: garbage collection is off, and this process keeps no state
 between forks.
@@ -41,7 +42,7 @@ _LARGEST_FILE = 1 << 28
 
 
 def main() -> None:
-    """Load and warm up the kernel, then fork until the other end closes."""
+    """Load and warm up the kernel, then serve requests until the other end closes."""
     connection = socket.socket(fileno=CHANNEL)
     name, inputs = receive(connection)
     kernel = catalogue.find(name)
@@ -78,7 +79,7 @@ def _in_child(work: Callable[[], int]) -> int:
 
 
 def _limit(extra_mb: int) -> None:
-    """Limit resources, so that a corrupted size cannot exhaust the machine's memory."""
+    """Ignore SIGINT and SIGTERM; limit memory and file sizes in case a size is corrupted."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -89,7 +90,7 @@ def _limit(extra_mb: int) -> None:
 
 
 def _send_scope(connection: socket.socket, kernel: catalogue.Kernel, call: Call) -> int:
-    """Send the kernel's scope. Runs in a child, because finding it alters the memory."""
+    """Send the kernel's scope. Runs in a child, because finding the scope alters its memory."""
     try:
         call()
         send(connection, kernel.scope())

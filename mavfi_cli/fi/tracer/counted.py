@@ -1,14 +1,14 @@
-"""Counts executions of instructions: up to one stop, by a detour, or over a whole run.
+"""Counts executions of instructions, either up to a stop or over a whole run.
 
 The k-th execution of an instruction is reached by counting. A *detour* counts inside the target, in
-a few nanoseconds per execution. A jump to a page of ours replaces the bytes of the counted
-instruction. The code there counts down without changing flags or stack, executes the replaced
-instructions and jumps back. At zero it stops at a breakpoint instead. No jump may lead into the
-middle of the replaced instructions. If they have fewer than five bytes, a short jump leads to five
-unused bytes nearby, which hold a second jump.
+a few nanoseconds per execution. A jump to a page that the tracer has mapped replaces the bytes of
+the counted instruction. The code there counts down without changing flags or stack, executes the
+replaced instructions and jumps back. At zero it stops at a breakpoint instead. No jump may lead
+into the middle of the replaced instructions. If they are shorter than five bytes, a short jump
+leads to five unused bytes nearby, which hold a second jump.
 
-The population of a program that is too long to be stepped consists of its execution counts.
-Instructions of a block always execute together and have equal counts. So a frequent instruction is
+If a program is too long to be stepped, faults are drawn from its execution counts. Instructions of
+a block always execute together, so their counts are equal. A frequent instruction can therefore be
 counted at any instruction of its block where a detour fits.
 """
 
@@ -37,7 +37,7 @@ _BY_BREAKPOINT = 100_000  # maximum executions counted by a breakpoint: about a 
 _JUMP_BYTES, _SHORT_JUMP_BYTES = 5, 2
 _SHORT_JUMP = range(-126, 130)  # reach of a short jump, from its own address
 _PAGE = 4096
-_SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets of the data
+_SAVED, _COUNTER, _RETURN = 0, 8, 16  # offsets in the data page
 _FIXED = frozenset(("syscall", "sysenter", "int", "int3", "hlt", "ud2", "xbegin", "xabort", "xend"))
 
 
@@ -73,7 +73,7 @@ class Detour:
 
     @property
     def counting(self) -> Counting:
-        """The counting method."""
+        """The counting method; a detour with a second jump is a `FAR_DETOUR`."""
         return Counting.FAR_DETOUR if self.via else Counting.DETOUR
 
     @classmethod
@@ -83,7 +83,7 @@ class Detour:
         return cls(size) if size >= _JUMP_BYTES else None
 
     def code(self, code: bytes, address: int, pages: int, count: int) -> _DetourCode | None:
-        """Make the detour that stops before execution `count` of the instruction at `address`.
+        """Assemble the detour that stops before execution `count` of the instruction at `address`.
 
         Args:
             code: the replaced instructions; only the last may be a branch.
@@ -213,8 +213,7 @@ class CountedRun:
         counts: (n,) executions.
         places: (n,) index of the instruction at which the executions are counted.
         detours: (n,) detour that counts the instruction; None if none fits.
-        joined: (n,) whether the instruction is the only predecessor of the next, which always
-            follows it.
+        joined: (n,) whether the next instruction always follows this one, and follows no other.
     """
 
     addresses: NDArray[np.int64]
@@ -242,7 +241,7 @@ class CountedRun:
         )
 
     def without(self, methods: Container[Counting]) -> CountedRun:
-        """Return the same run without some counting methods; it reaches fewer executions."""
+        """Return the same run without some counting methods; fewer executions can be reached."""
         detours = [
             None if detour and detour.counting in methods else detour for detour in self.detours
         ]
@@ -251,7 +250,7 @@ class CountedRun:
 
     @functools.cached_property
     def reached(self) -> NDArray[np.int64]:
-        """(n,) number of executions that can be reached, counted from the first."""
+        """Number of reachable executions of each instruction, from the first one on, (n,)."""
         detoured = np.array([self.detours[place] is not None for place in self.places])
         return np.where(detoured, self.counts, np.minimum(self.counts, _BY_BREAKPOINT))
 
@@ -281,12 +280,12 @@ class CountedRun:
     def trigger(
         self, position: int, locate: Locate, _: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger of one executed instruction, and k, its execution number."""
+        """Return the trigger for one executed instruction, and its execution number k."""
         index, k = self._at(position)
         return self.stages(index, k, locate), k
 
     def stages(self, index: int, k: int, locate: Locate) -> tuple[CountedStop, ...]:
-        """Return the trigger's stages up to execution k of an instruction."""
+        """Return the stages of a trigger that stops before execution k of an instruction."""
         place = int(self.places[index])
         here, there = (locate(int(self.addresses[at])) for at in (index, place))
         detour = self.detours[place]
@@ -298,7 +297,7 @@ class CountedRun:
 
 
 def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> int:
-    """Return the number of bytes that a detour at one instruction would replace."""
+    """Return the number of bytes, from one instruction on, that a detour may replace."""
     size, expected = 0, None
     while (how := _flow(code_at(address + size), address + size)) is not None and how.movable:
         size += how.size
@@ -313,7 +312,7 @@ def _straight_bytes(address: int, code_at: CodeAt, executions: Executions) -> in
 def _without_repeats(
     addresses: list[int], counts: list[int], flows: list[_Flow | None]
 ) -> list[int]:
-    """Count a repeated string instruction once, whatever its number of iterations."""
+    """Count each execution of a repeated string instruction once, not once per iteration."""
     counts = list(counts)
     for at, how in enumerate(flows):
         if how is None or not how.repeated or at + 1 == len(addresses):
@@ -338,7 +337,7 @@ def _joined(addresses: list[int], counts: list[int], flows: list[_Flow | None]) 
 def _detours(
     addresses: list[int], sizes: list[int], flows: list[_Flow | None]
 ) -> Iterator[Detour | None]:
-    """Return the detours at the instructions."""
+    """Yield the detour at each instruction; None if none fits."""
     ends = [at + how.size if how else at for at, how in zip(addresses, flows, strict=True)]
     gaps = [
         range(end, start - _JUMP_BYTES + 1)
@@ -359,7 +358,7 @@ def _detours(
 
 
 def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> Detour | None:
-    """Return a detour through the first unused bytes nearby."""
+    """Return a detour through the first unused bytes in reach; None if there are none."""
     for gap in gaps:
         first = max(gap.start, near.start)
         if first >= near.stop:
@@ -370,7 +369,7 @@ def _over_gap(address: int, size: int, gaps: Sequence[range], near: range) -> De
 
 
 def _places(detours: Sequence[Detour | None], joined: Sequence[bool]) -> list[int]:
-    """Return the index at which each instruction is counted: its own, or one of its block."""
+    """Return, for each instruction, the index where it is counted: its own or one in its block."""
     places: list[int] = []
     start = 0
     for at, more in enumerate(joined):

@@ -1,9 +1,9 @@
 """Decodes x86-64 instructions into the register bits and memory bytes that they read and write.
 
 A bit is *read* if its value can change a result elsewhere: another bit of a register, memory, an
-address or the control flow. It is *written* if it holds part of the result; a 32-bit write also
-clears the upper half, a VEX-encoded one all other bits (Intel SDM volume 1, sections 3.4.1.1 and
-14.1.1). These bits are overwritten, but are not part of the result.
+address or the control flow. It is *written* if it holds part of the result. A 32-bit write also
+clears the upper half of the register, and a VEX-encoded one clears all other bits (Intel SDM volume
+1, sections 3.4.1.1 and 14.1.1). Cleared bits are overwritten, but are not part of the result.
 
 Capstone does the decoding. `vectors` has the tables for vector instructions. This module has the
 exceptions for all others, the stack slots of push, pop, call and ret, and the properties that the
@@ -54,7 +54,7 @@ class RegisterUse:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MemoryUse:
-    """Bytes that an instruction reads or writes: base + index * scale + displacement."""
+    """Memory that an instruction reads or writes, at base + index * scale + displacement."""
 
     base: str | None
     index: str | None = None
@@ -204,7 +204,7 @@ _X87 = re.compile(r"st\((\d)\)$")
 
 @dataclass(frozen=True, slots=True)
 class _Named:
-    """A register of an operand: bits `shift` to `shift` + `width` of the full register."""
+    """A named part of a full register: `width` bits, beginning at bit `shift`."""
 
     full: str
     shift: int
@@ -267,7 +267,7 @@ class _Operands:
             self._add(self.writes, name, named.full, written, cleared, explicit)
 
     def flag(self, name: str, *, reads: bool, defined: bool, clears: bool) -> None:
-        """Add a flag; a flag that the manual leaves undefined has no mask."""
+        """Add a read or write of a flag; the mask is 0 where the manual leaves it undefined."""
         bit = 1 << FLAG_BITS[name]
         (self.reads if reads else self.writes)[name] = RegisterUse(
             register="rflags", mask=bit * defined, clears=bit * clears, explicit=False, operand=name
@@ -306,7 +306,7 @@ _NO_ADDRESS = ("nop", "prefetch")
 
 
 def _address(decoded: Any, op: Any, all_of: _Operands) -> None:
-    """Add base and index, without the bits that the scale or a short result discards."""
+    """Add base and index registers, without bits that the scale or a short result discards."""
     width = 8 * decoded.operands[0].size if decoded.mnemonic == "lea" else 64
     if op.mem.base and not (op.mem.index == op.mem.base and op.mem.scale == 1):
         all_of.touch(

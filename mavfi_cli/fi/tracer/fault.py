@@ -3,7 +3,7 @@
 Every result names its strategy: a sampling rule with a fault model, or an emulated injector, for
 comparison with published numbers. The released sources are the reference: ROSFI as
 in MAVBench/MAV_apps, branch mavfi, and PINFI as in DependableSystemsLab/pinfi, e14c129.
-docs/reference/instructions.md describes both and how ours deviate.
+docs/reference/instructions.md describes both and how our emulations deviate from them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ DATA_REGISTERS = frozenset((Site.GENERAL, Site.FLAGS, Site.VECTOR, Site.X87, Sit
 
 
 class Role(Enum):
-    """The role of the corrupted operand: the instruction reads it or writes it."""
+    """Whether the instruction reads or writes the corrupted operand."""
 
     SOURCE = "source"  # corrupted before the instruction executes
     DESTINATION = "destination"  # corrupted after the instruction has written it
@@ -72,10 +72,10 @@ class InstructionCorruption:
     inverts: str = ""  # a conditional jump: flip only the bits that invert its decision
 
     def struck(self, flags: int) -> tuple[int, ...]:
-        """Return the bits to invert; `flags` (all flags) matters only if a jump is inverted.
+        """Return the bits to invert; `flags`, the flags register, matters only to invert a jump.
 
-        If the jump tests two conditions ("below" or "equal"), all that hold are negated. If none
-        holds, "equal" is made to hold.
+        Such a jump tests two conditions: "below" or "less", and "equal". Each one that holds is
+        negated. If neither holds, "equal" is made to hold.
         """
         if not self.inverts:
             return self.bits
@@ -96,13 +96,13 @@ class InstructionCorruption:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstructionFault:
-    """One fault. The last stage of the trigger is the attacked instruction itself."""
+    """One fault. The last stage of its trigger stops at the attacked instruction."""
 
     trigger: tuple[CountedStop, ...]
     execution: int  # k: number of the execution in the profiled scope, from 1
     instruction: str
     instruction_bytes: bytes
-    corruption: InstructionCorruption | None  # None: null injection, everything but the flip
+    corruption: InstructionCorruption | None  # None: a null run, which leaves out the flip
 
     @property
     def target(self) -> Location:
@@ -124,7 +124,7 @@ class FaultModel:
     def named(
         cls, *, sites: Iterable[str], roles: Iterable[str], field: str, bits: int
     ) -> FaultModel:
-        """Make a model from names. The default is all data registers and both roles.
+        """Make a model from names. No sites means all data registers, no roles means both.
 
         Raises:
             UnknownName: a name does not exist; the message suggests the nearest.
@@ -138,7 +138,7 @@ class FaultModel:
         )
 
     def to_json(self) -> Json:
-        """Return the model as plain values, without the fields of compat modes."""
+        """Return the model as plain values, without `implicit`, which no option sets."""
         return {
             "sites": sorted(site.value for site in self.sites),
             "roles": sorted(role.value for role in self.roles),
@@ -259,7 +259,7 @@ Draw = Callable[
 
 
 class Rule(Enum):
-    """A rule that draws the time of a fault."""
+    """A rule by which the time of a fault is drawn."""
 
     INSTRUCTION = "instruction-uniform"  # every executed instruction in scope is equally likely
     CPU_TIME = "cpu-time"  # uniform over the CPU time of the fault-free run
@@ -268,12 +268,12 @@ class Rule(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strategy:
-    """A sampling rule, and the deviations of an emulated injector."""
+    """A sampling rule with a fault model, or an emulation of another injector."""
 
     name: str
     rule: Rule
     model: FaultModel
-    imitates: Draw | None = None  # draws like another injector, instead of the model
+    imitates: Draw | None = None  # draws as another injector does, not from the model
     attempts: int = 1  # time rules: maximum number of attempts
     retry_s: float = 0.0  # time rules: delay between attempts
     whole_process: bool = False  # also hits code out of scope
@@ -287,14 +287,14 @@ class Strategy:
 
         Raises:
             UnknownName: no such rule or compatibility mode; the message suggests the nearest.
-            FaultSpecError: an emulated injector, which chooses by its own rule, is given a model.
+            FaultSpecError: a model is given for an emulated injector, which has its own.
         """
         if compat is not None:
             if compat not in COMPAT:
                 raise UnknownName("compatibility mode", compat, COMPAT)
             if model not in (None, FaultModel()):
                 raise FaultSpecError(
-                    f"{compat} cannot be combined with sites, roles, field or bits: it chooses them"
+                    f"{compat} cannot be combined with sites, roles, field or bits: it has its own"
                 )
             return COMPAT[compat]
         rule = named_member(Rule, "sampling rule", name)
@@ -306,7 +306,7 @@ class Strategy:
         rng: np.random.Generator,
         following: Instruction | None = None,
     ) -> InstructionCorruption | None:
-        """Draw a corruption of an instruction, given the next one; None if no corruption fits."""
+        """Draw a corruption of an instruction; None if none fits. `following` is the next one."""
         if self.imitates is not None:
             return self.imitates(instruction, following, rng)
         return _draw_corruption(instruction, self.model, rng)
@@ -328,7 +328,10 @@ _VECTOR = re.compile(r"([xyz])mm\d*(\d)$")
 def _draw_rosfi(
     instruction: Instruction, _following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw like ROSFI: map bits 52 to 62 (110 to 126 of XMM) to byte 0, refuse most registers."""
+    """Draw as ROSFI does: refuse most registers, and flip a bit of the lowest byte only.
+
+    It draws a bit n from 52 to 62 (110 to 126 in an XMM register), but flips bit n % 8 instead.
+    """
     drawn = _draw_corruption(instruction, _ROSFI_MODEL, rng)
     if drawn is None or drawn.operand in _ROSFI_REFUSED:
         return None
@@ -340,7 +343,7 @@ def _draw_rosfi(
 def _draw_pinfi(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw like PINFI: one bit of a register that the instruction writes, after it has executed.
+    """Draw as PINFI does: one bit of a register that the instruction writes, after it executes.
 
     If only flags are written, the conditional jump that follows is inverted. Without such a jump,
     a bit of a memory operand that the instruction also writes is flipped before the instruction
@@ -369,10 +372,10 @@ def _draw_pinfi(
 def _draw_pinfi_with_bugs(
     instruction: Instruction, following: Instruction | None, rng: np.random.Generator
 ) -> InstructionCorruption | None:
-    """Draw like PINFI with its bugs: it reads only the last digit of a vector register's name.
+    """Draw as PINFI does, including its bugs.
 
-    So it takes xmm10 to xmm15 for xmm0 to xmm5. It also looks for the bits of a YMM register in
-    its upper half.
+    It reads only the last digit of a vector register's name, so it mistakes xmm10 to xmm15 for xmm0
+    to xmm5. In a YMM register, it flips bits of the upper half only.
     """
     drawn = _draw_pinfi(instruction, following, rng)
     if drawn is None or (match := _VECTOR.match(drawn.operand)) is None:

@@ -1,8 +1,8 @@
-"""Memory maps of a process and its ELF files: objects, build ids, functions, the code in scope.
+"""Memory maps of a process and its ELF files: objects, build ids, functions and code in scope.
 
-A location is `(object, offset)`. For an ELF object the offset is the address that the linker wrote
-(what `objdump` and `nm` print), so it does not depend on where the object was loaded. Compiled
-code without a file (numba) is a named region, with offsets from its start.
+A location is `(object, offset)`. For an ELF object, the offset is the address that the linker
+assigned (as printed by `objdump` and `nm`), so it does not depend on where the object was loaded.
+Compiled code without a file (numba) is a named region, whose offsets count from its start.
 
 Functions are read from the raw symbol tables, because a library of 10 MB has tens of thousands of
 them and a slower reader would delay the mission.
@@ -54,7 +54,7 @@ class _ElfFacts:
 
     @functools.cached_property
     def functions(self) -> tuple[Function, ...]:
-        """All functions, ascending; read on first use, because most objects never need them."""
+        """All functions by address; read on first use, because they are rarely needed."""
         try:
             with open(self.path, "rb") as stream:
                 return tuple(sorted(set(_functions(ELFFile(stream)))))
@@ -64,8 +64,8 @@ class _ElfFacts:
     def function_at(self, address: int) -> Function | None:
         """Return the function that holds a linked address.
 
-        If several start at one address, the largest is returned, or the last by name among equals.
-        A function without a size extends to the next.
+        If several start at the same address, the largest is returned; among equally large ones, the
+        last by name. A function without a size extends to the next one.
         """
         end = bisect.bisect_right(self.functions, address, key=attrgetter("start"))
         if not end:
@@ -79,7 +79,7 @@ def _elf_facts(path: str, _modified_ns: int) -> _ElfFacts:
     """Read an ELF file; the hash of its contents replaces a missing build id.
 
     Raises:
-        FaultError: not an ELF file.
+        FaultError: the file cannot be read or is not an ELF file.
     """
     try:
         with open(path, "rb") as stream:
@@ -114,7 +114,7 @@ def _text(elf: Any) -> tuple[range, ...]:
 
 
 def _functions(elf: Any) -> Iterator[Function]:
-    """Return the functions of both symbol tables."""
+    """Yield the functions in both symbol tables."""
     for table in (".symtab", ".dynsym"):
         section = elf.get_section_by_name(table)
         if section is None or not section["sh_size"]:
@@ -128,7 +128,7 @@ def _functions(elf: Any) -> Iterator[Function]:
 
 
 def short_name(symbol: str) -> str:
-    """Return the last part of the qualified name in a mangled function name."""
+    """Return the unqualified name of a function from its mangled symbol."""
     mangled = symbol.partition("+")[0]
     for size in re.finditer(r"\d+", mangled):
         end = size.end() + int(size.group())
@@ -140,7 +140,7 @@ def short_name(symbol: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """One instruction, independent of the load address of its object."""
+    """The location of one instruction, independent of its object's load address."""
 
     object: str  # file name of the object, or the name of a region
     offset: int
@@ -176,13 +176,13 @@ class _LoadedObject:
 
     @property
     def functions(self) -> tuple[Function, ...]:
-        """All functions, ascending; a region has none."""
+        """All functions by address; a region has none."""
         return () if self.facts is None else self.facts.functions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
-    """Compiled code without a file, identified by its build or by its bytes in memory."""
+    """Compiled code without a file, identified by a build id or else by its bytes in memory."""
 
     span: range  # addresses
     build_id: str = ""
@@ -197,7 +197,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scope:
-    """The code in scope: the text of these objects, as addresses of one process."""
+    """The code in scope: the text of these objects, as address ranges in one process."""
 
     objects: tuple[str, ...]
     spans: tuple[range, ...]
@@ -207,7 +207,7 @@ class Scope:
 
     @property
     def bounds(self) -> NDArray[np.int64]:
-        """The first address and the end of each span, (n, 2)."""
+        """The start and end of each span, (n, 2)."""
         return np.array([[span.start, span.stop] for span in self.spans], np.int64)
 
 
@@ -221,8 +221,8 @@ class Image:
         """Read the maps of a process.
 
         Args:
-            regions: by name, the addresses of compiled code without a file, and the parts of loaded
-                objects that count as their text.
+            regions: maps a name to the addresses of compiled code without a file, or to the part of
+                a loaded object that counts as its text.
         """
         self._files: dict[str, list[_Mapping]] = {}
         for mapping in _mappings(pid):
@@ -252,7 +252,7 @@ class Image:
 
     @property
     def names(self) -> list[str]:
-        """Names of all mapped files and regions; a file need not be an object."""
+        """Names of all mapped files and regions; a file need not be an ELF object."""
         return [*self._loaded, *(name for name in self._paths if name not in self._loaded)]
 
     def path_of(self, name: str) -> str:
@@ -262,7 +262,7 @@ class Image:
     def find(self, name: str) -> _LoadedObject | None:
         """Return an object or region by its name; None if no such object is loaded.
 
-        An object is read on first use, because a Python process has hundreds.
+        An object is read on first use, because a Python process loads hundreds of them.
         """
         if name not in self._loaded:
             path = self._paths.get(name)
@@ -277,7 +277,7 @@ class Image:
         return self.find(self._sorted[index][2])
 
     def named(self, name: str) -> _LoadedObject:
-        """Return an object by its file name.
+        """Return an object or region by its name.
 
         Raises:
             UnknownName: no such object is loaded.
@@ -288,7 +288,7 @@ class Image:
         return loaded
 
     def locate(self, address: int) -> Location:
-        """Return the location of an address; unknown memory is the object `?`."""
+        """Return the location of an address; in unknown memory, its object is `?`."""
         loaded = self.object_at(address)
         if loaded is None:
             return Location("?", address)
@@ -303,7 +303,7 @@ class Image:
         return self.named(location.object).bias + location.offset
 
     def symbol(self, location: Location) -> str:
-        """Return `function+offset` of a location, or the empty string."""
+        """Return `function+offset` for a location; empty if no function is known there."""
         loaded = self.find(location.object)
         if loaded is None or loaded.facts is None:
             return ""
@@ -311,10 +311,10 @@ class Image:
         return "" if function is None else f"{function.name}+{location.offset - function.start:#x}"
 
     def function(self, name: str, objects: Iterable[str]) -> Location:
-        """Return the entry of a function in one of the named objects.
+        """Return the entry of a function in the first of the named objects that has it.
 
         Raises:
-            UnknownName: none of them has it; the message suggests the nearest.
+            UnknownName: no object has this function; the message suggests the nearest name.
         """
         known: list[str] = []
         for loaded in map(self.named, objects):
@@ -328,7 +328,7 @@ class Image:
         """Return the code of the named objects.
 
         Raises:
-            UnknownName: an object is not loaded; the message suggests the nearest.
+            UnknownName: an object is not loaded; the message suggests the nearest name.
         """
         names = tuple(objects)
         spans = [

@@ -29,14 +29,14 @@ class BitActivation(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Injection:
-    """The result of a corruption at the stop."""
+    """The result of corrupting the stopped target."""
 
     applied: bool
     reason: str  # why it was not applied; empty if it was
     address: int  # address of the corrupted memory or opcode, otherwise of the instruction
     before: int  # the full register, the opcode bytes or the memory operand
     after: int  # as read back
-    stop_s: float  # time from the stop's report until the thread resumes
+    stop_s: float  # time that the corruption took
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
     """Run the target to the exact execution that the trigger names.
 
     Returns:
-        The reason why it was not reached, or the empty string.
+        The reason why the execution was not reached; empty if it was.
     """
     for stage in fault.trigger:
         address = image.address(stage.location)
@@ -65,7 +65,7 @@ def reach(tracee: Tracee, image: Image, fault: InstructionFault) -> str:
 
 
 def instruction_at(tracee: Tracee, address: int) -> Instruction | None:
-    """Decode the instruction that the target is about to execute."""
+    """Decode the instruction at an address of the target; None if there is none."""
     try:
         return decode(tracee.memory.read(address, 16), address)
     except OSError:
@@ -76,7 +76,7 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
     """Execute one whole instruction and leave no trap flag in the target.
 
     Returns:
-        The end of the program, if it ended.
+        How the program ended; None if it did not.
     """
     if instruction is not None and instruction.run_over:
         tracee.run_to(instruction.next_address)
@@ -88,7 +88,7 @@ def clean_step(tracee: Tracee, instruction: Instruction | None) -> Ended | None:
 def _erase_trap(tracee: Tracee, instruction: Instruction) -> None:
     """Remove the trap flag that a single step of `instruction` left in the target.
 
-    `pushf` has pushed the trap flag, and a system call has saved it in r11.
+    A `pushf` has pushed the flag onto the stack, and a system call has saved it in r11.
     """
     registers, memory = tracee.registers, tracee.memory
     if instruction.mnemonic in ("pushfq", "pushf"):
@@ -179,7 +179,7 @@ def _follow(
     window: int,
     patience_s: float,
 ) -> Followed:
-    """Step until the corrupted bits are read or overwritten, or until the window or time ends."""
+    """Step until the corrupted bits are read or overwritten, or the window or time runs out."""
     if not injection.applied:
         return NOTHING
     if corruption.role is Role.SOURCE or corruption.site is Site.INSTRUCTION_POINTER:
@@ -213,8 +213,8 @@ def strike(
     Args:
         tracee: the process, stopped before that instruction.
         fault: the fault; if it has no corruption, nothing is done.
-        window: number of instructions for which a destination fault is followed.
-        patience_s: wall-clock time for which it is followed.
+        window: largest number of instructions for which a destination fault is followed.
+        patience_s: longest wall-clock time for which it is followed.
 
     Raises:
         FaultError: another instruction is at the location.
@@ -239,7 +239,7 @@ def _touch(
     place: int,
     remaining: int,
 ) -> tuple[bool, int]:
-    """Return whether an instruction reads the remaining bits, and which remain after it."""
+    """Return whether an instruction reads remaining bits, and which bits remain after it."""
     if corruption.site is Site.MEMORY:
         return _touch_memory(tracee, current, place, remaining)
     register = corruption.register

@@ -56,7 +56,7 @@ class _IoVector(ctypes.Structure):
 
 
 def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
-    """Make one ptrace request; the result of a peek is unsigned.
+    """Make one ptrace request and return its result as an unsigned integer.
 
     Raises:
         OSError: the request failed; it carries the errno.
@@ -71,7 +71,7 @@ def request(number: int, tid: int, address: int = 0, data: int = 0) -> int:
 
 
 def require_supported() -> None:
-    """Refuse to trace on an unsupported processor.
+    """Refuse to trace on an unsupported machine.
 
     Raises:
         TracingForbidden: this is not x86-64 Linux.
@@ -85,7 +85,7 @@ def require_supported() -> None:
 
 
 def seize(tid: int, *, kill_with_tracer: bool) -> None:
-    """Attach to a thread without stopping it; the kernel attaches new threads and children.
+    """Attach to a thread without stopping it, and to all threads and children that it starts.
 
     Raises:
         TracingForbidden: the operating system refuses; the message explains how to allow it.
@@ -118,7 +118,7 @@ def set_registers(tid: int, note: int, data: bytes) -> None:
 
 
 class Memory:
-    """The memory of a process, whatever its protection; opened on first use.
+    """The memory of a process, accessible whatever its protection; opened on first use.
 
     Reading and writing raise OSError where nothing is mapped.
     """
@@ -136,7 +136,7 @@ class Memory:
         return os.pread(self._open(), size, address)
 
     def write(self, address: int, data: bytes) -> None:
-        """Write bytes; the kernel makes a private copy of a file's page."""
+        """Write bytes at an address; the kernel first copies a page that is privately mapped."""
         os.pwrite(self._open(), data, address)
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class Memory:
 
 @contextmanager
 def fixed_addresses() -> Iterator[None]:
-    """Start programs without address-space randomisation in this context: addresses repeat."""
+    """Disable address-space randomisation for programs that are started in this context."""
     before = int(_personality(0xFFFF_FFFF))
     if before == -1 or int(_personality(before | ADDR_NO_RANDOMIZE)) == -1:
         yield  # a sandbox may refuse; then only offsets repeat, not addresses
@@ -162,8 +162,9 @@ def fixed_addresses() -> Iterator[None]:
 def share_processor(pid: int) -> None:
     """Pin the calling thread and the main thread of `pid` to the processor where `pid` ran last.
 
-    Tracer and target alternate at every step, which is twice as fast on one processor. Nothing
-    unpins them, so call it only from a thread and for a process created for this purpose.
+    Tracer and target alternate at every step, and stepping is twice as fast if they share one
+    processor. Nothing unpins them, so call this only in a thread, and for a process, created for
+    this purpose.
     """
     stat = Path(f"/proc/{pid}/stat").read_text()
     processor = int(stat.rpartition(")")[2].split()[36])  # field 39, proc_pid_stat(5)
@@ -196,7 +197,7 @@ class Status:
 
     @property
     def ended(self) -> bool:
-        """True if the thread is gone."""
+        """True if the thread has ended."""
         return os.WIFEXITED(self.raw) or os.WIFSIGNALED(self.raw)
 
     @property
@@ -226,12 +227,12 @@ def wait(tid: int) -> Status:
 
 
 class ProcessTimer:
-    """A timer on one process; leaving its context cancels it.
+    """A timer that sends a signal to one process; leaving its context cancels it.
 
     It fires when the process has used `cpu_s` of CPU time since the timer was set, or when
-    `wall_s` has passed, whichever is set and comes first. `fired` is true from then on. If the
-    timer has killed a stopped process, the next request to that process ends the context without
-    an error.
+    `wall_s` has passed, whichever comes first; None sets no limit. `fired` is true from then on. If
+    the timer kills a stopped process, the next request to that process fails; the context ends
+    then, without an error.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
-"""The fault record, a JSON file that states what will be struck, and then what was struck.
+"""The fault record: a JSON file that first states what will be struck, and later what was struck.
 
-It is flushed to the disk *before* the target runs to the trigger, so that it survives any effect
+It is flushed to disk *before* the target runs to the trigger, so that it survives any effect
 of the fault. It is completed afterwards. Each write leaves the old file or the new one, never a
 partial one.
 """
@@ -38,8 +38,8 @@ def planned(
 
     Args:
         image: image of the process, for symbols and build ids.
-        names_symbol: include the symbol; reading those of a large object takes seconds.
-        context: further entries: seed, sampling rule, scope, kernel, program, run.
+        names_symbol: include the symbol; reading the symbols of a large object takes seconds.
+        context: further entries, such as seed, sampling rule, scope, kernel, program and run.
     """
     target = fault.target
     record = {
@@ -87,7 +87,7 @@ def _stage_to_json(stage: CountedStop) -> StageRecord:
 def completed(
     record: FaultRecord, injection: Injection | None, followed: Followed, **result: Any
 ) -> FaultRecord:
-    """Return the record after the run. `injection` is None if the trigger was not reached."""
+    """Return the record after the run. `injection` is None for a null run or a missed trigger."""
     what: Json = {"applied": False}
     if injection is not None:
         values = {"before": hex(injection.before), "after": hex(injection.after)}
@@ -98,7 +98,7 @@ def completed(
 
 
 def repeatable(written: FaultRecord) -> dict[str, Any]:
-    """Return a completed record without the measured time of the stop."""
+    """Return a completed record with its final state, but without the duration of the stop."""
     injection = {k: v for k, v in written["injection"].items() if k != "stop_s"}
     reason = written.get("not_injected_reason", "")
     state = "applied" if injection["applied"] else "not_injected"
@@ -126,10 +126,10 @@ def describe(written: FaultRecord) -> str:
 
 
 def fault_of(record: FaultRecord) -> InstructionFault:
-    """Read the fault that a record describes, to repeat it.
+    """Return the fault that a record describes, so that it can be repeated.
 
     Raises:
-        RecordError: not a fault record, or one of another version.
+        RecordError: the record is damaged or has another version.
     """
     if record.get("version") != VERSION:
         raise RecordError(f"not a fault record of version {VERSION}")
@@ -159,7 +159,7 @@ def _corruption_of(data: Mapping[str, Any]) -> InstructionCorruption:
 
 
 def require_same_build(record: FaultRecord, image: Image) -> None:
-    """Refuse a record whose objects are not the loaded ones.
+    """Refuse a record whose objects differ from the loaded ones.
 
     Raises:
         BuildMismatch: an object is missing or of another build; the message names all such
@@ -177,7 +177,7 @@ def require_same_build(record: FaultRecord, image: Image) -> None:
 
 
 def write(path: Path, record: FaultRecord) -> None:
-    """Write a record and flush it to the disk before returning.
+    """Write a record and flush it to disk before returning.
 
     Raises:
         RecordError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""The fields of a fault record that mavfi reads, separate from the code that writes them."""
+"""Types of the fault record's fields that mavfi reads; importing them does not load the tracer."""
 
 from __future__ import annotations
 

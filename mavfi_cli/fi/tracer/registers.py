@@ -47,7 +47,7 @@ def _cpuid(leaf: int, subleaf: int) -> tuple[int, int, int, int]:
 
 @functools.lru_cache(maxsize=1)
 def _xsave_offsets() -> dict[int, int]:
-    """Return the offsets of XSAVE components 2 and above, bytes, in the standard format."""
+    """Return the byte offsets of XSAVE components 2 and above in the standard format."""
     low, _, _, high = _cpuid(0xD, 0)
     enabled = low | high << 32
     return {n: _cpuid(0xD, n)[1] for n in range(2, 63) if enabled >> n & 1}
@@ -79,7 +79,7 @@ def widest_vector() -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """Bytes of the extended state that hold part of a register, with the component's number."""
+    """Bytes of the XSAVE area that hold part of a register, and the number of their component."""
 
     component: int
     offset: int
@@ -102,7 +102,7 @@ def width_of(name: str) -> int:
 
 
 def _vector_spans(kind: str, index: int) -> list[_Span]:
-    """Return the parts of a vector register that this processor has."""
+    """Return where a vector register is stored, without parts that this processor lacks."""
     parts = {"xmm": 1, "ymm": 2, "zmm": 3}[kind]
     offsets = _xsave_offsets()
     if index >= 16:
@@ -141,7 +141,7 @@ class Registers:
         return self._general
 
     def extended(self) -> bytes:
-        """Return the XSAVE area in standard format."""
+        """Return the thread's XSAVE area in the standard format."""
         if self._extended is None:
             buffer = ctypes.create_string_buffer(16384)
             size = linux.get_registers(self.tid, NT_X86_XSTATE, buffer)
@@ -161,7 +161,7 @@ class Registers:
         return int.from_bytes(b"".join(parts), "little")
 
     def write(self, name: str, value: int) -> None:
-        """Write a full register. Read it back for the value that the kernel stored.
+        """Write a full register. Read it back to see which value the kernel stored.
 
         Raises:
             OSError: the kernel refuses the value.
@@ -215,8 +215,8 @@ class Registers:
     def rearm(self) -> None:
         """Clear the resume flag, so that a breakpoint on the next instruction hits.
 
-        A stop at an instruction breakpoint leaves the resume flag set, which hides the next
-        execution (Intel SDM volume 3, section 18.3.1.1).
+        A stop at an instruction breakpoint leaves this flag set, and the flag suppresses the
+        breakpoint for the next instruction (Intel SDM volume 3, section 18.3.1.1).
         """
         flags = self.read("rflags")
         if flags & _RESUME_FLAG:

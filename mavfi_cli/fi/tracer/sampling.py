@@ -1,9 +1,9 @@
 """The population from which a fault is drawn: windows of executed instructions.
 
-A window of the golden run is single-stepped, and the addresses of the instructions in scope are
-recorded, so that sampling can be uniform over them. Code out of scope runs natively. Meanwhile
-every byte of the code in scope is a breakpoint instruction, which catches every re-entry (return,
-callback, exception).
+A window of the golden run is single-stepped. The address of every executed instruction in scope is
+recorded, so that faults can be drawn uniformly from these instructions. Code out of scope runs
+natively. Meanwhile, every byte of the code in scope is replaced by a breakpoint instruction, which
+catches every re-entry (return, callback, exception).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _CHUNK = 16384
 _BREAKPOINT = b"\xcc"  # the instruction
 _STAGE_COST = 12  # a further stop costs about as much as 12 counted hits
 _HORIZON = 1 << 20
-_NEAR = 16  # instructions before the target that are searched for a detour
+_NEAR = 16  # instructions before the target that are tried as places for a detour
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class Segment:
 
     @functools.cached_property
     def ranks(self) -> NDArray[np.int64]:
-        """(n,) at each position, which execution of its instruction this is, from 1."""
+        """For each position, the execution number of its instruction, from 1, (n,)."""
         order = np.argsort(self.trace, kind="stable")
         ordered = self.trace[order]
         fresh = np.r_[True, ordered[1:] != ordered[:-1]]
@@ -57,12 +57,12 @@ class Stratum:
     """The windows that begin at one instruction; some of them were stepped."""
 
     segments: tuple[Segment, ...]
-    windows_in_run: int  # all windows of the run; the stepped ones are a sample
+    windows_in_run: int  # number of all windows; the stepped ones are a sample
     marker: Location | None = None  # None: the start of the run
-    detours: bool = True  # whether detours count executions
+    detours: bool = True  # whether detours may count executions
 
     def without_detours(self) -> Stratum:
-        """Return the same windows, without detours on the way to an execution."""
+        """Return the same windows, with triggers that use no detours."""
         segments = (
             replace(segment, start=tuple(replace(stop, detour=None) for stop in segment.start))
             for segment in self.segments
@@ -71,12 +71,12 @@ class Stratum:
 
     @property
     def instructions(self) -> float:
-        """Number of executed instructions of all windows, estimated from the stepped ones."""
+        """Number of executed instructions in all windows, estimated from the stepped ones."""
         return self.executed / len(self.segments) * self.windows_in_run
 
     @property
     def executed(self) -> int:
-        """Number of executed instructions in scope, over the stepped windows."""
+        """Number of executed instructions in scope in the stepped windows."""
         return sum(len(segment.trace) for segment in self.segments)
 
     @property
@@ -85,18 +85,18 @@ class Stratum:
         return len(self.segments) == self.windows_in_run
 
     def address(self, position: int) -> int:
-        """Return the address of one executed instruction, counted over all segments."""
+        """Return the address of one executed instruction; positions run through all segments."""
         segment, index = self._at(position)
         return int(segment.trace[index])
 
     def trigger(
         self, position: int, locate: Locate, code_at: CodeAt
     ) -> tuple[tuple[CountedStop, ...], int]:
-        """Return the trigger of one executed instruction, and k, its execution number."""
+        """Return the trigger for one executed instruction, and its execution number k."""
         return _plan_trigger(*self._at(position), locate, code_at if self.detours else None)
 
     def _at(self, position: int) -> tuple[Segment, int]:
-        """Return the segment and index of one executed instruction, counted over all segments."""
+        """Return the segment of a position, and its index there; see `address`."""
         for segment in self.segments:
             if position < len(segment.trace):
                 return segment, position
@@ -130,13 +130,14 @@ def record_window(
     Args:
         tracee: the process, stopped at the start of the window.
         scope: the code whose instructions are recorded.
-        until_return: the target is at a function's entry; the window ends when it returns.
-        markers: addresses in scope; the window ends before the next execution of one. The
-            window always contains the instruction at which the target is stopped.
+        until_return: the target is at a function's entry; the window ends when the function
+            returns.
+        markers: addresses in scope; the window ends before the next execution of any of them. It
+            always contains the instruction at which the target is stopped.
         watch: called regularly with the number of instructions recorded since the last call.
 
     Raises:
-        WindowTooLong: more than `limit` instructions in scope.
+        WindowTooLong: more than `limit` instructions in scope are executed.
     """
     stop = np.array([-1, 0, *markers], np.int64)
     if until_return:
@@ -178,14 +179,14 @@ def _parts(tracee: Tracee, scope: Scope, stop: NDArray[np.int64]) -> Iterator[ND
 
 
 class _Blanket:
-    """Covers the code in scope with breakpoint instructions while foreign code runs."""
+    """Covers the code in scope with breakpoint instructions while other code runs."""
 
     def __init__(self, tracee: Tracee, scope: Scope) -> None:
         self._tracee, self._scope = tracee, scope
         self._code = {span.start: tracee.memory.read(span.start, len(span)) for span in scope.spans}
 
     def run_native(self, stop: NDArray[np.int64]) -> bool:
-        """Run foreign code. Return False if the program or the window's function ended."""
+        """Run code out of scope. Return False if the program or the window's function ended."""
         tracee, registers, returns_to = self._tracee, self._tracee.registers, int(stop[0])
         with contextlib.ExitStack() as undo:
             if returns_to > 0 and returns_to not in self._scope:
@@ -209,7 +210,7 @@ class _Blanket:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Way:
-    """Stages to an executed instruction of a segment, and their cost in counted hits."""
+    """The stages of a trigger for one executed instruction, and their cost in counted hits."""
 
     cost: int
     stages: tuple[CountedStop, ...]
@@ -223,14 +224,15 @@ def _plan_trigger(
 ) -> tuple[tuple[CountedStop, ...], int]:
     """Plan the cheapest exact trigger of one executed instruction of a segment.
 
-    All counted hits cost the same. So the trigger first counts to a rarely executed instruction
-    shortly before the target and then counts the target's executions, or uses a detour.
+    Every counted hit costs the same. If many hits would be needed, the trigger first counts to a
+    rarely executed instruction shortly before the target and then counts the target's executions,
+    or it uses a detour.
 
     Args:
-        code_at: 16 bytes of code at an address; None forbids detours.
+        code_at: returns 16 bytes of code at an address; None forbids detours.
 
     Returns:
-        The trigger, and k, the execution number of its instruction in the segment.
+        The trigger, and the target's execution number k in the segment.
     """
     target, k = locate(int(segment.trace[index])), int(segment.ranks[index])
     best = _Way(cost=k, stages=(CountedStop(target, k),))
@@ -242,7 +244,7 @@ def _plan_trigger(
 
 
 def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
-    """Count to the instruction before the target that makes the cost lowest."""
+    """Yield the cheapest way that first stops at an earlier instruction, if it saves hits."""
     target, k = segment.trace[index], int(segment.ranks[index])
     first = max(0, index - _HORIZON)
     before = segment.trace[first:index] == target
@@ -254,7 +256,7 @@ def _anchored(segment: Segment, index: int, locate: Locate) -> Iterator[_Way]:
 
 
 def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> Iterator[_Way]:
-    """Count by a detour, at the target or at the nearest instruction before it where one fits."""
+    """Yield a way with a detour at the target, or at the nearest earlier place where one fits."""
 
     def executions(address: int) -> int:
         return int(np.count_nonzero(segment.trace == address))
@@ -269,7 +271,7 @@ def _detoured(segment: Segment, index: int, locate: Locate, code_at: CodeAt) -> 
 def _through(
     segment: Segment, place: int, index: int, locate: Locate, detour: Detour | None = None
 ) -> _Way:
-    """Count to one executed instruction, and from there to the target."""
+    """Return the way that counts to one executed instruction, and from there to the target."""
     rank, target = int(segment.ranks[place]), segment.trace[index]
     stages = [CountedStop(locate(int(segment.trace[place])), rank, detour)]
     cost = rank if detour is None else min(rank, DETOUR_COST)
@@ -290,11 +292,11 @@ def draw_fault(
 ) -> InstructionFault:
     """Draw a fault uniformly from the executed instructions with an operand the model allows.
 
-    If an instruction has no such operand, another is drawn, so that the rest stay equally likely.
+    If an instruction has no such operand, another one is drawn, so the others stay equally likely.
 
     Args:
         plan: a strategy whose rule is instruction-uniform.
-        code_at: 16 bytes of code at an address.
+        code_at: returns 16 bytes of code at an address.
 
     Raises:
         FaultError: no executed instruction in scope has such an operand.
@@ -336,7 +338,7 @@ def draw_fault_here(
         execution: execution number to record.
 
     Returns:
-        The fault, or None and the reason.
+        The fault, or None and the reason why none was drawn.
     """
     here = tracee.registers.ip
     if tracee.registers.system_call is not None and not plan.in_system_calls:

@@ -22,9 +22,10 @@ from mavfi_cli.fi.tracer import linux
 from mavfi_cli.fi.tracer.registers import CALL_ARGUMENTS
 from mavfi_cli.fi.tracer.tracee import Mechanism, Tracee
 
-# The shell reports that it runs (its own exec is over) and waits for a line (so that the tracer can
-# attach before the program starts). A corrupted program leaves no core file and has bounded output
-# (blocks of 512 bytes) and memory (KiB). Its environment does not depend on the working directory.
+# The shell reports that it is running (its own exec is over), then waits for a line, so that the
+# tracer can attach before the program starts. A corrupted program leaves no core file, and its
+# output (in blocks of 512 bytes) and memory (in KiB) are limited. Without PWD and OLDPWD, its
+# environment does not depend on the working directory.
 _LAUNCHER = (
     'ulimit -c 0; ulimit -f 2097152; ulimit -v "$1"; echo >&3 && read -r go <&3 && '
     'cd -- "$2" && shift 2 && unset PWD OLDPWD && exec "$@" 3<&-'
@@ -61,8 +62,8 @@ class Program:
         """Make a command. Its program is looked up on the PATH.
 
         Args:
-            environment: by default the variables of this process for paths, language and number of
-                threads.
+            environment: the program's environment; by default, this process's variables for paths,
+                language, time zone and number of threads.
             variables: additional or changed variables.
 
         Raises:
@@ -70,7 +71,7 @@ class Program:
         """
         program = shutil.which(argv[0])
         if program is None:
-            raise TargetError(argv[0], "no such program, or it is not executable")
+            raise TargetError(argv[0], "the program was not found or is not executable")
         chosen = _kept_environment() if environment is None else environment
         return cls(
             argv=(str(Path(program).resolve()), *argv[1:]),
@@ -82,7 +83,7 @@ class Program:
 
 
 def _kept_environment() -> dict[str, str]:
-    """Return this process's environment without variables that differ between shells."""
+    """Return this process's variables for paths, language, time zone and number of threads."""
     return {
         name: value
         for name, value in os.environ.items()
@@ -118,7 +119,7 @@ def spawn(
 
 
 def run_to_entry(tracee: Tracee) -> bool:
-    """Run to the program's entry point, where its shared libraries are mapped.
+    """Run to the program's entry point; its shared libraries are mapped by then.
 
     Returns:
         False if the program ended first, for example because a library is missing.
@@ -161,7 +162,7 @@ def _await_exec(tracee: Tracee, command: Program) -> None:
 
 
 def _fix_random_bytes(tracee: Tracee) -> None:
-    """Replace the random bytes that the kernel passes to a program before it starts.
+    """Replace the random bytes that the kernel passes to a new program by fixed bytes.
 
     libc derives its stack canary from them.
     """
@@ -171,7 +172,7 @@ def _fix_random_bytes(tracee: Tracee) -> None:
 
 
 def _auxiliary(pid: int, key: int) -> int | None:
-    """Return a value of the auxiliary vector of a program (getauxval(3))."""
+    """Return one value of a program's auxiliary vector (getauxval(3)); None if it is missing."""
     words = struct.iter_unpack("=QQ", Path(f"/proc/{pid}/auxv").read_bytes())
     return next((value for name, value in words if name == key), None)
 
@@ -209,10 +210,10 @@ class ObservedRun:
 
     Attributes:
         started: description of the first thread, child or program that it started; empty if none.
-            The rest of the run was not observed.
-        written: absolute paths that it wrote, made, renamed or removed, in order.
-        terminal: whether it requested a terminal.
-        lacked_memory: whether it was refused memory.
+            After such a start, the rest of the run was not observed.
+        written: absolute paths that it opened for writing, created, renamed or removed, in order.
+        terminal: whether it tried to use a terminal.
+        lacked_memory: whether the operating system refused it memory.
     """
 
     started: str = ""
@@ -248,7 +249,7 @@ def watch(tracee: Tracee, *, wall_s: float) -> ObservedRun:
 
 
 def _record_entry(tracee: Tracee, observed: ObservedRun) -> None:
-    """Record what a system call requests, at its entry."""
+    """At the entry of a system call, record what it requests."""
     registers = tracee.registers
     number = registers.system_call
     if number == _IOCTL:
@@ -267,13 +268,13 @@ def _record_entry(tracee: Tracee, observed: ObservedRun) -> None:
 
 
 def _record_exit(tracee: Tracee, observed: ObservedRun) -> None:
-    """Record whether a system call was refused memory, at its end."""
+    """At the exit of a system call, record whether it was refused memory."""
     refused = _signed(tracee.registers.read("rax"), 64) == _NO_MEMORY
     observed.lacked_memory |= refused and tracee.registers.system_call in _MAPS
 
 
 def _absolute(pid: int, folder: int, path: str) -> str:
-    """Resolve a path against the process's folder or that of a descriptor."""
+    """Resolve a path against the process's working directory or the folder of a descriptor."""
     base = f"/proc/{pid}/cwd" if folder == _HERE else f"/proc/{pid}/fd/{folder}"
     try:
         return os.path.normpath(Path(os.readlink(base)) / path)
@@ -287,7 +288,7 @@ def _signed(value: int, bits: int) -> int:
 
 
 def _text(memory: linux.Memory, address: int) -> str:
-    """Return the text at an address; empty if there is none."""
+    """Return the NUL-terminated text at an address; empty if it cannot be read."""
     try:
         data = memory.read(address, 4096 - address % 4096)
         if b"\0" not in data:

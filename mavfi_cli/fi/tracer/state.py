@@ -1,4 +1,4 @@
-"""Compares all state that stopped forks of one process retain.
+"""Compares all the state that stopped forks of one process retain.
 
 A fork shares the pages of its process until it writes to them, and then owns a copy. So two forks
 can differ only in pages that one of them owns (bit 56 of the page map, proc_pid_pagemap(5)), in
@@ -38,9 +38,9 @@ class StoppedFork:
     """A fork that is stopped at the start of a system call.
 
     Attributes:
-        calls: number and arguments of its system calls since the forks were identical.
-        clock: bytes of a clock reading in its memory, where copies may be unaligned; they count as
-            zeros.
+        calls: number and arguments of each of its system calls since the forks were identical.
+        clock: the bytes of a clock reading. All copies of them in its memory, even unaligned ones,
+            count as zeros.
     """
 
     tracee: Tracee
@@ -52,7 +52,7 @@ class StoppedFork:
         return Path(f"/proc/{self.tracee.pid}")
 
     def _outline(self) -> tuple[object, ...]:
-        """Return what is compared directly: calls, registers, mappings, signals and threads."""
+        """Return the values to compare directly: calls, registers, mappings, signals, threads."""
         registers = self.tracee.registers
         vector = registers.extended()
         return (
@@ -68,7 +68,7 @@ class StoppedFork:
         return (self._process / "maps").read_text()
 
     def _own_pages(self) -> NDArray[np.int64]:
-        """Return the numbers of the pages that the fork may not share with the process."""
+        """Return the numbers (n,) of pages that the fork alone maps or that are swapped out."""
         numbers = []
         with (self._process / "pagemap").open("rb", buffering=0) as table:
             for line in self._maps().splitlines():
@@ -81,7 +81,7 @@ class StoppedFork:
         return np.concatenate(numbers)
 
     def _words(self, pages: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Return the contents of pages (n,) as words, with zeros for what is ignored."""
+        """Return the contents of pages (n,) as words (n, 512), with ignored words set to 0."""
         memory, data = self.tracee.memory, bytearray()
         for run in np.split(pages, np.flatnonzero(np.diff(pages) != 1) + 1):
             data += memory.read(int(run[0]) * _PAGE, len(run) * _PAGE)
@@ -105,7 +105,8 @@ def remembers_the_same(struck: StoppedFork, unstruck: Sequence[StoppedFork]) -> 
     """Return True if a struck fork can no longer behave differently from unstruck ones.
 
     Args:
-        unstruck: two forks; words of memory in which they differ hold clock readings.
+        unstruck: two unstruck forks. Memory words in which they differ from each other are assumed
+            to hold clock readings, and are ignored.
 
     Raises:
         OSError: the operating system does not allow the memory to be read.

@@ -1,7 +1,7 @@
 """The compiled single-step loop, in which a step costs little more than its system calls.
 
-The loop returns to Python for code out of scope, a system call, a push or pop of flags or a signal.
-`ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
+The loop returns to Python for code out of scope, a system call, a push or pop of the flags, or a
+signal. `ptrace` and `wait4` are resolved by name at run time, so the compiled loop can be cached.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _PEEKTEXT, _PEEKUSER, _SINGLESTEP = 1, 3, 9
 _OF_OWN_THREAD = 0x6000_0000  # __WALL and __WNOTHREAD, as in `Tracee`
 _STOPPED_BY_STEP = 0x057F  # wait status: stopped by SIGTRAP
 
-# Why recording returned: the trace is full, foreign code is next, a step over the next instruction
-# would leave traces, the report was not that of a step, or the window is over.
+# Why the loop returned: the trace is full, code out of scope is next, a step over the next
+# instruction would change the target, the report was not that of a step, or the window has ended.
 FULL, OUT_OF_SCOPE, NEEDS_CARE, OTHER_STATUS, WINDOW_END = 0, 1, 2, 3, 4
 _IP, _SP = 128, 152  # offsets in `struct user`
 NO_END = np.array([-1, 0], np.int64)
-"""The `stop` of a window without an end."""
+"""The argument `stop` for a window without an end."""
 
 _ptrace: Any = types.ExternalFunction(
     "ptrace", types.int64(types.int64, types.int64, types.uint64, types.uint64)
@@ -36,7 +36,7 @@ _wait4: Any = types.ExternalFunction(
 
 @compiled
 def _is_repeated(word: int) -> bool:
-    """Return True for F2 or F3, an optional REX and a string opcode (Intel SDM volume 2, REP)."""
+    """Return True if `word` begins a repeated string instruction (Intel SDM volume 2, REP)."""
     first = word & 0xFF
     if first != 0xF2 and first != 0xF3:
         return False
@@ -48,7 +48,7 @@ def _is_repeated(word: int) -> bool:
 
 @compiled
 def _needs_care(word: int) -> bool:
-    """Return True for a push or a pop of the flags, or a system call."""
+    """Return True if `word` begins a push or pop of the flags, or a system call."""
     first = word & 0xFF
     second = (word >> 8) & 0xFF
     code = second if first == 0x66 or 0x40 <= first <= 0x4F else first
@@ -96,8 +96,8 @@ def _run(
 
 
 def load() -> None:
-    """Load the compiled loop, or compile it, which takes seconds."""
-    # There is no thread 0, so both its pointers read as -1, where this window ends: no wait begins.
+    """Load the compiled loop from the cache, or compile it, which takes seconds."""
+    # Thread 0 does not exist: its pointers read as -1, where this window ends before any wait.
     ends_at_once = np.array([-1, -2], np.int64)
     record_steps(0, 0, np.empty((0, 2), np.int64), np.empty(0, np.int64), ends_at_once)
 
@@ -109,15 +109,15 @@ def record_steps(
     trace: NDArray[np.int64],
     stop: NDArray[np.int64],
 ) -> tuple[int, int, linux.Status]:
-    """Single-step a stopped thread and record the addresses of instructions before they execute.
+    """Single-step a stopped thread, and record each instruction's address before it executes.
 
     Args:
         group: `Tracee.group`. A report about another of its threads ends the recording, because
             Linux reports the end of a process only after the ends of its threads have been read.
         spans: (n, 2) addresses in scope.
         trace: (m,) filled from the start; a repeated string instruction is one entry.
-        stop: (2 + n,) the window ends at the first address once the stack pointer is above the
-            second number, and at each of the other addresses.
+        stop: (2 + n,) an address, a stack pointer and n further addresses. The window ends at the
+            first address if the stack pointer is above the given one, and at any further address.
 
     Returns:
         The number of recorded addresses, why the recording ended, and the last report.

@@ -10,9 +10,9 @@ the kernel counts the hits of a hardware breakpoint and raises SIGTRAP on the k-
 so it works in virtual machines. With `DEBUG`, the tracer writes the debug register itself and
 counts, with one stop per hit.
 
-Both take microseconds per hit. If no jump leads into the middle of the instructions at the counted
-address, many hits are counted in the target itself, by a detour. By the time the target has
-stopped, the detour is removed and the memory restored.
+Both take microseconds per hit. Many hits are therefore counted in the target itself, by a detour,
+provided that no jump leads into the middle of the instructions at the counted address. By the time
+the caller sees the stop, the detour has been removed and the memory restored.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class _DebugBreakpoint:
         self._tid = tid
         self._enable(0)
         self._poke(0, address)
-        self._enable(1)  # enable for the thread; type execute and length 1 are zeros
+        self._enable(1)  # enable it for the thread; zeros mean type execute, length 1
 
     def close(self) -> None:
         """Remove the breakpoint; the thread must be stopped or gone."""
@@ -120,7 +120,7 @@ class ExecutionCounter:
 
     Args:
         stop_at: the thread traps before this execution; 0: never.
-        inherited: threads that it starts get counters of their own.
+        inherited: threads that this thread starts get counters of their own.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class ExecutionCounter:
         self._fd = _open_event(tid, address, stop_at, inherited=inherited)
 
     def read(self) -> int:
-        """Return the executions since the counter was opened, even after the thread has ended."""
+        """Return the number of executions since the start, even after the thread has ended."""
         return int.from_bytes(os.read(self._fd, 8), "little")
 
     def close(self) -> None:
@@ -161,7 +161,7 @@ def _signal_code(tid: int) -> int:
 
 
 def _signal_of(status: linux.Status) -> int:
-    """Return the signal that a stop delivers to its thread, or 0 if it is the tracer's own."""
+    """Return the signal that a stop delivers to its thread; 0 for none or the tracer's own."""
     if not status.stopped or status.event:
         return 0
     ours = status.signal == signal.SIGTRAP and _signal_code(status.tid) == _TRAP_PERF
@@ -178,14 +178,14 @@ def threads_of(pid: int) -> list[int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """The end of a process. At most one field is set; neither is if the status is unknown."""
+    """How a process ended. At most one field is set, and none if the status is unknown."""
 
     exit_code: int | None
     signal: int | None
 
     @classmethod
     def of(cls, code: int) -> Ended:
-        """Convert an exit code as `subprocess` returns it: a negative one is a signal."""
+        """Convert an exit code in the form of `subprocess`: a negative one is a signal."""
         return cls(exit_code=None, signal=-code) if code < 0 else cls(exit_code=code, signal=None)
 
     def describe(self) -> str:
@@ -209,7 +209,7 @@ class EndWatch:
         self._poller.register(self._descriptor, select.POLLIN)
 
     def look(self) -> Ended | None:
-        """Return how the process ended, or None. Once reaped, its status is unknown."""
+        """Return how the process ended; None if it has not. Once reaped, its status is unknown."""
         if not self._poller.poll(0):
             return None
         try:
@@ -232,7 +232,7 @@ class Tracee:
 
     pid: int
     tid: int
-    group: int  # argument of waitpid: -process group, the process, or any child of this thread
+    group: int  # argument of waitpid: minus the process group, the process, or -1 for any child
     mechanism: Mechanism = Mechanism.PERF
     ended: Ended | None = None
     signals: list[int] = field(default_factory=list)  # signals delivered to the process, in order
@@ -252,12 +252,12 @@ class Tracee:
     ) -> Tracee:  # fmt: skip
         """Attach to every thread of a running process and stop one of them, the target.
 
-        The attaching thread must have no other children that other code waits for.
+        The attaching thread must have no other child that other code waits for.
 
         Args:
             thread: the target; None for the main thread.
             mechanism: how executions are counted; by default the best that is allowed.
-            alone: the process has one thread; the attaching thread may trace other processes.
+            alone: the process has only one thread. The attaching thread may trace others as well.
 
         Raises:
             TracingForbidden: the operating system refuses.
@@ -266,7 +266,7 @@ class Tracee:
         seized: set[int] = set()
         while missing := [t for t in threads_of(pid) if t not in seized]:
             for each in missing:
-                # It may have ended between the listing and the attach.
+                # The thread may have ended between the listing and the attach.
                 with contextlib.suppress(ProcessLookupError):
                     linux.seize(each, kill_with_tracer=True)
                 seized.add(each)
@@ -310,7 +310,7 @@ class Tracee:
     def run_to(self, address: int, count: int = 1, detour: Detour | None = None) -> bool:
         """Run until the target thread is about to execute `address` for the `count`-th time.
 
-        If the thread is stopped just before an execution, this execution counts as the first.
+        If the thread is already stopped before an execution of `address`, that one is the first.
 
         Args:
             detour: the location of a detour that can count the executions.
@@ -456,7 +456,7 @@ class Tracee:
         return calls
 
     def system_call(self, number: int, *arguments: int) -> int:
-        """Make the stopped target execute a system call and restore its state."""
+        """Make the stopped target execute a system call, then restore its state."""
         before, here = self.registers.general(), self.registers.ip
         code = self.memory.read(here, len(_SYSTEM_CALL))
         self.memory.write(here, _SYSTEM_CALL)
@@ -487,7 +487,7 @@ class Tracee:
         self.registers.write_together({"rip": start, "rax": call})
 
     def connect(self, descriptor: int, address: bytes) -> None:
-        """Replace a socket with a stream socket that is connected to a Unix address.
+        """Replace a socket of the target with a stream socket connected to a Unix address.
 
         Raises:
             OSError: the operating system refuses.
@@ -503,10 +503,10 @@ class Tracee:
         self.memory.write(place, kept)
 
     def detach(self) -> None:
-        """Let the process and its children continue without a tracer, or note its end.
+        """Let the process and its children continue without a tracer, or record its end.
 
-        The target thread must be stopped. A thread that has left its process, such as a killed one,
-        is awaited like all others, because Linux reports the main thread's end last.
+        The target thread must be stopped. Even a thread that no longer appears in its process, such
+        as a killed one, is awaited, because Linux reports the main thread's end last.
         """
         self.memory.close()
         while self.ended is None and (left := self._traced() - {self.tid}):
@@ -542,7 +542,7 @@ class Tracee:
             except OSError:  # it has ended
                 return False
 
-        # Processes first: a machine has many threads, and the target is stopped meanwhile.
+        # Check processes first: there may be many threads, and the target is stopped meanwhile.
         processes = [int(pid) for pid in os.listdir("/proc") if pid.isdigit()]
         return {
             thread
@@ -553,7 +553,7 @@ class Tracee:
         }
 
     def kill(self) -> Ended:
-        """Kill the process and its children, and wait until all are gone."""
+        """Kill the process, and its group if we started it, and wait until all have ended."""
         if self.ended is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -564,7 +564,7 @@ class Tracee:
         return self.ended
 
     def _kill_descendants(self) -> None:
-        """Kill the process group of a program that we started."""
+        """Kill the process group of a program that we started, and wait for its end."""
         try:
             os.killpg(-self.group, signal.SIGKILL)
             while True:
@@ -591,7 +591,7 @@ class Tracee:
         return self.handle(self._wait(), how)
 
     def handle(self, status: linux.Status, how: int) -> Ended | None:
-        """Handle a report and its successors, until the target stops for the caller or ends.
+        """Handle a report and those after it, until the target stops for the caller or ends.
 
         Args:
             how: the request that resumes the target after a stop that the caller does not await.
@@ -633,7 +633,7 @@ class Tracee:
                 self._continue(status, linux.CONT)
 
     def _trapped(self, status: linux.Status) -> bool:
-        """Return True if the caller awaits this stop of the target; False if the target runs on."""
+        """Return True if the caller awaits this stop of the target; False if it must go on."""
         if status.event == linux.EVENT_STOP:
             return self._interrupting
         if status.trapped:
@@ -690,7 +690,7 @@ class Tracee:
             self.memory.write(address, data)
 
     def _map_near(self, address: int) -> int | None:
-        """Map pages within reach of a jump, where neither heap nor libraries are mapped later."""
+        """Map pages within reach of a jump, away from any later heap or library mappings."""
         for distance in _DISTANCES:
             pages = (address - distance) & ~4095
             if pages > 0 and self.system_call(

@@ -1,4 +1,4 @@
-"""Bits of explicit operands that vector instructions read and write (Intel SDM volume 2).
+"""The bits that vector instructions read and write in explicit operands (Intel SDM volume 2).
 
 Capstone's access flags are wrong for many VEX and EVEX forms and do not distinguish elements. As a
 rule, this module therefore treats the first operand as the destination and the others as sources.
@@ -46,7 +46,7 @@ Piece = tuple[str, int] | None  # operand "a" (first source) or "b" (last), its 
 
 @dataclass(slots=True)
 class Touched:
-    """Bits of one explicit operand; `clears` are the bits that always get a new value."""
+    """The bits of one explicit operand that are read, written, or (`clears`) always replaced."""
 
     reads: int = 0
     writes: int = 0
@@ -96,11 +96,11 @@ class _VectorForm:
         return bool(VECTOR.match(self.names[position]))
 
     def read(self, position: int, mask: int) -> None:
-        """Add bits of an operand that are read."""
+        """Add `mask` to the bits of an operand that are read."""
         self.touched[position].reads |= mask
 
     def write(self, mask: int, kept: int = 0) -> None:
-        """Add bits of the destination that are written; all but the kept ones are zeroed."""
+        """Set the written bits of the destination; all bits but the kept ones are replaced."""
         target = self.touched[self.target]
         target.writes = mask
         if self.is_vector(self.target):
@@ -119,7 +119,7 @@ def _width(name: str, size: int) -> int:
 
 
 def vector_bits(decoded: Any) -> tuple[Touched, ...] | None:
-    """Return the bits of the explicit operands that a vector instruction reads and writes.
+    """Return which bits of each explicit operand a vector instruction reads and writes.
 
     Returns:
         None if no explicit operand is a vector register.
@@ -172,7 +172,7 @@ def _operation(form: _VectorForm, lane: int) -> int:
 
 
 def _merged(form: _VectorForm, source: int, lane: int) -> int:
-    """Handle a conversion of the last operand; other elements come from the first source."""
+    """Handle a function of the last operand; other elements come from the first source."""
     if lane and form.is_vector(form.target):
         _write_lane(form, lane)
     else:
@@ -182,7 +182,7 @@ def _merged(form: _VectorForm, source: int, lane: int) -> int:
 
 
 def _write_lane(form: _VectorForm, lane: int) -> None:
-    """Write the lowest element; VEX copies the rest of 128 bits from the first source."""
+    """Write the lowest element; VEX forms copy the rest of 128 bits from the first source."""
     rest = low(128) & ~low(lane)
     if form.same(form.first, form.target):
         form.write(low(lane), kept=rest if form.vex else ALL & ~low(lane))
@@ -379,7 +379,7 @@ _BY_IMMEDIATE = [lane for name, (_, lane) in _SHUFFLES.items() if not re.match("
 
 
 def _packed(form: _VectorForm) -> None:
-    """Handle all others, which use whole registers except in conversions, sign masks and counts."""
+    """Handle the rest, which use whole registers except for conversions, controls and counts."""
     name, width = form.mnemonic, form.widths[form.target]
     alone = form.same(form.first, form.last) and len(form.sources) == 1 + form.vex
     sources = [] if alone and _ZEROING.match(name) else list(form.sources)
@@ -410,7 +410,7 @@ def _packed(form: _VectorForm) -> None:
 
 
 def _repeated(element: int, mask: int) -> int:
-    """Return a mask with the same bits of every element."""
+    """Return `mask` repeated in every element of `element` bits."""
     return sum(mask << place for place in range(0, 512, element))
 
 
@@ -430,7 +430,7 @@ _TWO_TABLES = re.compile(r"vperm([ti])2(ps|pd|[bwdq])$")
 
 
 def _mask(form: _VectorForm, lane: int) -> None:
-    """Apply an AVX-512 mask, one bit per element; without zeroing, masked elements stay as is."""
+    """Apply an AVX-512 mask, one bit per element; without zeroing, masked elements are kept."""
     assert form.writemask is not None
     target = form.touched[form.target]
     compares = not form.is_vector(form.target)  # into a mask, whose masked bits are cleared

@@ -1,4 +1,4 @@
-"""Instruction-level faults in a mission: plan, profile, injection, and the attacked node."""
+"""Instruction-level faults in a mission: planning, profiling, injection, and the attacked node."""
 
 from __future__ import annotations
 

@@ -25,8 +25,9 @@ from mavfi_cli.mission.companion_faults import CompanionFault
 from mavfi_cli.mission.programs import RunningProgram
 from mavfi_cli.spec.fault import InstructionConfig
 
-# Signals with which programs end each other. An end by such a signal, with code 0 or with unknown
-# status counts as a death by the fault if the program keeps running for a time without the process.
+# Signals with which programs end each other. If the struck process ends by such a signal, with code
+# 0 or with unknown status, the fault counts as the cause only if the program still runs _WITHOUT_S
+# later.
 _ORDINARY = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGHUP})
 _WITHOUT_S = 2.0
 # The tracer thread computes in Python for up to several seconds. The link thread must not wait
@@ -40,11 +41,11 @@ class ProcessInjection(CompanionFault):
     Args:
         request: The fault.
         programs: The companion's programs by name.
-        repeat: Record of a fault whose instruction is struck again.
+        repeat: Record of a fault whose instruction is to be struck again; None to draw one.
 
     Raises:
         UnknownName: The companion has no such program.
-        FaultError: Values of the fault contradict each other.
+        FaultError: Settings of the fault contradict each other.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class ProcessInjection(CompanionFault):
         self._usual_switch_s: float | None = None
         self._watch: EndWatch | None = None
         self._end: tuple[float, Ended] | None = None  # stamp and end of the struck process
-        self._leads, self._codes = True, 0  # if it is the program's own; ended ones before it
+        self._leads, self._codes = True, 0  # is it the program's own; number of earlier ends
 
     def aim_at(self, shortest_flight_s: float) -> None:
         """See `CompanionFault`."""
@@ -69,7 +70,7 @@ class ProcessInjection(CompanionFault):
         self.injector = self._moment
 
     def begin(self, path: Path) -> None:
-        """Write the planned fault, and load what must not be loaded while a thread is stopped."""
+        """Write the planned fault. Load code that cannot be loaded while a thread is stopped."""
         stepper.load()
         self._usual_switch_s = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
@@ -101,7 +102,7 @@ class ProcessInjection(CompanionFault):
             self.ends = {self._request.program: NodeEnds(crashes=[crash])}
 
     def _look(self, watch: EndWatch, program: RunningProgram) -> Ended | None:
-        """Return how the struck process has ended, or None."""
+        """Return how the struck process ended; None if that is not known yet."""
         ended = watch.look()
         if ended is None or not self._leads or ended.exit_code is not None or ended.signal:
             return ended
@@ -146,7 +147,7 @@ class ProcessInjection(CompanionFault):
         return [record.describe(self._written())]
 
     def finish(self) -> dict[str, Any]:
-        """Return the record. The programs must have ended."""
+        """Return the fault's record. The programs must have ended."""
         return record.repeatable(self._written())
 
     def _written(self) -> FaultRecord:

@@ -1,9 +1,9 @@
 """Plans one exact instruction-level fault of a mission, and injects it during the flight.
 
-A node is a function of its requests. A rehearsal sends the requests of the golden run to a separate
-node, without a flight and as fast as the machine allows. Requests, numbers of kernel entries and
-profiles are kept below the output folder, under a hash of everything that determines them. In the
-flight a tracer thread injects the fault.
+What a node does depends only on its requests. A rehearsal sends the requests of the golden run to a
+separate node, without a flight and as fast as the machine allows. Requests, numbers of kernel
+entries and profiles are kept in a subfolder of the output folder, named by a hash of everything
+that determines them. In the flight a tracer thread injects the fault.
 
 Nodes of missions that share a flight are struck in the rehearsal. A fault that changes neither the
 node's answer nor its memory needs no flight. Otherwise the flight takes over the struck node.
@@ -144,7 +144,7 @@ def keep_orders(golden: MissionConfig, profiles: Path, fly_golden: FlyGolden) ->
 def _plan_fault(
     config: MissionConfig, profiles: Path, fly_golden: FlyGolden
 ) -> tuple[InstructionFault, dict[str, Any]]:
-    """Draw the fault of a mission, and the entries of _CONTEXT."""
+    """Draw a mission's fault. Return it with the record's entries that _CONTEXT names."""
     request, golden = config.instruction, config.golden
     assert request is not None
     orders = keep_orders(golden, profiles, fly_golden)
@@ -157,7 +157,7 @@ def _plan_fault(
 
 
 class _GoldenNode:
-    """A node in a golden flight, from which faults are drawn. Use it in one thread."""
+    """A node of a golden flight, for drawing its faults. It must be used in a single thread."""
 
     def __init__(
         self, golden: MissionConfig, node: str, profiles: Path, kept: GoldenOrders
@@ -185,7 +185,7 @@ class _GoldenNode:
             self._rehearsal.close()
 
     def draw(self, request: InstructionConfig) -> tuple[KernelInvocation, np.random.Generator]:
-        """Draw the invocation to strike. Also return the generator for the rest of the draw.
+        """Draw the invocation to strike. Return it with the generator for the rest of the draw.
 
         Raises:
             FaultError: the flight never enters the kernel.
@@ -211,7 +211,7 @@ class _GoldenNode:
     def fault(
         self, request: InstructionConfig, drawn: KernelInvocation, rng: np.random.Generator
     ) -> tuple[InstructionFault, dict[str, Any]]:
-        """Draw the fault in an invocation, and the entries of _CONTEXT."""
+        """Draw the fault in an invocation. Return it with the entries that _CONTEXT names."""
         strategy = replace(mission_strategy(request), whole_process=False)
         profiling = Stream.FAULT.generator(self._golden.seed, "profile", self.kernel, drawn.number)
         profile = _kept(
@@ -237,7 +237,7 @@ class _GoldenNode:
         return replace(fault, corruption=None) if request.null else fault, context
 
     def received_alike(self, flown: GoldenOrders, drawn: KernelInvocation) -> bool:
-        """Return True if another flight sent the process the same requests up to an invocation."""
+        """Return True if another flight sent equal requests up to that of the invocation."""
         own = [at for at, (node, *_) in enumerate(self._orders) if node == self.name]
         until = own[drawn.order - 1] + 1
         theirs = flown.of_process(self.process)[:until]
@@ -254,15 +254,15 @@ def struck_nodes(
     *,
     profiles: Path,
 ) -> dict[int, StruckInjection]:
-    """Inject the faults of missions in a rehearsal.
+    """Inject the faults of missions in rehearsals. Return the injections by mission number.
 
     Faults that cannot be planned or compared there are left out.
 
     Args:
-        flown: the missions without their faults.
-        requests: their faults, by number.
-        recorder: recorder of the flight of `flown`. If the golden mission has another protection,
-            its requests are already kept.
+        flown: the flown mission, which equals the others without their faults.
+        requests: the faults, by mission number.
+        recorder: recorder of the flight of `flown`. If `flown` differs from its golden mission, the
+            requests of the golden mission must already be kept.
     """
     golden, seen = flown.golden, GoldenOrders.of(recorder)
     orders = _golden_orders(golden, profiles, lambda _: recorder)
@@ -297,8 +297,8 @@ def struck_nodes(
 def draw_invocation(node: str, counts: Sequence[int], rng: np.random.Generator) -> KernelInvocation:
     """Draw one invocation of a kernel uniformly, given the entries up to the end of each request.
 
-    Every entry is an invocation, except for a planner node: it is entered whenever it builds an
-    obstacle grid, at least once per request, and the request is the invocation.
+    Every entry is an invocation, except in a planner node. There the kernel is entered whenever an
+    obstacle grid is built, at least once per request, and the request is the invocation.
 
     Args:
         counts: cumulative entries at the end of every request of the golden run; not empty.
@@ -390,8 +390,8 @@ class InstructionInjection(NoInjection):
         """
         if config.link is not None:
             raise FaultError(
-                "an instruction-level fault needs flights that repeat, and those of a foreign "
-                "autopilot do not: leave out --link"
+                "an instruction-level fault needs a repeatable flight, and a flight of a foreign "
+                "autopilot is not repeatable: leave out --link"
             )
         fault, context = _plan_fault(config, profiles, fly_golden)
         return cls(fault, context, for_debugger=for_debugger)
@@ -400,14 +400,14 @@ class InstructionInjection(NoInjection):
     def of_record(
         cls, recorded: FaultRecord, for_debugger: Callable[[int], None] | None = None
     ) -> InstructionInjection:
-        """Repeat the fault of a record.
+        """Create the injection that repeats a recorded fault.
 
         Raises:
             RecordError: The record is damaged.
         """
         fault = record.fault_of(recorded)
         if missing := [name for name in _CONTEXT if name not in recorded]:
-            raise RecordError(f"the fault record is damaged: it has no {missing[0]!r}")
+            raise RecordError(f"the fault record is damaged: it has no entry {missing[0]!r}")
         context = {name: recorded.get(name) for name in _CONTEXT}
         return cls(fault, context, recorded=recorded, for_debugger=for_debugger)
 
@@ -419,8 +419,8 @@ class InstructionInjection(NoInjection):
         """Move the attacked node into its own process and arm the fault there.
 
         Raises:
-            BuildMismatch: the repeated record comes from another build.
-            TracingForbidden: the operating system refuses.
+            BuildMismatch: the recorded fault comes from another build.
+            TracingForbidden: the operating system does not permit tracing.
         """
         scope = self._spawned.begin(Setup.of(config, briefing, self.node), f"node {self.node}")
         pid = self._spawned.pid
@@ -465,10 +465,11 @@ class InstructionInjection(NoInjection):
         return None if ended is None else ended.describe()
 
     def _note_strike(self) -> None:
-        """Check for a strike between two inputs, so that its tick does not depend on host speed.
+        """Note whether the fault has struck, once the node has answered.
 
-        If a detector changed the flight before the fault, the trigger comes in a different
-        invocation than planned, or never.
+        The time of the call does not depend on the host's speed, so the logged tick of the strike
+        does not either. If a detector changed the flight before the fault, the trigger occurs in an
+        invocation other than planned, or never.
         """
         self._struck = self._struck or self._reached.is_set()
 
@@ -481,7 +482,7 @@ class InstructionInjection(NoInjection):
         return [] if self._fault.corruption is None else [record.describe(done.record)]
 
     def finish(self) -> dict[str, Any]:
-        """Return the record at the end of the mission, which is the same in every repetition."""
+        """Return the fault's record at the end of the mission, without what repetitions change."""
         assert self._tracer is not None
         return record.repeatable(self._tracer.result().record)
 

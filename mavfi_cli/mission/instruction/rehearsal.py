@@ -2,8 +2,8 @@
 
 Before a request the node is stopped and forked, as often as needed. A fork is a copy of the node
 just before this invocation, with the same memory. The forks receive the request one after another,
-because all share the node's socket: forks that are stepped for a profile, one with a fault, and two
-without it, which are compared with the struck one.
+because all share the node's socket. Some are stepped for a profile. One is struck by the fault and
+compared with two that are not.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class KernelInvocation:
     """One invocation of a kernel, and the entry with which it begins."""
 
     number: int  # number of the kernel's invocation, from 1
-    of: int
+    of: int  # number of invocations to choose from
     order: int  # number of the node's request that contains it, from 1
     entry: int  # number of the kernel's entry with which it begins, from 1
     earlier: int  # entries in the earlier requests
@@ -81,7 +81,7 @@ class Struck:
 
     Attributes:
         record: fault record, as from a flight.
-        process: serves the node starting with this request; None if the fault is masked.
+        process: process that serves this request and all later ones; None if the fault is masked.
         how: how the node ended or hung; empty if it answers.
     """
 
@@ -94,7 +94,7 @@ class Struck:
 class Rehearsal:
     """The `AttackPlace` in which one invocation of a node's kernel runs.
 
-    Use it in one thread.
+    It must be used in a single thread.
 
     Args:
         setup: the first message to the node's program.
@@ -132,7 +132,7 @@ class Rehearsal:
         """Count the kernel's entries up to the end of each request to the node, using a fork.
 
         Raises:
-            TracingForbidden: the operating system allows neither counting nor tracing.
+            TracingForbidden: the operating system permits neither counting nor tracing.
         """
         counts, address = [], self._image.address(self.scope_of_node.entry)
         fork = self._stop().fork()
@@ -153,8 +153,8 @@ class Rehearsal:
     def go_to(self, invocation: KernelInvocation) -> None:
         """Process the requests before an invocation, which must not precede the current one.
 
-        The node and its forks stay on one processor: switching between two doubles the time of
-        stepping, and the C library keeps the processor's number in the memory of each thread.
+        The node and its forks stay on one processor, because switching between two doubles the time
+        of stepping, and the C library keeps the processor's number in the memory of each thread.
         """
         linux.share_processor(self._spawned.pid)
         self._entry = invocation.entry - invocation.earlier
@@ -168,7 +168,7 @@ class Rehearsal:
             self._done += 1
 
     def _stop(self) -> Tracee:
-        """Stop the node where it waits for a request."""
+        """Stop the node in the system call in which it waits for the next request."""
         if self._stopped is None:
             self._stopped = Tracee.attach(self._spawned.pid, alone=True)
             self._stopped.await_call()
@@ -186,10 +186,10 @@ class Rehearsal:
     # Profile
 
     def start(self) -> Tracee:
-        """Start a fork, stopped where it begins the invocation; it ends without an answer."""
+        """Return a fork stopped at the start of the invocation. It will end without an answer."""
         tracee = self._fork()
         if not tracee.run_to(self._image.address(self.scope_of_node.entry), self._entry):
-            raise TargetError(f"node {self._node}", "does not begin its invocation again")
+            raise TargetError(f"node {self._node}", "a fork does not begin the invocation again")
         tracee.system_call(CLOSE, CHANNEL)
         return tracee
 
@@ -202,13 +202,13 @@ class Rehearsal:
         return image.scope(self.scope_of_node.objects)
 
     def profile(self, invocation: KernelInvocation, rng: np.random.Generator) -> TargetProfile:
-        """Step an invocation, or a sample of it.
+        """Profile an invocation by stepping all of it, or a sample.
 
         Args:
             rng: draws the sample, if only a sample is stepped.
 
         Raises:
-            TracingForbidden: the operating system refuses.
+            TracingForbidden: the operating system does not permit tracing.
             WindowTooLong: the invocation is too long to be stepped.
             TargetError: nothing in scope executes.
         """
@@ -221,16 +221,16 @@ class Rehearsal:
             return profile_calls(self, rng, inner, windows=_INNER_CALLS[node], limit=_WHOLE_LIMIT)
         if node != "planner":
             return profile_call(self, limit=_WHOLE_LIMIT)
-        # No native function encloses a request: Python calls several compiled functions, with or
-        # without a search, which begins with the first of `inner`. So the request ends with the
-        # run. It is stepped whole if it needs no search.
+        # No native function encloses a request: Python calls several compiled functions, and only
+        # some requests need a search, which begins with the first of `inner`. So the request ends
+        # with the run. It is stepped whole if it needs no search.
         tracee = self.start()
         try:
             searches = tracee.count_to_end(self._image.address(inner[0])) > 0
         finally:
             tracee.kill()
         if not searches:
-            with contextlib.suppress(WindowTooLong):  # smoothing repeats its attempts
+            with contextlib.suppress(WindowTooLong):  # smoothing may repeat its passes
                 return profile_run(self, rng, limit=_WHOLE_LIMIT)
         several: Any = {"markers": inner, "windows": _WINDOWS, "enough": _ENOUGH}
         return profile_run(self, rng, **several, limit=_WHOLE_LIMIT)
@@ -242,13 +242,13 @@ class Rehearsal:
     ) -> Struck:
         """Strike an invocation in a fork, and compare the fork with two unstruck ones.
 
-        If they differ, the struck fork is kept, to continue in a flight.
+        If the struck fork differs, it is kept, so that a flight can continue with it.
 
         Args:
             context: further entries of the record.
 
         Raises:
-            TracingForbidden: the operating system refuses.
+            TracingForbidden: the operating system does not permit tracing.
             OSError: no fork can be made, or its memory cannot be read.
             FaultError: the location holds another instruction.
         """
@@ -270,7 +270,7 @@ class Rehearsal:
             with _limited(tracee) as alarm:
                 injection, followed = strike(tracee, here, window=64)
             if alarm.fired:
-                raise TargetError(f"node {self._node}", "hangs before it is struck")
+                raise TargetError(f"node {self._node}", "it hangs before the fault strikes")
             reason = "" if injection is None else injection.reason
             done = record.completed(planned, injection, followed, not_injected_reason=reason)
             struck = _run_to_answer(tracee)
@@ -283,7 +283,7 @@ class Rehearsal:
             if len(unstruck) < 2:
                 raise TargetError(
                     f"node {self._node}",
-                    "gives no answer when the same invocation is repeated without the fault",
+                    "it gives no answer when the same invocation is repeated without the fault",
                 )
             if remembers_the_same(struck, unstruck):
                 return Struck(record=done, effect=NodeEffect.MASKED)
@@ -292,7 +292,7 @@ class Rehearsal:
             return Struck(record=done, effect=NodeEffect.CHANGED, process=process)
 
     def _let_go(self, fork: Tracee) -> NodeProcess:
-        """Connect a fork, which is about to answer, to a socket of its own, and let it continue."""
+        """Give a fork that is about to answer a connection of its own, and let it continue."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind("")  # an address that the operating system chooses
             listener.listen()

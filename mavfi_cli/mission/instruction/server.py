@@ -22,11 +22,12 @@ from mavfi_cli.spec.mission import MissionConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """The message to the program, which replies with its `KernelScope`.
+    """The first message to the program. The program replies with its `KernelScope`.
 
     The memory of the node depends on the bytes of the message. So the message holds the golden
-    mission, which all missions of a pair share, and holds it as text, because a pickle encodes
-    which objects are identical. A replay reads the same text from the mission's record.
+    mission, because all missions of a pair share it. It holds the mission as text, because a pickle
+    also encodes which objects are identical. A replay builds the same text from the mission's
+    record.
 
     Attributes:
         golden: the mission without fault and protection, as JSON.
@@ -38,7 +39,7 @@ class Setup:
 
     @classmethod
     def of(cls, config: MissionConfig, briefing: Briefing, node: str) -> Setup:
-        """Return the message for a node of a mission."""
+        """Build the message for a node of a mission."""
         own_m = config.loaded_stack().goal_tolerance_m
         recorded = json.dumps(replace(config.golden, goal_tolerance_m=own_m).to_dict())
         golden = structure(json.loads(recorded), MissionConfig).to_dict()

@@ -17,10 +17,10 @@ _NEEDED = {None: ("rerun", "view"), ".rrd": ("rerun", "view"), ".mcap": ("mcap_p
 
 
 def require_viewer(path: Path | None) -> None:
-    """Check that flights can be written to a file of this name, or shown if it is None.
+    """Check that flights can be written to `path`, or shown in rerun's window if it is None.
 
     Raises:
-        ConfigError: the name has another suffix.
+        ConfigError: the suffix is neither .rrd nor .mcap.
         MavfiError: a package is not installed, or there is no display.
         RecordError: the folder does not exist.
     """

@@ -1,4 +1,4 @@
-"""A flight as a stream of typed, timed entries, from which files for two viewers are written.
+"""A flight as a stream of typed, timed entries, which are written for two viewers.
 
 Lengths are in m and angles in rad; positions are in the world frame (ENU). The path of an entry is
 its place in the tree that the viewers show, such as `faulty/map`. A newer entry replaces an older
@@ -99,7 +99,7 @@ class ViewedFlight:
 
 
 def entries_of(flights: Sequence[ViewedFlight]) -> Iterator[Entry]:
-    """Yield the world and the entries of at least one flight in the order of their stamps."""
+    """Yield the entries of the world and of one or more flights, in the order of their stamps."""
     streams: list[Iterable[Entry]] = [_world(flights[0].run.record)]
     for flight in flights:
         streams += [_plans(flight), _notes(flight), *(_marks(flight, kind) for kind in _MARKED)]

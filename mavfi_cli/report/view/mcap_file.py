@@ -59,8 +59,8 @@ _AXES = [
 def write_mcap(flights: Sequence[ViewedFlight], path: Path) -> None:
     """Write flights as an MCAP file, atomically. Equal flights give equal bytes.
 
-    The time of a message is that of the first flight's tlog: stamp 0 is EPOCH_UNIX_S, or for a
-    foreign autopilot the date of the flight.
+    The time of a message is that in the first flight's tlog: stamp 0 is EPOCH_UNIX_S or, for a
+    foreign autopilot, the Unix time at which its clock was 0.
 
     Raises:
         RecordError: The file could not be written, or the tlog of a foreign flight could not be
@@ -109,7 +109,7 @@ def _metadata(flights: Sequence[ViewedFlight]) -> dict[str, Mapping[str, object]
 
 
 def write_layout(flights: Sequence[ViewedFlight], path: Path) -> None:
-    """Write a layout that Foxglove imports for the file of these flights.
+    """Write a layout for Foxglove to import together with the file of these flights.
 
     Its panels show the world, the camera of the last flight, its events, and three plots of states.
 
@@ -255,7 +255,7 @@ def _turn(quaternion: Sequence[float]) -> Quaternion:
 
 
 def _optical(quaternion: FloatArray) -> tuple[float, float, float, float]:
-    """Turn a camera's quaternion (4,) from axes x forward, y left to axes z forward, x right."""
+    """Convert a camera's quaternion (4,) from x forward, y left to z forward, x right."""
     w, x, y, z = (quaternion / 2.0).tolist()
     return w + x - y + z, x - w - y - z, w + x + y - z, x - w + y + z
 
@@ -296,7 +296,7 @@ def _cloud(entry: Entry) -> PointCloud:
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Message]]:
-    """Yield the frame in metres, the lens, and the pose of the optical frame."""
+    """Yield the pose of the optical frame, the camera's calibration, and the depth image in m."""
     frame, stamp = entry.data, _timestamp(entry)
     name = entry.path
     rows, columns = frame.depth_m.shape

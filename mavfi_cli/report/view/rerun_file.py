@@ -62,10 +62,10 @@ def _log(recording: Any, flights: Sequence[ViewedFlight]) -> None:
 def _log_entries(
     recording: Any, entries: Iterable[Entry], drawn: Mapping[str, ViewedFlight]
 ) -> None:
-    """Log entries one by one, except the numbers of all ticks: those follow column by column.
+    """Log entries one by one; the numbers of all ticks follow at the end, column by column.
 
     Args:
-        drawn: The flight for each path of numbers, which gives the colour of the lines.
+        drawn: The flight for each path of numbers; it determines colour and width of the lines.
     """
     numbers: dict[str, list[Entry]] = {}
     for entry in entries:
@@ -119,7 +119,7 @@ def _archetypes(entry: Entry) -> Iterator[tuple[str, Any]]:
 
 
 def _camera(entry: Entry) -> Iterator[tuple[str, Any]]:
-    """Yield the camera's pose and lens, and the frame; pixels without a measurement are 0."""
+    """Yield the camera's pose, its lens, and its depth image; unmeasured pixels are 0."""
     frame = entry.data
     rows, columns = frame.depth_m.shape
     w, x, y, z = frame.quaternion
@@ -169,7 +169,7 @@ def _blueprint(flights: Sequence[ViewedFlight]) -> Any:
 
 
 def _eye(flight: ViewedFlight) -> Any:
-    """View the middle of the route from the south-west and above; None without a route."""
+    """Return a view of the middle of the route from the south-west and above; None without one."""
     record = flight.run.record
     start, goal = record.world.get("start"), record.goal_enu_m
     if start is None or goal is None:

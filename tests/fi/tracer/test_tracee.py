@@ -264,7 +264,7 @@ def test_attaching_to_nothing_is_a_clear_error():
 
 
 def test_a_program_that_is_not_there_is_a_clear_error():
-    with pytest.raises(TargetError, match="no such program"):
+    with pytest.raises(TargetError, match="was not found"):
         Program.of(["/nowhere/at/all"])
 
 
