@@ -37,7 +37,7 @@ def compiled(function: F) -> F:
 
     numba's cache checks the source file of a function, but not the files of the functions that
     were compiled into it. Here a cache entry's stamp covers all sources in the folder of the
-    function and in the folders of the compiled functions in its module, own or imported.
+    function and of all compiled functions that it can reach. Outdated code is never run.
     """
     numba = _numba()
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
@@ -45,8 +45,7 @@ def compiled(function: F) -> F:
     cache_file = getattr(cache, "_cache_file", None)
     if cache_file is not None:
         _load_without_compiler(cache)
-        known: list[Any] = [function, *_callees(function)]
-        folders = sorted({Path(inspect.getfile(function)).parent for function in known})
+        folders = sorted({Path(inspect.getfile(reached)).parent for reached in _reached(function)})
         cache_file._source_stamp = tuple(folder_digest(folder) for folder in folders)
     kernel: F = dispatcher
     return kernel
@@ -116,9 +115,16 @@ def _numba() -> Any:
     return numba
 
 
-def _callees(function: Any) -> list[Any]:
-    """Return the Python functions behind all compiled functions in the module of `function`."""
-    return [value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")]
+def _reached(function: Any) -> list[Any]:
+    """Return a function, and the Python functions behind all compiled functions it can reach.
+
+    It can reach those in its module, own or imported, and what they can reach in turn.
+    """
+    reached = [function]
+    for known in reached:
+        others = (getattr(value, "py_func", None) for value in known.__globals__.values())
+        reached += [other for other in others if other is not None and other not in reached]
+    return reached
 
 
 # Sources ------------------------------------------------------------------------------------------

@@ -12,32 +12,49 @@ from mavfi_cli.core.compiled import TARGET, compiled, processor_level
 CALLEE = (
     "from mavfi_cli.core.compiled import compiled\n@compiled\ndef inner(x):\n    return x + {}\n"
 )
-CALLER = (
+BETWEEN = (
     "from mavfi_cli.core.compiled import compiled\n"
     "from callee_module import inner\n"
     "@compiled\n"
-    "def outer(x):\n"
+    "def between(x):\n"
     "    return inner(x)\n"
+)
+CALLER = (
+    "from mavfi_cli.core.compiled import compiled\n"
+    "from between_module import between\n"
+    "@compiled\n"
+    "def outer(x):\n"
+    "    return between(x)\n"
     "from mavfi_cli.core.compiled import in_cache\n"
     "known = in_cache(outer)\n"
     "print(outer(1.0), sum(outer.stats.cache_hits.values()), known)\n"
 )
 
 
-@pytest.mark.slow
-def test_an_edited_callee_is_compiled_anew(tmp_path, monkeypatch):
-    (tmp_path / "caller_module.py").write_text(CALLER)
-    monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
+@pytest.fixture
+def chain(tmp_path, monkeypatch):
+    """Three modules in folders of their own, and what a run of the first prints."""
+    folders = [tmp_path / name for name in ("caller", "between", "callee")]
+    texts = (CALLER, BETWEEN, CALLEE.format(1.0))
+    for folder, text in zip(folders, texts, strict=True):
+        folder.mkdir()
+        (folder / f"{folder.name}_module.py").write_text(text)
+    monkeypatch.setenv("PYTHONPATH", ":".join([*map(str, folders), *sys.path]))
 
     def run():
         command = [sys.executable, "-c", "import caller_module"]
         result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
         return result.stdout.split()
 
-    (tmp_path / "callee_module.py").write_text(CALLEE.format(1.0))
+    return tmp_path, run
+
+
+@pytest.mark.slow
+def test_an_edited_callee_of_a_callee_is_compiled_anew(chain):
+    folder, run = chain
     assert run() == ["2.0", "0", "False"]
     assert run() == ["2.0", "1", "True"]
-    (tmp_path / "callee_module.py").write_text(CALLEE.format(5.0))
+    (folder / "callee" / "callee_module.py").write_text(CALLEE.format(5.0))
     assert run() == ["6.0", "0", "False"]
 
 
@@ -75,18 +92,10 @@ def test_kernels_have_the_same_instructions_on_every_processor():
 
 
 @pytest.mark.slow
-def test_damaged_machine_code_is_compiled_anew(tmp_path, monkeypatch):
-    (tmp_path / "caller_module.py").write_text(CALLER)
-    (tmp_path / "callee_module.py").write_text(CALLEE.format(1.0))
-    monkeypatch.setenv("PYTHONPATH", ":".join([str(tmp_path), *sys.path]))
-
-    def run():
-        command = [sys.executable, "-c", "import caller_module"]
-        result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
-        return result.stdout.split()
-
+def test_damaged_machine_code_is_compiled_anew(chain):
+    folder, run = chain
     assert run() == ["2.0", "0", "False"]
-    cache = tmp_path / "__pycache__"
+    cache = folder / "caller" / "__pycache__"
     for pattern in ("*.nbi", "*.nbc"):
         for file in cache.glob(pattern):
             file.write_bytes(file.read_bytes()[:40] + b"damage")
