@@ -1,4 +1,4 @@
-"""Prepares a campaign's folder and missions from a preset, file or folder."""
+"""Prepares a campaign's folder and missions from a preset, a TOML file or a folder."""
 
 from __future__ import annotations
 
@@ -47,9 +47,10 @@ from mavfi_cli.spec.mission import MissionConfig
 
 DEFAULT, SPEC = Path("campaigns"), "campaign.toml"
 SEARCH = "world-search"  # folder of the campaign that finds fixed worlds
-_AT_ONCE = 4  # candidate worlds that are flown at the same time
+_AT_ONCE = 4  # candidate seeds of a world that are flown at the same time
 _APPEND = "--append adds what is new"
-# Missions that differ only in these are checked once. Each world is checked with its vehicle.
+# Missions that differ only in these fields are checked once. Every world is still checked with its
+# vehicle process.
 _ALIKE = ("seed", "time_limit_s", "isolate", "world")
 
 
@@ -73,8 +74,9 @@ def chosen(
             name.
         programs: programs that a folder's missions may name; see
             `MissionConfig.require_programs`.
-        sampling: how faults are drawn; None means as specified. It becomes part of the name too.
-        many_worlds: replaces fixed worlds by one for each seed. It becomes part of the name too.
+        sampling: how faults are drawn; None means as specified. This becomes part of the name too.
+        many_worlds: replace the fixed worlds by a new world for each seed. This becomes part of the
+            name too.
 
     Raises:
         ConfigError: the specification or the scale is invalid, or `out` is None and the name is
@@ -99,7 +101,7 @@ def chosen_spec(
     *,
     many_worlds: bool = False,
 ) -> Spec:
-    """Find the named specification as `chosen` does, but without its folder."""
+    """Find the named specification as `chosen` does, but do not return its folder."""
     folder = _folder(what)
     if folder is None:
         spec = load_spec(what)
@@ -121,13 +123,13 @@ def chosen_spec(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Unflown(Spec):
-    """The missions left on a study's list, which has no factors."""
+    """The unfinished missions of a study whose ledger stores a list but no factors."""
 
     left: list[PlannedMission]
 
     @classmethod
     def of(cls, ledger: Ledger) -> Self:
-        """Read the missions that the ledger lacks.
+        """Read the missions without a result, including those that could not begin.
 
         Raises:
             ConfigError: the ledger does not store which run folders to keep.
@@ -158,7 +160,7 @@ def _folder_of(what: str) -> Path:
             and ./NAME means the folder. If ./NAME holds a campaign, the name alone is refused.
 
     Raises:
-        ConfigError: a file is not a specification, or a name has two meanings.
+        ConfigError: a file is not a valid specification, or a name has two meanings.
         UnknownName: a single word is neither a preset nor a folder.
     """
     if (folder := _folder(what)) is not None:
@@ -207,17 +209,17 @@ def _require_one_meaning(what: str) -> None:
         own = DEFAULT / what
         raise ConfigError(
             f"{what} is a preset, and .{os.sep}{what} holds a campaign: use .{os.sep}{what} for "
-            f"the folder; the preset's own folder is {own}, which --out {own} creates"
+            f"that campaign, or {own} for the preset's, which --out {own} creates"
         )
 
 
 def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[Spec, bool]:
-    """Return a study's campaign for a folder, and whether its list grows.
+    """Return the specification for a study in a folder, and whether the folder's list grows.
 
     A study with more repetitions continues one with fewer, because lists grow by repetition.
 
     Args:
-        what, repetitions: words for the study and its repetitions in errors.
+        what, repetitions: words for the study and its repetitions in error messages.
 
     Raises:
         ConfigError: the folder holds another campaign.
@@ -239,13 +241,13 @@ def resumed(spec: Spec, folder: Path, what: str, *, repetitions: str) -> tuple[S
 
 
 def stored_spec(ledger: Ledger) -> Spec | None:
-    """Return the stored specification of a campaign; None if a program made its list."""
+    """Return a campaign's stored specification; None if its list was made without one."""
     text = ledger.meta("spec")
     return None if text is None else parse_spec(text, ledger.folder / SPEC)
 
 
 def stopped(ledger: Ledger) -> list[str]:
-    """Return the settings that the stopping rule has ended early."""
+    """Return the labels of the settings that the stopping rule has ended early."""
     spec = stored_spec(ledger)
     if spec is None or spec.stop is None:
         return []
@@ -278,15 +280,16 @@ def begin(
         options, spectator: used by the flights that search for fixed worlds, if there are any.
 
     Raises:
-        ConfigError: the folder holds another campaign, or `missing_only` is set and it holds none.
+        ConfigError: the folder holds another campaign, `missing_only` is set and it holds none, or
+            missions are appended to a stratified campaign.
         MavfiError: the missions cannot be flown with the chosen world, vehicle, planner or other
             setting, or no world seed satisfies the rule in [fixed_world].
     """
     begun = (folder / LEDGER).is_file()
     if append and spec.sampling is Sampling.STRATIFIED:
-        raise ConfigError("the rounds of a stratified campaign cannot grow", key="append")
+        raise ConfigError("must not be used with a stratified campaign", key="append")
     if missing_only and not begun:
-        raise ConfigError("no campaign was begun there", path=folder)
+        raise ConfigError("holds no campaign to resume", path=folder)
     if begun:
         spec = _with_stored_worlds(spec, folder, append=append)
     missions = None if begun else flyable(spec)  # checked before a folder exists
@@ -321,14 +324,14 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
     """Return the specification with the stored world seeds of its campaign.
 
     Raises:
-        ConfigError: missions are appended under another rule for fixed worlds.
+        ConfigError: missions are to be appended, but the rule for fixed worlds has changed.
     """
     with Ledger(folder) as ledger:
         stored = stored_spec(ledger)
     here, there = spec.fixed_world, stored.fixed_world if stored else None
     if append and stored and (here and here.rule()) != (there and there.rule()):
         raise ConfigError(
-            "holds a campaign with another [fixed_world]; choose another folder", path=folder
+            "holds a campaign with a different [fixed_world]; choose another folder", path=folder
         )
     if here is None or there is None or here.rule() != there.rule():
         return spec
@@ -350,7 +353,7 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
     """Check each kind of mission once, and each kind of vehicle process once.
 
     Raises:
-        MavfiError: as `check_names`, with the name of the setting.
+        MavfiError: as `check_names`, with the labels of the setting added.
     """
     seen: set[str] = set()
     for mission in missions:
@@ -366,15 +369,15 @@ def check_kinds(missions: Iterable[PlannedMission]) -> None:
 
 
 def check_names(config: MissionConfig, *, start: bool = True) -> None:
-    """Raise any error that would prevent every mission of this kind.
+    """Check that missions of this kind can be flown.
 
     Args:
-        start: also start the simulated vehicle, and end it at once.
+        start: also start the simulated vehicle, and stop it immediately.
 
     Raises:
         VehicleProcessError: the simulation rejects the world, the vehicle, the start or the goal.
-        MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model is
-            for another stack; a fault is invalid; or the start is blocked.
+        MavfiError: a world, vehicle, planner, platform, stack or target does not exist; a model
+            belongs to another stack; a fault is invalid; or the start is blocked.
     """
     CompanionParts.of(config)
     users = None if config.companion is None else CompanionConfig.load(config.companion)
@@ -403,7 +406,7 @@ def check_names(config: MissionConfig, *, start: bool = True) -> None:
             raise VehicleProcessError(str(error), error.exit_code) from None
 
 
-# Fixed worlds: golden runs are flown in one candidate after another until one fits the rule. They
+# Fixed worlds: golden runs are flown in candidate worlds until one satisfies the rule. These runs
 # form a campaign of their own in a subfolder, so an interrupted search continues where it stopped.
 
 
@@ -416,15 +419,15 @@ def _with_worlds(
 ) -> Spec:
     """Return the specification with a seed for every world that the rule covers.
 
-    A candidate is judged by golden flights of the first mission in that world. That mission has the
-    first value of every factor, so all stacks and platforms share one world.
+    A candidate seed is judged by golden flights of the first mission in that world. This mission
+    has the first value of every other factor, so all stacks and platforms share the chosen seed.
 
     Args:
         missions: the specification's missions.
         folder: folder of the campaign.
 
     Raises:
-        ConfigError: no candidate fits.
+        ConfigError: no candidate seed satisfies the rule.
         MavfiError: as `run_campaign`.
     """
     rule = spec.fixed_world
@@ -476,6 +479,6 @@ def _search(
     raise ConfigError(
         f"no world seed of {config.world} from 1 to {rule.candidates} gives a median of {least} to "
         f"{most} replans over {rule.flights} golden flights{seen}; leave the world out of "
-        "`worlds`, or name its seed in [fixed_world.world_seed]",
+        "`worlds`, or set its seed in [fixed_world.world_seed]",
         key="fixed_world",
     )

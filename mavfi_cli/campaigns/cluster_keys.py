@@ -1,7 +1,7 @@
-"""The keys of a cluster: one certificate that scheduler, workers and runner share over TLS.
+"""Makes and loads a cluster's keys: one TLS certificate for scheduler, workers and runner.
 
-The certificate is self-signed and the only trusted authority, so only holders of the key can
-connect.
+The certificate is self-signed and is the only trusted authority, so only holders of its private key
+can connect.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SKEW = timedelta(days=1)  # clocks of hosts differ
 
 
 def make_keys(folder: Path) -> None:
-    """Write a new certificate and its key into a folder, which is created if necessary.
+    """Write a new certificate and its private key to a folder, creating the folder if necessary.
 
     Only the user can read the files. Existing files are never replaced.
 
@@ -70,15 +70,16 @@ def _write_new(path: Path, content: bytes) -> None:
                 file.write(content)
     except MavfiError as error:
         if isinstance(error.__context__, FileExistsError):
-            raise ConfigError("exists; choose another folder for new keys", path=path) from None
+            raise ConfigError("exists; choose another folder for the new keys", path=path) from None
         raise
 
 
 def security(folder: Path) -> Security:
-    """Return dask's TLS settings for every role in a cluster, with the keys in a folder.
+    """Return dask's TLS settings for all roles in a cluster, using the keys in a folder.
 
     Raises:
-        ConfigError: a file is missing, belongs to another user, or is accessible to other users.
+        ConfigError: a file is missing, is not a regular file, belongs to another user, or is
+            accessible to other users.
     """
     from distributed.security import Security
 
@@ -99,6 +100,6 @@ def _private(path: Path) -> Path:
         raise ConfigError(problem, path=path) from None
     if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise ConfigError(
-            "must be your own file, which nobody else can read (chmod 600)", path=path
+            "must be a file that you own and nobody else can access (chmod 600)", path=path
         )
     return path

@@ -1,11 +1,11 @@
 """The ledger of a campaign: SQLite in WAL mode, one writer, one transaction per mission.
 
     meta      schema, versions, name and specification of the campaign
-    cells     the settings, by their labels
+    cells     the settings: their numbers and labels
     missions  the numbered list, written before the first mission flies
     results   one short row per finished mission
-    records   its complete result.json, compressed
-    draws     of a stratified campaign: the faults drawn for missions, with strata and weights
+    records   the complete result.json of each finished mission, compressed
+    draws     the faults drawn for a stratified campaign's missions, with strata and weights
 
 A mission is missing until it has a row in `results`. A kill at any moment leaves a complete row or
 none.
@@ -92,14 +92,15 @@ CREATE TABLE IF NOT EXISTS draws (
     changes TEXT NOT NULL
 )
 """
-# The missions as flown: those of a uniform list, and those of a list with draws.
+# The missions as flown: from a uniform list, and from a list whose faults are drawn in rounds.
 _PLANNED = "(SELECT *, NULL AS stratum, 1.0 AS weight FROM missions)"
 _DRAWN = (
     "(SELECT m.number, cell, COALESCE(d.pair, m.pair) AS pair, COALESCE(d.changes, m.changes) AS "
     "changes, stratum, COALESCE(weight, 1.0) AS weight FROM missions AS m LEFT JOIN draws AS d "
     "USING (number))"
 )
-# Whether a mission's flight repeats, for `columns`; a user's companion depends on the wall clock.
+# SQL for `columns`: whether a mission's flight repeats exactly. A flight of a user's companion does
+# not, because it depends on the wall clock.
 REPEATS = "instr(changes, '\"companion\":') = 0"
 _SHORT = (
     "flight_time_s", "distance_m", "energy_regression_j", "energy_propeller_j", "min_clearance_m",
@@ -121,9 +122,9 @@ class Drawn(NamedTuple):
     """The fault drawn for a mission of a stratified campaign.
 
     Attributes:
-        round: the round of draws, from 0.
-        weight: number of uniformly drawn missions that it stands for.
-        pair, changes: as in the list of missions.
+        round: zero-based number of the round in which it was drawn.
+        weight: number of uniformly drawn missions that this mission represents.
+        pair, changes: pair and configuration with this fault, as stored in the list of missions.
     """
 
     number: int
@@ -140,8 +141,7 @@ class Ledger:
     Use it as a context manager. Any number of readers may run alongside one writer.
 
     Attributes:
-        export: the table of flights if the ledger was opened from an export, which has no records;
-            else None.
+        export: the table of flights, without records, of a ledger opened from an export; else None.
     """
 
     export: pa.Table | None = None
@@ -153,7 +153,7 @@ class Ledger:
 
         Raises:
             RecordError: the ledger is missing, damaged, or cannot be opened.
-            ConfigError: another version of mavfi wrote it, or another process is writing to it.
+            ConfigError: its schema version is not supported, or another process is writing to it.
         """
         self.folder = folder
         self._path = folder if memory else folder / LEDGER
@@ -196,7 +196,7 @@ class Ledger:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._unlock()
-            raise ConfigError("another process runs this campaign", path=self.folder) from None
+            raise ConfigError("is being run by another process", path=self.folder) from None
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -228,7 +228,7 @@ class Ledger:
         if schema != str(SCHEMA):
             version = f"of version {schema}" if schema is not None else "of no version"
             raise ConfigError(
-                f"a ledger {version}; this mavfi reads version {SCHEMA}", path=self._path
+                f"is a ledger {version}; this mavfi supports only version {SCHEMA}", path=self._path
             )
         self._list = _DRAWN if "draws" in tables else _PLANNED
 
@@ -260,19 +260,19 @@ class Ledger:
     # The campaign ---------------------------------------------------------------------------------
 
     def meta(self, key: str) -> str | None:
-        """Return an entry about the campaign; None if it was never stored."""
+        """Return the campaign's metadata stored under a key; None if there is none."""
         values = [
             str(value) for (value,) in self._rows("SELECT value FROM meta WHERE key = ?", key)
         ]
         return values[0] if values else None
 
     def set_meta(self, values: Mapping[str, str]) -> None:
-        """Store entries about the campaign atomically."""
+        """Store metadata of the campaign by key, in one transaction."""
         with self._transaction():
             self._db.executemany("REPLACE INTO meta VALUES (?, ?)", values.items())
 
     def plan(self, missions: Iterable[PlannedMission]) -> int:
-        """Append missions to the list; return their number.
+        """Append missions to the list; return how many were appended.
 
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
@@ -301,7 +301,7 @@ class Ledger:
         return Sampling.STRATIFIED if self.stratified else Sampling.UNIFORM
 
     def draw(self, rows: Iterable[Drawn]) -> None:
-        """Store the faults that replace those on the list, all or none."""
+        """Store drawn faults, which replace those on the list, in one transaction."""
         self._list = _DRAWN
         with self._transaction():
             self._db.execute(_DRAWS)
@@ -323,10 +323,10 @@ class Ledger:
         """Store all rows of a campaign, but no records.
 
         Args:
-            cells: labels of the settings with their numbers.
+            cells: number of each setting by its labels, which are canonical JSON.
             missions: number, cell, pair and changes of every mission.
             draws: the faults drawn for missions of a stratified campaign.
-            results: columns of the table `results` by name; a missing column is empty.
+            results: columns of the table `results` by name; a missing column is stored as NULL.
 
         Raises:
             RecordError: a row has the wrong types, or a number occurs twice.
@@ -349,7 +349,7 @@ class Ledger:
         return int(count)
 
     def cells(self) -> list[Labels]:
-        """Return the settings, by number.
+        """Return the labels of each setting, in order of the settings' numbers.
 
         Raises:
             RecordError: the ledger is damaged, for example because a mission's setting is missing.
@@ -360,7 +360,7 @@ class Ledger:
             ]
             for (cell,) in self._rows("SELECT DISTINCT cell FROM missions"):
                 if cell not in range(len(cells)):
-                    raise ValueError(f"it has no setting {cell!r}")
+                    raise ValueError(f"a mission refers to the missing setting {cell!r}")
         return cells
 
     def rows(self) -> Iterator[tuple[int, str, str, str]]:
@@ -377,7 +377,7 @@ class Ledger:
     ) -> Iterator[MissingMission]:
         """Yield the missions without a result, in the order of the list.
 
-        They are read in portions, so results may be added in the meantime.
+        Missions are read 1,000 at a time, so the caller may add results while iterating.
 
         Args:
             errors: include missions that could not begin.
@@ -406,11 +406,11 @@ class Ledger:
                 return
 
     def mission_cells(self) -> list[int]:
-        """Return the setting of each mission, in the order of the list."""
+        """Return the number of each mission's setting, in the order of the list."""
         return [cell for (cell,) in self._rows("SELECT cell FROM missions ORDER BY number")]
 
     def fates(self, *, errors: bool = True) -> Iterator[tuple[int, tuple[str | None, str | None]]]:
-        """Yield number, outcome and fault's fate of every finished mission.
+        """Yield the number of every finished mission with its outcome and its fault's fate.
 
         Args:
             errors: include missions that could not begin.
@@ -420,7 +420,7 @@ class Ledger:
             yield number, (fate[0], fate[1])
 
     def over(self) -> int:
-        """Return the number of finished missions."""
+        """Return the number of finished missions, including those that could not begin."""
         ((count,),) = self._rows("SELECT count(*) FROM results")
         return int(count)
 
@@ -436,7 +436,7 @@ class Ledger:
         attempts: int,
         path: str | None,
     ) -> None:
-        """Store a mission's result in one transaction; an existing row is replaced.
+        """Store a mission's result in one transaction, replacing an earlier one.
 
         Raises:
             RecordError: the ledger cannot be written, for example because the disk is full.
@@ -504,7 +504,7 @@ class Ledger:
         """Yield the configurations of these missions in the order of the list.
 
         Raises:
-            RecordError: the changes of a mission in an export are invalid.
+            RecordError: the stored changes of a mission are invalid.
         """
         rows = self._rows(
             f"SELECT number, changes FROM {self._list} "
@@ -520,10 +520,11 @@ class Ledger:
             yield config
 
     def columns(self, names: Sequence[str]) -> Iterator[list[tuple[Any, ...]]]:
-        """Yield columns of the flown missions in portions, in the order of the list.
+        """Yield portions of the flown missions, in the order of the list, as columns.
 
         Args:
-            names: columns of the tables `missions` and `results`, `stratum`, `weight`, REPEATS.
+            names: columns of the tables `missions` and `results`, `stratum`, `weight`, or the SQL
+                expression REPEATS.
         """
         rows = self._rows(
             f"SELECT {', '.join(names)} FROM results JOIN {self._list} USING (number) "
@@ -533,7 +534,7 @@ class Ledger:
             yield list(zip(*portion, strict=True))
 
     def errors_by_cell(self) -> dict[int, int]:
-        """Count the missions that could not begin, for every cell with such missions."""
+        """Count the missions that could not begin, by cell; cells without any are absent."""
         return dict(
             self._rows(
                 "SELECT cell, count(*) FROM results JOIN missions USING (number) "
@@ -542,7 +543,7 @@ class Ledger:
         )
 
     def planned_by_cell(self) -> list[int]:
-        """Count the missions per cell."""
+        """Return the number of planned missions in each cell, in order of the cells' numbers."""
         rows = self._rows("SELECT count(*) FROM missions GROUP BY cell ORDER BY cell")
         return [count for (count,) in rows]
 
@@ -553,7 +554,7 @@ EXPORT = ".parquet"
 METADATA = b"mavfi"  # key of an export's provenance
 _NEEDED = ("number", "pair", "world", "seed", "stack", "state", "outcome", "injected", "changes")
 _LABEL = "label_"
-STRATUM, WEIGHT = "stratum", "weight"  # columns of a stratified sample; uniform missions weigh 1
+STRATUM, WEIGHT = "stratum", "weight"  # columns of a stratified sample; otherwise weights are 1
 _ABSENT = {"reason": "", "wall_s": 0.0, "attempts": 1}  # values for columns that an export lacks
 
 
@@ -566,7 +567,8 @@ def stored_export(path: Path) -> pa.Table:
     """Read an export.
 
     Raises:
-        RecordError: the file is missing or damaged, lacks a column, or lists a mission twice.
+        RecordError: the file is missing or damaged, lacks a column or a weight, or lists a mission
+            twice.
     """
     import pyarrow.compute as pc
 
@@ -584,13 +586,16 @@ def stored_export(path: Path) -> pa.Table:
     try:
         origin = stored_provenance(table)
     except (TypeError, ValueError):
-        raise _no_export(path, "its metadata are damaged") from None
+        raise _no_export(path, "its metadata is damaged") from None
     _require_weights(table, path, stratified=origin.get("sampling") == Sampling.STRATIFIED.value)
     return table
 
 
 def _require_weights(table: pa.Table, path: Path, *, stratified: bool) -> None:
-    """Refuse missions of a stratified sample without their weights, as after a careless merge."""
+    """Raise RecordError if a mission of a stratified sample lacks a valid weight.
+
+    Merging exports of a stratified and a uniform campaign can lose weights.
+    """
     names = [name for name in (STRATUM, WEIGHT) if name in table.column_names]
     rows = table.select(["number", *names]).to_pylist() if stratified or STRATUM in names else []
     for row in rows:
@@ -599,8 +604,8 @@ def _require_weights(table: pa.Table, path: Path, *, stratified: bool) -> None:
             isinstance(weight, float) and 0.0 < weight < math.inf
         ):
             raise RecordError(
-                f"{path}: mission {row['number']} is in a stratified sample and must have a weight "
-                f"above 0, got {weight}; export the campaign again"
+                f"{path}: mission {row['number']} of a stratified sample must have a weight above "
+                f"0, got {weight}; export the campaign again"
             )
 
 
@@ -614,7 +619,7 @@ def stored_provenance(table: pa.Table) -> dict[str, Any]:
 
 
 class ExportedLedger(Ledger):
-    """A ledger in memory with the missions of an export, but without records of flights.
+    """A ledger in memory that holds the missions of an export, but no records of flights.
 
     Raises:
         RecordError: the file is not an export.

@@ -27,12 +27,12 @@ _FIRST = ("setting", "world")  # labels that come before the others
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedMission:
-    """One mission of a campaign; its number is its place in the list, from 0.
+    """One mission of a campaign. Its number is its zero-based position in the list.
 
     Attributes:
         labels: the mission's setting; missions with equal labels are counted together.
-        pair: missions with equal pairs share world, start and noise. Empty selects a hash of
-            everything that golden, faulty and protected flights of a pair share.
+        pair: missions with equal pairs share world, start and noise. An empty string is replaced by
+            a hash of everything that the golden, faulty and protected flights of a pair share.
     """
 
     config: MissionConfig
@@ -57,7 +57,7 @@ _shared = attrgetter(*_SHARED)
 
 @functools.lru_cache(maxsize=4096)
 def _pair_of(shared: tuple[Any, ...]) -> str:
-    """Return the digest of the golden mission with these values of _SHARED."""
+    """Return a digest of the golden mission whose _SHARED fields have these values."""
     golden = MissionConfig(**dict(zip(_SHARED, shared, strict=True)))
     return hashlib.sha256(canonical(changes_of(golden)).encode()).hexdigest()[:16]
 
@@ -68,7 +68,7 @@ def canonical(value: Any) -> str:
 
 
 def changes_of(config: MissionConfig) -> Changes:
-    """Return the values of a mission that differ from the defaults."""
+    """Return the fields of a mission that differ from their defaults, as JSON values."""
     return {
         name: plain
         for name in _NAMES
@@ -92,10 +92,11 @@ def _plain(value: Any) -> Any:
 
 
 def kind_of(changes: Changes, apart: Collection[str]) -> str:
-    """Return a mission as text, without some values and without the seeds of its faults.
+    """Return a mission as canonical JSON, without some fields and without the seeds of its fault.
 
     Args:
-        changes: the mission's values from `changes_of`.
+        changes: the mission's fields from `changes_of`.
+        apart: names of the fields to leave out.
     """
     kind = {name: value for name, value in changes.items() if name not in apart}
     for name in ("fault", "instruction"):
@@ -106,7 +107,7 @@ def kind_of(changes: Changes, apart: Collection[str]) -> str:
 
 
 def label_text(labels: Labels) -> str:
-    """Describe a setting in one phrase, whatever the order of its labels."""
+    """Describe a setting in a phrase that does not depend on the order of its labels."""
     phrases = (f"{name}={label_value(labels[name])}" for name in ordered(labels))
     return " ".join(phrases) or "all missions"
 
@@ -117,14 +118,14 @@ def label_value(value: Label) -> str:
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Return names of labels in display order."""
+    """Return distinct label names in display order."""
     unordered = set(names)
     return [name for name in _FIRST if name in unordered] + sorted(unordered - set(_FIRST))
 
 
 @contextlib.contextmanager
 def naming(labels: Labels) -> Iterator[None]:
-    """Add the name of the setting to errors raised in the block.
+    """Append the labels of the setting to errors raised in the block.
 
     Raises:
         ConfigError: replaces any MavfiError and keeps its exit code.
@@ -139,7 +140,7 @@ def naming(labels: Labels) -> Iterator[None]:
 
 
 class MissingMission(NamedTuple):
-    """A mission without a result: its place in the list, its setting, and what to fly."""
+    """A mission without a result: its number, its setting's number, and what to fly."""
 
     number: int
     cell: int
@@ -149,7 +150,7 @@ class MissingMission(NamedTuple):
 class Sampling(Enum):
     """How the faults of a campaign are drawn."""
 
-    UNIFORM = "uniform"  # each fault independently, by the rule of its level
+    UNIFORM = "uniform"  # each fault independently, by the rule for its level
     STRATIFIED = "stratified"  # in rounds, more where outcomes have varied; missions have weights
 
 
@@ -186,7 +187,7 @@ class Injected(Enum):
 
     @classmethod
     def of(cls, flight: FlightRecord, *, faulty: bool) -> Injected:
-        """Return the fate of a mission's fault, from its record."""
+        """Derive the fate of a mission's fault from the flight's record."""
         fault = flight.fault
         if not faulty:
             return cls.GOLDEN
@@ -201,7 +202,10 @@ class Injected(Enum):
 
 
 def _caught(flight: FlightRecord) -> bool:
-    """Return True if an alarm withheld the struck value, matched by stamp or by state."""
+    """Return True if an alarm that was not accepted matches a strike.
+
+    It matches by its stamp, or by a struck state if it follows the first strike.
+    """
     stamps = {strike.stamp_s for strike in flight.strikes}
     states = {change.state for strike in flight.strikes for change in strike.changes}
     alarms = () if flight.detection is None else flight.detection.alarms
@@ -215,7 +219,7 @@ def _caught(flight: FlightRecord) -> bool:
     )
 
 
-# Fates with which a fault, if there was one, could affect the success of the mission.
+# Fates of the missions that count: no fault, or a fault that could affect the mission's success.
 COUNTED = frozenset(
     fate.value for fate in (Injected.GOLDEN, Injected.ACTIVE, Injected.UNREAD, Injected.CAUGHT)
 )
@@ -223,15 +227,15 @@ COUNTED = frozenset(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionResult:
-    """One row of the ledger.
+    """One finished mission, as the ledger stores it.
 
     Attributes:
-        result: its result.json, as `mavfi fly` writes it. A mission that crashed or hung before it
-            could write one has the known fields only. Empty for an error.
+        result: its result.json, as `mavfi fly` writes it. If the mission crashed or hung before it
+            could write one, only the known fields. Empty for an error.
         injected: the fate of its fault; None for an error.
         reason: the record's reason for the outcome, or why the mission could not begin.
         wall_s: wall time of the final attempt, s.
-        attempts: number of attempts; above 1 after kills from outside the mission.
+        attempts: number of attempts; above 1 if something outside the mission spoilt an attempt.
         path: absolute path of the kept run folder; None if it was not kept.
         stratum, weight: stratum and weight in a stratified sample; None and 1 in a uniform one.
     """
@@ -251,5 +255,5 @@ class MissionResult:
 
     @property
     def flight(self) -> FlightRecord:
-        """The sections of the result."""
+        """The result as a typed record."""
         return FlightRecord.of(self.result)

@@ -9,19 +9,20 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """A campaign at one moment of host time.
+    """The state of a running campaign at one moment.
 
     Attributes:
         total: number of missions on the list.
         before: missions that were finished before this run began.
         over: missions that are finished now, including `before`.
         running: flights that have not ended; missions that share a flight count as one.
-        again: attempts that were repeated because something outside the mission ended them.
+        again: attempts that were repeated because something outside the mission ended them or may
+            have affected them.
         elapsed_s: wall time of this run, s.
         inside_s: wall time spent in missions, summed over the workers, s.
         workers: missions that can fly at the same time; None if that varies, as on a cluster.
         outcomes: outcomes of this run's missions by setting, in the order of the list.
-        beyond_s: wall time of the work that follows the missions, s.
+        beyond_s: estimated wall time of the work that follows the missions, s.
     """
 
     total: int
@@ -42,13 +43,13 @@ class Progress:
 
     @property
     def eta_s(self) -> float | None:
-        """Time to the end at this rate, s; None before the first mission has ended."""
+        """Remaining wall time at this rate, s; None before the first mission has ended."""
         rate = self.rate_per_h
         return 3600.0 * (self.total - self.over) / rate + self.beyond_s if rate > 0.0 else None
 
     @property
     def outside(self) -> float | None:
-        """Fraction of the workers' time outside missions; None if their number varies."""
+        """Fraction of the workers' time spent outside missions; None if their number varies."""
         if self.workers is None or self.elapsed_s <= 0.0:
             return None
         return max(0.0, 1.0 - self.inside_s / (self.workers * self.elapsed_s))
@@ -61,7 +62,7 @@ class Progress:
 
     @property
     def success_rates(self) -> dict[str, float]:
-        """Success rate of each setting that has a finished mission."""
+        """Success rate of each setting in which this run has finished a mission."""
         return {
             setting: outcomes["success"] / outcomes.total()
             for setting, outcomes in self.outcomes.items()
@@ -70,20 +71,20 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Format a time as minutes or hours."""
+    """Format a duration in seconds as `M:SS min`, or as `H:MM:SS h` from one hour."""
     minutes, left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{left:02d} h" if hours else f"{minutes}:{left:02d} min"
 
 
 class Spectator:
-    """Watches a campaign. This base class ignores all events."""
+    """Observes a campaign. This base class ignores all events."""
 
     def on_progress(self, progress: Progress) -> None:
-        """Handle progress, after every mission and at least every second."""
+        """Handle progress. Called after missions have ended, and at least every second."""
 
     def on_end(self, progress: Progress) -> None:
-        """Handle the end, after all missions or an interruption."""
+        """Handle the end of the run: all missions have ended, or the user interrupted it."""
 
     def on_note(self, text: str) -> None:
         """Handle a note for the user."""

@@ -1,4 +1,4 @@
-"""Runs the missing missions of a campaign until the stopping rule ends each setting.
+"""Flies the missing missions of a campaign, each setting until a stopping rule, if any, ends it.
 
 With a stopping rule, the interval of a setting's success rate is checked after every batch, over
 exactly the setting's missions up to that point in the list, regardless of the order in which they
@@ -60,8 +60,8 @@ WORK, PROFILES = "work", "profiles"
 ATTEMPTS = 3  # most attempts at a mission if something outside it ends them
 LIMIT_S = 900.0  # wall time of one mission; the slowest takes some twenty seconds
 SHARING = 48  # most missions that share a flight
-_AHEAD = 5000  # missions of the list that are searched for ones to share a flight
-_GIVE_UP = 5  # a campaign ends after this many missions that cannot begin, if none could
+_AHEAD = 5000  # missions to read ahead in search of some that share a flight
+_GIVE_UP = 5  # end the campaign after this many failed starts if no mission could begin
 _LOOK_S = 0.5
 
 
@@ -81,7 +81,8 @@ class Options:
         kept: numbers of missions whose run folders are kept regardless of `keep`.
         profiles: folder of instruction-level profiles that several campaigns share. None selects
             the campaign's own, where profiles are removed after their last mission.
-        planned: numbers of the missions after which profiles are no longer needed; None for all.
+        planned: numbers of the missions to fly; a profile is removed after the last of them that
+            needs it. None means all.
         programs: programs that missions of the folder may name; see
             `MissionConfig.require_programs`.
     """
@@ -131,7 +132,7 @@ def run_campaign(
     append: bool = False,
     stop: Stop | None = None,
 ) -> Ledger:
-    """Fly a list of missions into a folder, except those that have a result.
+    """Fly the missions of a list that have no result in the folder yet.
 
     Args:
         missions: the list.
@@ -139,13 +140,14 @@ def run_campaign(
         options: how to run them.
         spectator: observes the progress.
         append: add new missions to the folder's list.
-        stop: rule that ends settings early.
+        stop: the stopping rule; None flies all missions.
 
     Returns:
         The ledger, open for reading; `results()` follows the order of the list.
 
     Raises:
-        ConfigError: the folder holds another list, or another process is writing to it.
+        ConfigError: the folder holds another list, versions or files have changed since it was
+            stored, or another process is writing to the folder.
         CampaignStopped: a problem with the machine prevents flights.
         RecordError: the ledger cannot be written.
         Interrupted: the user pressed Ctrl-C; a second one kills the missions in flight.
@@ -167,13 +169,13 @@ def store_plan(
     differing: Sequence[str] = (),
     can_append: str = "",
 ) -> None:
-    """Store the list, or compare it with the stored one.
+    """Store a campaign's list of missions, or compare it with the stored list.
 
     Args:
         append: add missions that are not stored; stored ones always stay.
-        differing: descriptions of the differences for the error; if empty, it names the first
-            differing missions.
-        can_append: hint on how to append missions, for the error if the list only adds missions.
+        differing: descriptions of the differences, for the error message. If empty, the message
+            shows the first mission that is new and the first that is gone.
+        can_append: how to append missions; part of the error message if the list only adds some.
 
     Raises:
         ConfigError: the stored list differs, or as `require_unchanged`.
@@ -229,7 +231,7 @@ def fly_missing(
 
 @contextlib.contextmanager
 def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
-    """Create an empty folder for attempts; remove remnants of a killed run."""
+    """Create the folders for attempts and profiles; empty the former before and remove it after."""
     work = own_folder(folder / WORK)
     shutil.rmtree(work, ignore_errors=True)
     for path in (work, profiles):
@@ -241,19 +243,19 @@ def _prepared(folder: Path, profiles: Path) -> Iterator[None]:
 
 
 class MissionQueue:
-    """The missing missions in the order of the list, in batches if there is a stopping rule.
+    """A queue of the missing missions in list order, in batches if there is a stopping rule.
 
     Args:
-        missing: missions without a result; yields None while the next one is not drawn yet.
+        missing: yields the missions without a result, and None while the next one is not drawn yet.
         stop: the stopping rule; None admits all missions.
         cells: setting of every mission, in the order of the list.
         over: number, outcome and fault's fate of every finished mission.
         shares: whether missions may share a flight.
         drawn: strata and weights of the missions of a stratified campaign, by number.
-        stopped: the set to which stopped settings are added; None makes one.
+        stopped: the set to which the numbers of stopped settings are added; None makes a new set.
 
     Attributes:
-        stopped: settings that the rule has ended.
+        stopped: numbers of the settings that the rule has ended.
     """
 
     def __init__(
@@ -279,7 +281,7 @@ class MissionQueue:
             members.append(number)
         self._open = dict.fromkeys(self._members, stop.batch if stop else 0)
         self._over: dict[int, Row] = {}
-        self._finished: Counter[int] = Counter()  # finished missions below the open boundary
+        self._finished: Counter[int] = Counter()  # finished ones among the admitted missions
         self._drawn = {} if drawn is None else drawn
         self.stopped: set[int] = set() if stopped is None else stopped
         for number, row in over if stop else ():
@@ -297,7 +299,7 @@ class MissionQueue:
                 return None
 
     def mates(self, mission: MissingMission, most: int) -> list[MissingMission]:
-        """Take further missions that may begin now and share a mission's flight."""
+        """Take at most `most` further missions that may begin now and share a mission's flight."""
         if not self._shares:
             return []
         while sum(map(len, self._read.values())) < _AHEAD and self._read_one():
@@ -334,14 +336,14 @@ class MissionQueue:
         return cell not in self.stopped and self._place[number] < self._open[cell]
 
     def record(self, number: int, row: Row) -> None:
-        """Record the end of a mission."""
+        """Record the end of a mission; after a full batch, stop its setting or admit the next."""
         if self._stop is None:
             return
         cell = self._cells[number]
         self._over[number] = row
         if self._place[number] < self._open[cell]:
             self._finished[cell] += 1
-        # All admitted missions are over and more follow.
+        # All admitted missions of the setting have ended, and more are on the list.
         while self._finished[cell] == self._open[cell] < len(self._members[cell]):
             if cell in self.stopped or self._narrow(cell, self._stop):
                 self.stopped.add(cell)
@@ -434,7 +436,7 @@ class _Run:
                 over = workers.wait(_LOOK_S)
                 if not interrupts:
                     self._note_unforked(over)
-                self._fill(workers, interrupts)  # so that they fly while the ledger is written
+                self._fill(workers, interrupts)  # so that missions fly while the ledger is written
                 for ended in over:
                     self._take(ended)
                 self._spectator.on_progress(self._progress(workers.flights))
@@ -450,8 +452,8 @@ class _Run:
         if self._given_up:
             number, reason = next(iter(sorted(self._given_up.items())))
             raise CampaignStopped(
-                f"{len(self._given_up)} missions were killed from outside {ATTEMPTS} times; the "
-                f"first is mission {number} ({reason}). If memory is short, use fewer --jobs"
+                f"{len(self._given_up)} missions failed {ATTEMPTS} times for external reasons; "
+                f"the first is mission {number} ({reason}). If memory is short, use fewer --jobs"
             )
 
     def _fill(self, workers: LocalWorkers | Cluster, interrupts: Sequence[int]) -> None:
@@ -480,7 +482,7 @@ class _Run:
         return [mission, *self._queue.mates(mission, most - 1)]
 
     def _note_unforked(self, over: Sequence[AttemptEnd]) -> None:
-        """Note which of the ended missions have to be flown alone, and why."""
+        """Note which missions were not forked and must be flown alone, and why."""
         reasons = {ended.number: ended.unforked for ended in over if ended.unforked}
         self._alone |= reasons
         for reason, count in Counter(reasons.values()).items():
@@ -520,7 +522,7 @@ class _Run:
         shutil.rmtree(out, ignore_errors=True)
 
     def _forget_profiles(self, config: MissionConfig) -> None:
-        """Remove the shared profiles of a golden run after its last mission."""
+        """Remove the profiles of a golden run after the last mission that uses them."""
         if (golden := config.golden) not in self._sharing:
             return
         if config.instruction is not None:
@@ -589,7 +591,7 @@ def _put_away(run: Path, runs: Path, number: int) -> Path:
 
 
 def require_unchanged(ledger: Ledger) -> None:
-    """Require that versions and files have not changed since the campaign began.
+    """Require that versions and files are the same as when the campaign began.
 
     Raises:
         ConfigError: a version or a file has changed.
@@ -600,7 +602,9 @@ def require_unchanged(ledger: Ledger) -> None:
         ledger.set_meta({"versions": canonical(versions)})
     elif stored != canonical(versions):
         differing = version_differences(json.loads(stored), versions)
-        raise ConfigError(f"begun with other versions: {'; '.join(differing)}", path=ledger.folder)
+        raise ConfigError(
+            f"was begun with other versions: {'; '.join(differing)}", path=ledger.folder
+        )
     noted = json.loads(ledger.meta("files") or "{}")
     changed = [name for name, digest in noted.items() if digest != file_digest(name)]
     if changed:
@@ -611,7 +615,7 @@ def require_unchanged(ledger: Ledger) -> None:
 
 
 def _note_files(ledger: Ledger, missions: Iterable[PlannedMission]) -> None:
-    """Store hashes of the files that missions name, for `require_unchanged`."""
+    """Store digests of the files that missions name, for `require_unchanged`."""
     noted = json.loads(ledger.meta("files") or "{}")
     named = {name for mission in missions for name in mission.config.files}
     new = {name: file_digest(name) for name in sorted(named - noted.keys())}

@@ -1,4 +1,4 @@
-"""The specification of a campaign: factors, settings, repetitions, stopping rule, worlds."""
+"""Defines a campaign's specification: factors, settings, repetitions, stopping rule, worlds."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Factors = Mapping[str, Any]  # values of factors by name, as in TOML
 # Factors: what may differ between missions, and the record that has the field ---------------------
 
 
-# Level at which faults strike -> the field of the mission, and its record.
+# Level at which a fault strikes -> the mission's field for it, and the dataclass of its value.
 _LEVELS = {"source": ("fault", FaultConfig), "instruction": ("instruction", InstructionConfig)}
 _SEEDED = {"seed": (*_LEVELS,), "invocation_seed": ("instruction",)}
-# Aliases in a specification for a field of a fault at either level.
+# Names in a specification for a fault's field `target`, at either level.
 _ALIASES = {"stage": "target", "site": "target"}
 _NESTED = {"fault", "instruction", "detector"}  # written flat: see below
 _NEVER = {"link", "realtime"}  # campaigns fly the simulated vehicle
-# Factors that may differ without any fault.
+# Factors that may differ even between missions without a fault.
 MISSION = tuple(
     member.name for member in fields(MissionConfig) if member.name not in _NESTED | _NEVER
 )
@@ -61,7 +61,7 @@ def _mission_of(values: Factors, seed: int, fault_seeds: Mapping[str, int]) -> M
 
 
 def _fault(values: Factors, seeds: Mapping[str, int]) -> Factors:
-    """Return the field `fault` or `instruction` of a mission; empty without a fault."""
+    """Return a mission's field `fault` or `instruction` as a dict; empty without a fault."""
     given = {name: value for name, value in values.items() if name not in (*MISSION, *_DETECTOR)}
     level = given.pop("level", "source")
     if level not in [*_LEVELS]:
@@ -96,10 +96,10 @@ class Keep(Enum):
     ALL = "all"
 
     def wants(self, number: int, outcome: str | None) -> bool:
-        """Return True if the run folder of this mission is kept."""
+        """Return True if the run folder of this mission is to be kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        mixed = number  # so that sampled successes cover all settings, however they alternate
+        mixed = number  # a hash, so that sampled successes cover all settings however those alternate
         for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
             mixed = mixed * factor % _WORD
             mixed ^= mixed >> 15
@@ -115,12 +115,12 @@ class FixedWorld:
     """The table `[fixed_world]` of a specification.
 
     Attributes:
-        replans: least and largest median of replans over the golden runs; None: no rule, so that
-            only worlds with a `world_seed` are fixed.
+        replans: smallest and largest accepted median of the golden runs' replans. None means no
+            rule, so that only the worlds in `world_seed` are fixed.
         flights: number of golden runs per candidate; seeds start at the campaign's first.
-        candidates: largest world seed to try, starting at 1; the first that fits is chosen.
-        worlds: the worlds that the rule covers; empty for all worlds of the campaign.
-        world_seed: seed of every world, given by the user or chosen by the rule.
+        candidates: world seeds from 1 to this number are tried; the first that fits is chosen.
+        worlds: the worlds that the rule covers; empty for all of the campaign but world files.
+        world_seed: seed of every fixed world, given by the user or chosen by the rule.
         flown: replans of the golden runs of candidates 1, 2, 3, ...; a candidate whose flights
             could not begin has fewer than `flights` values.
     """
@@ -150,7 +150,7 @@ class FixedWorld:
                 raise ValueError(f"world_seed.{world}: must be at least 0, got {seed}")
 
     def rules(self, world: str) -> bool:
-        """Return True if the rule covers this world.
+        """Return True if this world is fixed, by the rule or by a given seed.
 
         A user's world file is covered only if it is named, because its boxes are already fixed.
         """
@@ -165,7 +165,7 @@ class FixedWorld:
         return len(replans) == self.flights and least <= statistics.median(replans) <= most
 
     def describe(self, worlds: Container[str]) -> str:
-        """Describe the rule and the seeds of some worlds in one line."""
+        """Describe the seeds of these worlds, and the rule, in one line."""
         phrases = []
         for world in filter(worlds.__contains__, self.world_seed):
             seed = self.world_seed[world]
@@ -176,7 +176,7 @@ class FixedWorld:
                                        self.rule()]))  # fmt: skip
 
     def rule(self) -> str:
-        """Describe the rule; empty without one."""
+        """Describe the rule in a phrase; empty without a rule."""
         if self.replans is None:
             return ""
         least, most = self.replans
@@ -187,13 +187,13 @@ class FixedWorld:
 
 Axes = Mapping[str, tuple[Any, ...]]
 MOST = 1_000_000  # missions of one campaign
-# Factors whose values are lists; a list of lists crosses several values.
+# Factors whose value is a list. A list of lists holds several values, which are crossed.
 LISTS = ("start", "goal", "isolate", "protect", "exact_bits", "sites", "roles", "objects")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """A group of missions: its own factors, crossed with the common ones."""
+    """A group of missions, whose own factors are crossed with the common ones."""
 
     name: str = ""
     axes: Axes = field(default_factory=dict)
@@ -211,7 +211,7 @@ class Stop:
     Attributes:
         margin: largest half-width of the Wilson interval of the success rate.
         confidence: confidence of that interval.
-        batch: number of missions of a setting between checks of the interval.
+        batch: number of a setting's missions between two checks of the interval.
     """
 
     margin: float
@@ -228,11 +228,11 @@ class Stop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spec:
-    """One campaign.
+    """The specification of one campaign.
 
     Attributes:
-        seed: root of the seeds of all faults.
-        first_seed: first seed of the missions; repetition r flies with first_seed + r, or with
+        seed: root seed from which the seeds of all faults are derived.
+        first_seed: seed of the first mission; repetition r flies with first_seed + r, or with
             first_seed + r // faults_per_invocation if several faults share an invocation.
         repetitions: missions for each combination of factors.
         faults_per_invocation: number of faults at instruction level that strike the same
@@ -241,8 +241,8 @@ class Spec:
         fixed: factors that all missions share.
         axes: crossed factors with their values.
         settings: groups of missions, crossed with `axes`.
-        stop: ends settings early; None flies everything.
-        fixed_world: one fixed world seed for all missions; None: the world changes with the seed.
+        stop: the rule that ends settings early; None flies all missions.
+        fixed_world: rule and seeds of fixed worlds; None means that every seed has its own world.
     """
 
     name: str  # name of the folder below campaigns/
@@ -268,8 +268,8 @@ class Spec:
             self.stop is not None or self.sampling is not Sampling.UNIFORM
         ):
             raise ValueError(
-                "faults_per_invocation: must be 1 with a stop rule or stratified sampling, which "
-                f"count missions as independent, got {self.faults_per_invocation}"
+                "faults_per_invocation: must be 1 with a stop rule or stratified sampling, because "
+                f"both treat missions as independent, got {self.faults_per_invocation}"
             )
         named = {*self.fixed, *self.axes, *(name for own in self.settings for name in own.axes)}
         if self.sampling is not Sampling.UNIFORM and "companion" in named:
@@ -298,7 +298,7 @@ class Spec:
         return replace(self, repetitions=repetitions, settings=settings)
 
     def describe_worlds(self) -> str:
-        """Describe the fixed worlds of the missions in one line; empty without any."""
+        """Describe the fixed worlds in one line; empty without `[fixed_world]`."""
         flown = {kind.config.world for kind in self.kinds()}
         return "" if self.fixed_world is None else self.fixed_world.describe(flown)
 
@@ -338,7 +338,7 @@ class Spec:
         return [self._mission(values, labels, 0) for values, labels, _ in self._points()]
 
     def programs(self) -> frozenset[str]:
-        """Return the programs that missions name and execute. Raises as `kinds`."""
+        """Return the programs that the missions name and execute. Raises as `kinds`."""
         return frozenset(name for kind in self.kinds() for name in kind.config.programs)
 
     def _points(self) -> list[tuple[Factors, Labels, int]]:
@@ -371,8 +371,8 @@ class Spec:
     def _mission(self, values: Factors, labels: Labels, repetition: int) -> PlannedMission:
         several = self.faults_per_invocation
         seed = values.get("seed", self.first_seed + repetition // several)
-        # The seed depends on the target, or the faults of all states would share one draw. No other
-        # factor changes it: a target gets the same fault with every detector and platform.
+        # The fault's seed depends on the target; otherwise all states would share one draw. No
+        # other factor changes it: a target gets the same fault with every detector and platform.
         target = next((str(values[name]) for name in _ALIASES if name in values), "")
         seeds = {"seed": Stream.FAULT.seed(self.seed, "campaign", seed, repetition, target)}
         if several > 1:
@@ -385,10 +385,10 @@ class Spec:
             return PlannedMission(config=config, labels=labels)
 
     def differences(self, other: Spec, repetitions: str = "repetitions") -> list[str]:
-        """Describe every differing factor or number, except names and stopping rules.
+        """Describe every difference from `other` in factors, settings, numbers and sampling.
 
         Args:
-            repetitions: the word for repetitions.
+            repetitions: the word for repetitions in the descriptions.
         """
         there, here = self._choices(repetitions), other._choices(repetitions)
         if there == here:  # the same values in different settings
@@ -401,7 +401,7 @@ class Spec:
         ]
 
     def _choices(self, repetitions: str) -> dict[str, list[Any]]:
-        """Return all values of each factor, and the numbers."""
+        """Return the values of each factor, and the other compared properties, by description."""
         choices: dict[str, list[Any]] = {}
         for axes in (self.axes, *(setting.axes for setting in self.settings)):
             for name, values in axes.items():
@@ -477,10 +477,10 @@ def _listed(values: Sequence[Any] | None) -> str:
 def require_named(
     key: str, names: Sequence[str], known: Sequence[str] | None = None, least: int = 1
 ) -> None:
-    """Require at least one name, without repetition, all of them known.
+    """Require at least `least` names, all different and known.
 
     Raises:
-        ConfigError: there is no name, or one occurs twice.
+        ConfigError: there are too few names, or one occurs twice.
         UnknownName: a name is not among `known`, if that is given.
     """
     if len(names) < least:

@@ -1,4 +1,4 @@
-"""Reads specifications from TOML (campaign.toml, the presets) and applies changes of `--set`."""
+"""Reads specifications from TOML (campaign.toml, the presets) and applies `--set` changes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def load_spec(name: str) -> Spec:
 
 
 def parse_spec(text: str, path: Path) -> Spec:
-    """Parse a specification in TOML; `path` is for messages and the default name."""
+    """Parse a specification in TOML. `path` locates errors and gives the default name."""
     return _read_spec(parse_toml(text, path), path, text)
 
 
@@ -65,7 +65,7 @@ def _read_spec(data: Factors, path: Path, text: str = "") -> Spec:
     mission, factors = data.get("mission", {}), data.get("factors", {})
     settings = data.get("setting", [{}])
     if not isinstance(settings, list):
-        raise ConfigError("must consist of tables [[setting]]", path=path, key="setting")
+        raise ConfigError("must be one or more [[setting]] tables", path=path, key="setting")
     _require_table(mission, "mission", NAMES, path)
     for name, value in mission.items():
         _require_usable(name, value, f"mission.{name}", path)
@@ -106,7 +106,7 @@ def _require_table(table: Any, key: str, known: Sequence[str], path: Path) -> No
 
 
 def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
-    """Refuse a value that no factor can have."""
+    """Raise ConfigError for a date or time, or if a list-valued factor has no list."""
     if name in LISTS and not isinstance(value, list):
         raise ConfigError(f"must be a list, got {value!r}", path=path, key=key)
     if isinstance(value, datetime.date | datetime.time):
@@ -114,7 +114,7 @@ def _require_usable(name: str, value: Any, key: str, path: Path) -> None:
 
 
 def _axes(table: Factors, place: str, path: Path) -> Axes:
-    """Read factors with one or more values."""
+    """Read a table of factors, each of which has one or more values."""
     axes: dict[str, tuple[Any, ...]] = {}
     for name, value in table.items():
         key, several = f"{place}.{name}", isinstance(value, list)
@@ -123,7 +123,7 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
         values = tuple(value) if several else (value,)
         for item in values:
             _require_usable(name, item, key, path)
-        if name == "planner":  # one planner is one setting, however its name is written
+        if name == "planner":  # so that aliases of one planner count as one value
             values = tuple(canonical_planner(v) if isinstance(v, str) else v for v in values)
         if name not in LISTS and not values:
             raise ConfigError("must have at least one value, got []", path=path, key=key)
@@ -135,23 +135,23 @@ def _axes(table: Factors, place: str, path: Path) -> Axes:
 
 _ODD = re.compile(r"[^\w.+=-]+")  # unsuitable for a folder's name
 _COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')  # outside double quotes
-_LONGEST = 100  # characters of a folder's name; a longer one ends with a digest of the changes
+_LONGEST = 100  # characters of a folder's name; the end of a longer one becomes a digest
 
 
 def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
-    """Return the specification with factors replaced, under a name that includes the changes.
+    """Return the specification with some factors replaced, and the changes added to its name.
 
     A factor is replaced in all settings that have it. A mission factor that the specification
-    lacks is added to all missions, and a factor of instruction-level faults, such as `compat`, to
-    the settings at that level.
+    lacks is added to all missions. A factor of instruction-level faults, such as `compat`, is
+    added to the settings at that level.
 
     Args:
         changes: KEY=VALUE[,VALUE] with distinct keys. A value with a comma is quoted as in TOML,
             and all values may be written as one TOML list.
 
     Raises:
-        ConfigError: there is no such factor, a change is not KEY=VALUE, the specification lacks
-            this factor of faults, or the values are invalid.
+        ConfigError: a change is not KEY=VALUE, its key is not a factor or is a fault's factor that
+            the specification lacks, or its values are invalid.
     """
     if not changes:
         return spec
@@ -176,7 +176,7 @@ def replaced(spec: Spec, changes: Sequence[str]) -> Spec:
 
 
 def folder_name(text: str) -> str:
-    """Return the text without characters that are unsuitable for a folder's name."""
+    """Replace characters that are unsuitable for a folder's name by hyphens."""
     return _ODD.sub("-", text).strip("-")
 
 
@@ -202,7 +202,7 @@ def _replace(data: dict[str, Any], key: str, values: list[Any]) -> None:
 
 
 def _values(key: str, text: str) -> list[Any]:
-    """Parse the values; for a list-valued factor, the elements of one list or several lists."""
+    """Parse values separated by commas, or written as one list; see `replaced`."""
     listed = text[0] == "[" and text[-1] == "]"
     if listed and isinstance(values := _value(text), list):
         return values
@@ -211,7 +211,7 @@ def _values(key: str, text: str) -> list[Any]:
 
 
 def _value(text: str) -> Any:
-    """Parse a number, a truth value, a quoted text or a list as in TOML; else keep the text."""
+    """Parse a TOML number, boolean, string or array; return any other text unchanged."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

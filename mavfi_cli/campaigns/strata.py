@@ -1,11 +1,12 @@
-"""Draws the faults of a stratified campaign in rounds, more of them where outcomes have varied.
+"""Draws the faults of a stratified campaign in rounds, more in strata whose outcomes have varied.
 
-A stratum consists of what the seed determines about a fault before any flight: the bit field, its
-half and the state of the highest flipped bit, or the node, and the moment. Every repetition has a
-pool of seeds. The strata have the same shares in the pools as in the population, whatever rule
-draws a fault from its seed. A round allocates a number of missions to each stratum, and a seed from
-a pool to each mission. A mission's weight is the number of uniformly drawn missions that it stands
-for, so that the allocation does not bias estimates.
+A stratum is defined by what the seed determines about a fault before any flight. At source level,
+this is the highest flipped bit (its field, the half of that field, and its state) and the moment, if
+that is random. At instruction level, it is the node and the moment. Every repetition has a pool of
+seeds. On average, a stratum has the same share of the pools as of the population, whatever rule
+derives a fault from its seed. A round allocates a number of missions to each stratum, and a seed
+from a pool to each mission. A mission's weight is the number of uniformly drawn missions that it
+represents, so that the allocation does not bias estimates.
 
 The missions of a round are drawn after all earlier missions have ended, from their results and the
 campaign's seed. So a resumed campaign draws the same faults, regardless of the order in which
@@ -53,7 +54,7 @@ Fault = FaultConfig | InstructionConfig
 
 
 def stratum_of(fault: Fault, requests: int = 0) -> Stratum:
-    """Return the finest stratum of a fault, which its seed determines.
+    """Return the finest stratum that contains a fault. The fault's seed determines it.
 
     Args:
         requests: number of plans that the golden flight requests; 0 if unknown.
@@ -85,7 +86,7 @@ def _third(moment: float) -> str:
 
 
 def _part_of(kind: BitType, bit: int) -> tuple[str, str]:
-    """Return the field of a bit and the half that contains it, such as `exponent`, `upper half`."""
+    """Return the field of a bit and its half of that field, such as `exponent`, `upper half`."""
     fields = {own: bits for own, bits in kind.fields.items() if own is not Field.ANY}
     name, bits = next(
         ((own.value, bits) for own, bits in fields.items() if bit in bits),
@@ -99,8 +100,8 @@ def coarsened(strata: Sequence[Stratum], least: float) -> frozenset[Stratum]:
     """Merge strata, finest level first, so that each has a share of at least `least`.
 
     Returns:
-        The strata that remain. A seed belongs to the longest prefix of its own stratum among them;
-            the empty prefix takes the rest.
+        The strata that remain, including the empty one. A seed belongs to the longest of them that
+            is a prefix of its own stratum.
     """
     kept: set[Stratum] = {()}
     left = Counter(strata)
@@ -122,11 +123,12 @@ def _coarse(stratum: Stratum, kept: frozenset[Stratum]) -> Stratum:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Strike:
-    """One fault of the list, and the missions that it strikes: with each detector, and without.
+    """One fault of the list, and the missions that it strikes, with and without detectors.
 
     Attributes:
         config: one of these missions.
-        numbers, bare: numbers of all its missions, and of those without a detector.
+        numbers: numbers of all these missions.
+        bare: numbers of those without a detector.
     """
 
     config: MissionConfig
@@ -143,12 +145,12 @@ class _Strike:
 class Rounds:
     """The rounds of a stratified campaign.
 
-    Missions with equal faults but different detectors get the same draw, as on the list.
+    Missions with equal faults but different detectors also get equal faults when these are drawn.
 
     Args:
         ledger: ledger of the campaign, open for writing, with a stored list.
         seed: root of the seeds of all faults.
-        size: repetitions of a round; the last round has up to twice as many.
+        size: repetitions of a round; the last round has fewer than twice as many.
 
     Attributes:
         drawn: the faults drawn so far, by mission number.
@@ -192,14 +194,14 @@ class Rounds:
         return [members[begin:end] for begin, end in itertools.pairwise(cuts)]
 
     def missing(self, stopped: Collection[int], *, errors: bool) -> Iterator[MissingMission | None]:
-        """Yield the missing missions, and draw each round when all earlier missions are over.
+        """Yield the missing missions, drawing each round once all earlier missions have ended.
 
         Args:
             stopped: settings that the stopping rule has ended so far.
             errors: include missions that could not begin.
 
         Yields:
-            None while an earlier mission is not over.
+            The next missing mission; None while an earlier mission has not ended.
         """
         cells = self._ledger.mission_cells()
         begun: list[int] = []
@@ -222,7 +224,7 @@ class Rounds:
         ]
 
     def _parts(self, number: int) -> list[list[int]]:
-        """Return the missions of a round, with golden flights first if draws depend on them."""
+        """Return a round's missions as one part, or fault-free ones first if draws need them."""
         strikes = self._strikes(number)
         plain = [mission for mission, _ in self._plain.get(number, ())]
         struck = [mission for strike in strikes for mission in strike.numbers]
@@ -233,7 +235,7 @@ class Rounds:
     # One round
 
     def _draw(self, number: int) -> None:
-        """Draw the faults of a round, unless they are stored."""
+        """Draw and store the faults of a round, unless they are already stored."""
         if any(strike.numbers[0] in self.drawn for strike in self._strikes(number)):
             return
         rows: list[Drawn] = []
@@ -276,7 +278,7 @@ class Rounds:
                 seeds = [seed for seed, own in pool if own == stratum]
                 picked = rng.choice(len(seeds), size=wanted, replace=wanted > len(seeds))
                 chosen[-1] += [(seeds[place], stratum, total / count) for place in picked]
-        # Strikes keep the world of their own repetition where possible; others share one.
+        # A strike whose own repetition got no draw moves to a repetition that got several.
         further = [(strike, *draw) for strike, draws in zip(strikes, chosen, strict=True)
                    for draw in draws[1:]]  # fmt: skip
         for strike, draws in zip(strikes, chosen, strict=True):
@@ -286,7 +288,7 @@ class Rounds:
     def _rows(
         self, strike: _Strike, number: int, place: _Strike, seed: int, stratum: str, weight: float
     ) -> Iterator[Drawn]:
-        """Move the missions of a strike to the world and flight of `place`, with a drawn fault."""
+        """Yield the missions of a strike with a drawn fault and the mission seed of `place`."""
         for mission, config in zip(
             strike.numbers, self._ledger.configs(strike.numbers), strict=True
         ):
@@ -299,7 +301,7 @@ class Rounds:
     def _pools(
         self, kind: str, rounds: Sequence[Sequence[_Strike]], number: int
     ) -> list[list[tuple[int, Stratum]]]:
-        """Return seeds and their strata, for each strike of a round."""
+        """Return the pool of each strike in a round: seeds and their strata."""
         requests = self._requests(rounds[number])
         begin = sum(map(len, rounds[:number]))
         pools = []
@@ -313,7 +315,7 @@ class Rounds:
         return pools
 
     def _requests(self, strikes: Sequence[_Strike]) -> dict[MissionConfig, int]:
-        """Return how many plans each strike's golden flight requests, by flight, where known."""
+        """Return the number of plans requested in each of the strikes' golden flights, if known."""
         wanted = {strike.config.golden for strike in strikes
                   if isinstance(strike.fault, InstructionConfig)}  # fmt: skip
         numbers = [
@@ -329,7 +331,10 @@ class Rounds:
         return requests
 
     def _spreads(self, rounds: Sequence[Sequence[_Strike]]) -> dict[str, float]:
-        """Return the spread of losses per stratum, without a detector if such missions exist."""
+        """Return the spread of failures in each stratum.
+
+        Missions with a detector count only for strikes that have no mission without one.
+        """
         over = dict(self._ledger.fates())
         lost: dict[str, list[bool]] = {}
         for strike in itertools.chain.from_iterable(rounds):

@@ -1,4 +1,4 @@
-"""The task of a campaign's worker: fly a mission, or a flight from which several are forked."""
+"""The task of a campaign's worker: fly one mission, or a flight from which several fork."""
 
 from __future__ import annotations
 
@@ -35,15 +35,16 @@ def prepare() -> None:
 
 
 def perform(task: Mapping[str, Any], out: Path, forks: Forks | None = None) -> Path:
-    """Fly a mission, or several that share a flight; return the mission's run folder.
+    """Fly a mission, or several that share a flight; return the run folder of this process.
 
     Args:
-        task: "missions" as triples of number, `missions.changes_of` and folder; "limit_s" of each;
-            "alone", the reason why a mission does not share a flight, or "".
-        out: folder of the mission, or of the shared flight, which keeps nothing.
+        task: "missions", triples of a number, the changes from `missions.changes_of` and a folder;
+            "limit_s", the wall time limit of each mission, s; "alone", the reason why a mission
+            does not share a flight, or "".
+        out: folder of the mission, or of the shared flight, whose files are not kept.
 
     Raises:
-        SystemExit: this process has flown the shared flight.
+        SystemExit: this process has flown the shared flight, which is no mission of its own.
         MavfiError: the mission could not begin, or its record could not be written.
     """
     from mavfi_cli.core.config import structure

@@ -1,7 +1,7 @@
-"""Workers that fly missions on this machine or on dask.distributed, and judge how they ended.
+"""Flies missions on this machine or on dask.distributed, and judges how they ended.
 
 Dask workers import this module. Every thread of a dask worker keeps one local worker, so a dask
-worker with n threads flies n missions at a time.
+worker with n threads runs n flights at a time.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class CampaignStopped(MavfiError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptResult:
-    """The judgement of an attempt.
+    """The judged result of an attempt.
 
     Attributes:
         state: state of the mission; None if something outside ended the attempt.
@@ -69,9 +69,9 @@ class AttemptEnd:
         exit: exit code of the mission's process; None if it was killed.
         signal: signal that killed it; None after a time-out or if its guard was killed too.
         timeout: true if the mission exceeded its wall time.
-        report: the mission's last message: folder, or error and text, or traceback.
-        lost: reason why its end is unknown.
-        unforked: reason why it was not forked from its shared flight; empty if it was.
+        report: the mission's last message, with its folder, an error and its text, or a traceback.
+        lost: the reason if neither exit code, signal nor time-out is known.
+        unforked: reason why it was not forked from its shared flight; else empty.
         wall_s: wall time of the whole attempt, including the guard's work, s.
     """
 
@@ -100,7 +100,7 @@ class AttemptEnd:
         if self.exit == 0 and "folder" in report:
             return _recorded(out / report["folder"], config)
         if shutil.disk_usage(out if out.is_dir() else out.parent).free < FULL_BYTES:
-            raise CampaignStopped(f"{out.parent}: the disk is full; run again when there is room")
+            raise CampaignStopped(f"{out.parent}: the disk is full; free some space, then run again")
         if "error" in report:
             return _refused(report["error"], report["text"])
         if self.timeout:
@@ -143,7 +143,7 @@ class LocalWorkers:
 
     @property
     def flights(self) -> int:
-        """Number of flights that have not ended, even if all their missions have."""
+        """Number of flights that have not ended, including those whose missions have all ended."""
         return len(self._flying)
 
     def start(self, attempts: Sequence[Attempt], limit_s: float, alone: str = "") -> None:
@@ -176,7 +176,7 @@ class LocalWorkers:
                 (folder / HALT).touch()
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for a guard's message or the time-out; return the ended missions."""
+        """Wait for guards' messages or the time-out; return the missions that have ended."""
         ended = []
         for selected, _ in self._selector.select(timeout_s):
             channel = selected.fileobj
@@ -216,7 +216,7 @@ class LocalWorkers:
 
 
 def _end_of_flight(message: Mapping[str, Any]) -> str:
-    """Describe how a shared flight ended before it had forked all its missions."""
+    """Describe why a shared flight ended before it had forked all its missions."""
     report = message.get("report") or {}
     if "signal" in message:
         return f"their flight was killed by {signal.Signals(message['signal']).name}"
@@ -238,7 +238,7 @@ def _next_message(channel: socket.socket) -> Mapping[str, Any] | None:
 # What the end of an attempt means --------------------------------------------------------------
 
 FULL_BYTES = 16 << 20  # with less free space a disk counts as full
-# A fault can make a process die from other signals; these come from outside.
+# Signals from outside the mission; a fault can only make a process die from others.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _OUTSIDE_WORDS = tuple(f"killed by {number.name}" for number in _FROM_OUTSIDE)
 # Errors that the machine may have caused, so that another attempt may succeed.
@@ -257,7 +257,7 @@ def _recorded(run: Path, config: MissionConfig) -> AttemptResult:
     if outcome == Outcome.INTERRUPTED.value:
         return AttemptResult(state=None, result={}, reason="interrupted")
     crashes = [crash.how for node in flight.nodes.values() for crash in node.crashes]
-    if config.link is None:  # no fault of the companion can kill the simulated vehicle
+    if config.link is None:  # no fault in the companion can kill the simulated vehicle
         if outcome == Outcome.LINK_LOST.value and reason.endswith(_OUTSIDE_WORDS):
             return AttemptResult(state=None, result={}, reason=reason)
         if flight.referee is None:
@@ -314,11 +314,11 @@ _LOOK_S = 2.0  # interval between queries for the number of threads
 
 
 class Cluster:
-    """The workers of one scheduler.
+    """Flies missions on the workers of one dask scheduler.
 
     Args:
         address: address of the scheduler, such as tls://host:8786.
-        keep: the campaign's policy; run folders that it drops are sent without their traces.
+        keep: the policy that selects run folders to keep; the others are sent without traces.
         keys: folder with the keys of the cluster; required for tls://.
 
     Raises:
@@ -345,7 +345,7 @@ class Cluster:
 
     @property
     def free(self) -> int:
-        """Number of flights that can be sent now."""
+        """Number of flights that can be sent now; negative if threads have left."""
         if time.monotonic() - self._looked_s > _LOOK_S:
             self._threads = sum(self._client.nthreads().values())
             self._looked_s = time.monotonic()
@@ -372,7 +372,7 @@ class Cluster:
         """Do nothing: flights on the cluster fly all their missions."""
 
     def wait(self, timeout_s: float) -> list[AttemptEnd]:
-        """Wait for a result or the time-out; return the ended missions."""
+        """Wait for a flight's result or the time-out; return the missions that have ended."""
         flights = []
         with contextlib.suppress(queue.Empty):
             flights.append(self._done.get(timeout=timeout_s))
@@ -387,7 +387,7 @@ class Cluster:
             return [AttemptEnd(number=number, lost=lost) for number in outs]
         answer = future.result()
         if isinstance(answer, str):
-            raise CampaignStopped(f"a worker has different versions: {answer}")
+            raise CampaignStopped(f"a worker's versions differ: {answer}")
         return [_unpacked(ended, files, outs[ended.number]) for ended, files in answer]
 
     def close(self) -> None:
@@ -403,7 +403,7 @@ def _put(done: queue.SimpleQueue[int], flight: int, _future: Future) -> None:
 
 
 def _unpacked(ended: AttemptEnd, files: Mapping[str, bytes], out: Path) -> AttemptEnd:
-    """Write a mission's files where the mission would have written them."""
+    """Write a mission's files where a local mission would have written them."""
     for name, data in files.items():
         path = out / name
         if ".." in Path(name).parts or not path.is_relative_to(out):
@@ -445,7 +445,7 @@ def _require_workers(client: Client, address: str, ours: Mapping[str, str]) -> N
             raise CampaignStopped(f"worker {worker} cannot fly missions: {versions!r}")
         differing = version_differences(ours, versions)
         if differing:
-            raise CampaignStopped(f"worker {worker} has different versions: {'; '.join(differing)}")
+            raise CampaignStopped(f"the versions of worker {worker} differ: {'; '.join(differing)}")
 
 
 _SMALL = (RESULT, FAULT)  # files that the runner reads from a run folder that is not kept
@@ -506,7 +506,7 @@ def _workers(task: str) -> LocalWorkers:
 
 @cache
 def _scratch() -> ScratchFolder:
-    """Return this worker's scratch folder, which also keeps instruction-level profiles."""
+    """Return this worker's scratch folder, with a subfolder for instruction-level profiles."""
     folder = ScratchFolder("worker")
     (folder.path / "profiles").mkdir()
     return folder

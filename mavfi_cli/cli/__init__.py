@@ -18,8 +18,8 @@ from mavfi_cli.core.compiled import choose_caches
 from mavfi_cli.core.errors import UnknownName
 from mavfi_cli.core.terminal import exit_code, leave
 
-# name -> (module, what it does); the help page must not import the modules. A vehicle-side command
-# replaces this process.
+# Command -> its module and a summary, so that the help page need not import the modules. A
+# vehicle-side command replaces this process.
 _COMMANDS = {
     "fly": ("mavfi_cli.cli.fly", "Fly one mission: live progress, summary, run folder."),
     "companion": ("mavfi_cli.cli.companion", "Fly a vehicle as a program, for fly --companion."),
@@ -50,7 +50,7 @@ class _LazyGroup(click.Group):
     """A group that imports a command's module when the command or its help is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of the help."""
+        """Return the commands' names in the order of the help page."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -69,7 +69,7 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete a command from the table, because importing every module would be slow."""
+        """Complete a command's name from the table, because importing every module would be slow."""
         items = [
             CompletionItem(name, help=text)
             for name, (_, text) in _COMMANDS.items()
@@ -87,10 +87,10 @@ class _LazyGroup(click.Group):
 
 
 class _VehicleSide(click.Command):
-    """A vehicle-side command. For `mavfi world`, its program completes the words that follow."""
+    """A vehicle-side command, which a separate program carries out."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Run the program for completions; `mavfi sitl` has none, because it would start to fly."""
+        """Ask the program of `mavfi world`; `mavfi sitl` has none, because it would start flying."""
         from mavfi_cli.core.processes import PYTHON
 
         if self.name != "world":
@@ -108,7 +108,7 @@ class _VehicleSide(click.Command):
 
 
 def _vehicle_side(name: str, module: str) -> click.Command:
-    """Return a command that becomes `python -m module`, with its streams, signals and exit code."""
+    """Return a command that replaces this process by `python -m module`."""
 
     def become(arguments: tuple[str, ...]) -> None:
         from mavfi_cli.core.processes import PYTHON
@@ -147,7 +147,7 @@ def main() -> NoReturn:
 
 
 def _interrupt(*_: object) -> NoReturn:
-    """End as Ctrl-C does, leaving no process and no temporary folder behind."""
+    """End as after Ctrl-C, leaving no process and no temporary folder behind."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _terminated.append(True)
     raise KeyboardInterrupt

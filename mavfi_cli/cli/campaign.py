@@ -333,7 +333,7 @@ def keys(folder: Path) -> None:
 def _planned(
     what: str, scale: float | None, changes: Sequence[str], worlds: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the missions of a campaign as a dict for JSON and as lines of text."""
+    """Describe the missions of a campaign: a dict for JSON, and lines of text."""
     from collections import Counter
 
     from mavfi_cli.campaigns.begin import chosen_spec, flyable

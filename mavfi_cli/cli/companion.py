@@ -1,4 +1,4 @@
-"""`mavfi companion`: mavfi's own companion as a separate program."""
+"""`mavfi companion`: run mavfi's own companion as a separate program."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def companion(
     mission = replace(mission, **given)
     CompanionParts.of(mission)  # rejects unknown names
     if (goal is None) == (briefing is None):
-        raise click.UsageError("give --goal, or --lockstep with a briefing")
+        raise click.UsageError("give either --goal or --lockstep with a briefing")
     launch: StartVehicle = Vehicle.start
     if briefing is None:
         mission = replace(mission, link=link, goal=goal)

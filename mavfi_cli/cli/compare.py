@@ -60,7 +60,7 @@ def compare(out: Path, as_json: bool, as_csv: bool, quiet: bool, **_options: Any
 
     given = given_fields(ComparePlan)
     if given.get("inject") == ():
-        raise ConfigError("must name at least one target, or be none, got ''", key="inject")
+        raise ConfigError("must name at least one target or be `none`, got ''", key="inject")
     if given.get("inject") == ("none",):
         given["inject"] = ()
     plan = ComparePlan(**given)

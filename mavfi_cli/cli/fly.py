@@ -1,4 +1,4 @@
-"""`mavfi fly`: one mission, with live progress, a summary and a run folder."""
+"""`mavfi fly`: fly one mission, with live progress, a summary and a run folder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _EITHER = {"bits", "field", "fault_seed"}
 _OF_PROGRAM = {"objects", "function"}
 _INSTRUCTION = {"sites", "roles", "compat", *_OF_PROGRAM}
 _DETECTOR = {"protect", "threshold", "model", "any_stack", "watch"}
-_SMALL = 1.0e-3  # largest small change, relative to the value or to 1 unit if that is more
+_SMALL = 1.0e-3  # largest change that counts as small, relative to the larger of value and 1 unit
 _LARGE = [
     "--inject", "waypoint_position", "--all-components", "--field", "exponent",
     "--fault-seed", "20",
@@ -210,7 +210,7 @@ def fly(
     mission = _mission_of(config)
     if golden is not None:
         if mission.companion is None:
-            raise click.UsageError("--golden needs --companion; other flights repeat exactly")
+            raise click.UsageError("--golden needs --companion, because other flights repeat exactly")
         from mavfi_cli.studies.spread import fly_spread
 
         with progress_view(mission, quiet=quiet) as view:
@@ -221,7 +221,7 @@ def fly(
     recorder = Recorder() if record else None
     if record and mission.companion is not None:
         raise click.UsageError(
-            "--record cannot be combined with --companion: it records mavfi's own nodes"
+            "--record cannot be combined with --companion, because it records mavfi's own nodes"
         )
     if record:
         viewers.require_viewer(Path(f"flight.{record}"))
@@ -251,7 +251,7 @@ def fly(
 
 
 def _hint(run: Run) -> list[str]:
-    """Suggest a fault that moves a waypoint far, if this fault hardly changed its state."""
+    """Suggest a fault that moves a waypoint far, if this one changed little and did no harm."""
     record = run.record
     changes = [change for strike in record.strikes for change in strike.changes]
     small = (
@@ -262,7 +262,7 @@ def _hint(run: Run) -> list[str]:
     )
     if not record.succeeded or record.config["detector"] or not (changes and all(small)):
         return []
-    if "config" in given_options():  # its fault settings would alter the suggested one
+    if "config" in given_options():  # the file's fault settings would alter the suggested fault
         return []
     line = ["mavfi", "fly"]
     for name, value in given_options().items():
@@ -277,11 +277,11 @@ def _hint(run: Run) -> list[str]:
 
 
 def _mission_of(path: Path | None) -> MissionConfig:
-    """Return the mission of the file, with the options applied.
+    """Return the mission in the file, or the default one, with the options applied.
 
     Raises:
         ConfigError: the file or an option is not valid.
-        UsageError: options contradict each other, or a key within one is not valid.
+        UsageError: options contradict each other, or part of an option's value is not valid.
     """
     from mavfi_cli.core.config import load_toml
     from mavfi_cli.spec.mission import MissionConfig
@@ -334,7 +334,7 @@ def _replaced(base: MissionConfig, given: Given) -> MissionConfig:
 def _faults(
     base: MissionConfig, given: Given
 ) -> tuple[FaultConfig | None, InstructionConfig | None]:
-    """Check and return the mission's fault, at source or instruction level."""
+    """Return the mission's checked faults at source and at instruction level; one is None."""
     from mavfi_cli.attack.live import mission_strategy
     from mavfi_cli.mission.companion_faults import check_companion_fault
     from mavfi_cli.spec.companion import CompanionConfig
@@ -361,7 +361,7 @@ def _faults(
     if source:
         if direction is not None:
             if fault.wire_target is None:
-                raise click.UsageError("--stage needs a MAVLink message as --inject")
+                raise click.UsageError("--stage needs --inject with a MAVLink message")
             fault = replace(fault, target=f"{direction}.{fault.wire_target[1]}")
         companion = given.get("companion", base.companion)
         if companion is None:
@@ -369,7 +369,7 @@ def _faults(
         else:
             check_companion_fault(fault, CompanionConfig.load(companion).program)
         return fault, None
-    mission_strategy(fault)  # reports wrong names now
+    mission_strategy(fault)  # rejects unknown names before the flight
     companion = given.get("companion", base.companion)
     if companion is None:
         refuse_given(_OF_PROGRAM, "needs --companion")
@@ -381,10 +381,11 @@ def _faults(
 
 
 def _recorded_fault(run: Path, companion: str | None) -> InstructionConfig:
-    """Return the request of a recorded fault in a user's companion.
+    """Return the configuration that repeats a recorded fault in a user's companion.
 
     Raises:
-        RecordError: the run has no such record.
+        RecordError: the run has no record of such a fault.
+        UsageError: an option conflicts with --replay, or --companion is missing.
     """
     from mavfi_cli.core.config import structure
     from mavfi_cli.spec.companion import CompanionConfig

@@ -1,4 +1,4 @@
-"""Options in groups: the help shows one section per group."""
+"""Defines commands whose options are grouped: the help shows one section per group."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any] | click.Command)
 
 
 def section(title: str) -> Callable[..., Callable[[Decorated], Decorated]]:
-    """Return `click.option` for options in a section of the help, which show their defaults."""
+    """Return a `click.option` whose options appear in this section and show their defaults."""
     return partial(click.option, cls=_GroupedOption, group=title, show_default=True)
 
 
@@ -37,7 +37,7 @@ class GroupedCommand(click.Command):
     """A command whose errors name the option at fault and whose help groups the options."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call the command. An invalid value is a usage error that names the option."""
+        """Call the command. Turn an error about an option's value into a usage error that names it."""
         if ctx.params.get("as_json") and ctx.params.get("as_csv"):
             raise click.UsageError("--json cannot be combined with --csv")
         try:
@@ -79,7 +79,7 @@ class GroupOfCommands(click.Group):
 
 
 def _blamed(error: MavfiError) -> tuple[str, str]:
-    """Return the option or argument that caused an error, and the problem; both may be empty."""
+    """Return the option or argument that caused an error, and the problem; empty if unknown."""
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
     if isinstance(error, PlaceError):  # it names the world, which is not at fault
@@ -105,10 +105,10 @@ def given_options() -> Given:
 
 
 def given_fields(kind: type, **others: Any) -> Given:
-    """Return the options that the user gave and that are fields of a plan.
+    """Return those options given by the user that are fields of a dataclass.
 
     Args:
-        kind: the dataclass of the plan.
+        kind: the dataclass, such as a plan.
         others: further fields, which take precedence.
     """
     known = {field.name for field in fields(kind)}
@@ -116,7 +116,7 @@ def given_fields(kind: type, **others: Any) -> Given:
 
 
 def spelling(name: str) -> str:
-    """Return the current command's option for a parameter, such as `--v-max`, or the name."""
+    """Return the current command's option for a parameter, such as `--v-max`; else the name."""
     for param in click.get_current_context().command.params:
         if param.name == name or f"--{name}" in param.opts:
             return param.opts[0]
@@ -124,7 +124,7 @@ def spelling(name: str) -> str:
 
 
 def refuse_given(names: Collection[str], why: str) -> None:
-    """Reject options that would have no effect. `why` follows the option in the message."""
+    """Raise UsageError if the user gave one of these options. The message is option and `why`."""
     for name in given_options():
         if name in names:
             raise click.UsageError(f"{spelling(name)} {why}")

@@ -1,4 +1,4 @@
-"""`mavfi doctor`, `platforms`, `stacks`, `states`: what this machine supports, and what exists."""
+"""`mavfi doctor`, `platforms`, `stacks`, `states`: test this machine, and list what exists."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _title(chosen: PlatformProfile | Stack) -> str:
 
 # Doctor -------------------------------------------------------------------------------------------
 
-_FINDING = 29  # column of a check's finding
+_FINDING = 29  # column in which a check's finding starts
 _MARKS = {"ok": ("green", "ok"), "limited": ("yellow", "limited"), "failed": ("red", "FAILED")}
 
 
@@ -108,7 +108,7 @@ def _all_s(profile: PlatformProfile) -> float:
 
 
 def _kernel_lines(profile: PlatformProfile) -> Iterator[str]:
-    """Yield lines on the computer and each kernel, with the source of each number."""
+    """Yield lines about the computer and each kernel, with the source of each number."""
     if profile.measured_factor is not None:
         yield _title(profile)
         yield _MEASURED.format(
@@ -199,7 +199,7 @@ def _explained(stack: Stack) -> Iterator[str]:
             source = textwrap.wrap(stack.sources.get(key, "not given"), WIDTH - start)
             yield (
                 head + source.pop(0) if len(head) == start else head
-            )  # a long value has its source below
+            )  # the source of a long value starts on the next line
             yield from (" " * start + line for line in source)
 
 

@@ -225,7 +225,7 @@ def _variable(text: str) -> tuple[str, str]:
 def _replay_folder(
     folder: Path, kernels: tuple[str, ...], runs: int, program: ProgramTarget | None
 ) -> bool:
-    """Repeat recorded runs and print those that differ. Return True if none does."""
+    """Repeat recorded runs and print those that differ. Return True if none differs."""
     from mavfi_cli.attack.campaign import replay_runs
 
     equal = total = 0

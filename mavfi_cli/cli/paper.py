@@ -1,4 +1,4 @@
-"""`mavfi reproduce` and `mavfi report`: the paper's experiments, and a page about its claims."""
+"""`mavfi reproduce` and `mavfi report`: fly the paper's experiments, and report on its claims."""
 
 from __future__ import annotations
 

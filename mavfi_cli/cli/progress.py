@@ -1,4 +1,4 @@
-"""Progress on stderr: a live line on a terminal, plain lines elsewhere."""
+"""Shows progress on stderr: a live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _Part = str | tuple[str, str]  # text, or text and its style on a terminal
 
 
 class _Lines:
-    """Plain lines: notes at once, progress every ten seconds."""
+    """Prints plain lines: notes immediately, progress at most every ten seconds."""
 
     def __init__(self, first_s: float) -> None:
         self._next_s, self._last_s = first_s, 0.0
@@ -44,7 +44,7 @@ class _Lines:
 
 
 class _LiveLine(_Lines):
-    """One line that is rewritten, with notes scrolling above it."""
+    """Rewrites one line in place, with notes scrolling above it."""
 
     def __init__(self, live: Live) -> None:
         self._live, self._next_s = live, 0.0
@@ -95,7 +95,7 @@ class _FlightView(Watcher):
         self._screen.update(line, progress.stamp_s)
 
     def on_event(self, event: Event) -> None:
-        if self._title:  # not earlier: a mission that cannot begin prints one line only
+        if self._title:  # not earlier, so that a mission that cannot begin prints only one line
             self._screen.note((self._title, "bold"))
             self._title = ""
         if event.kind in _NOTED:
@@ -141,7 +141,7 @@ class _MissionsView(Spectator):
 
 
 class _RunsView:
-    """Runs of isolated kernels: which kernel, how many runs, and the time left."""
+    """Shows runs of isolated kernels: the kernel, the number of runs, and the time left."""
 
     def __init__(self, screen: _Lines, kernels: Sequence[str], runs: int) -> None:
         self._screen, self._kernels, self._runs = screen, list(kernels), runs
@@ -202,7 +202,7 @@ def missions_view(*, quiet: bool) -> Iterator[Spectator]:
 
 @contextmanager
 def steps_view() -> Iterator[Callable[[str], None]]:
-    """Show the current step of a computation on stderr. Yields a function that takes its name."""
+    """Show the steps of a computation on stderr. Yields a function that takes a step's name."""
     begun_s = time.monotonic()
     with _screen(PLAIN_EVERY_S) as screen:
         yield lambda name: screen.update(f"{name} ...", time.monotonic() - begun_s)

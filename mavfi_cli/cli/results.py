@@ -1,4 +1,4 @@
-"""Write and print the result of a command that computes one result."""
+"""Saves and prints the result of a study, such as a comparison or an evaluation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def save(
     out: Path, contents: Mapping[str, object], tables: Mapping[str, str],
     pictures: Mapping[str, Figure],
 ) -> list[str]:  # fmt: skip
-    """Write JSON files, CSV files and pictures under the given names, and return the names.
+    """Write JSON files, CSV files and pictures to a folder, by name; return the names.
 
     Raises:
         RecordError: a file cannot be written.

@@ -15,7 +15,7 @@ from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
 
-_ACTIVATION_SECTIONS = ("events", "fault")  # sections that also name the reader of the fault
+_ACTIVATION_SECTIONS = ("events", "fault")  # record sections that also contain the fault's activation
 
 
 @click.command(cls=GroupedCommand)
@@ -186,7 +186,7 @@ def _repeat_mission(
 
 
 def _warn_of_builds(versions: Mapping[str, str]) -> None:
-    """Warn of programs whose versions differ from the record's; {} means they are unknown."""
+    """Warn of components whose versions differ from the recorded ones; {} if none are known."""
     from mavfi_cli.core.installed import installed_versions, version_differences
 
     for text in version_differences(versions, installed_versions()) if versions else ():

@@ -1,4 +1,4 @@
-"""`mavfi train`: error-free flights, their data set, and the detectors' models."""
+"""`mavfi train`: fly error-free missions, store their data set, and fit the detectors."""
 
 from __future__ import annotations
 

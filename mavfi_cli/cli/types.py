@@ -37,7 +37,7 @@ Vector3 = tuple[float, float, float]
 
 
 class _Place(click.ParamType[Vector3]):
-    """Coordinates (east, north, up), m."""
+    """An option type for coordinates X,Y,Z (east, north, up), m."""
 
     name = "text"
 
@@ -58,7 +58,7 @@ Names = str | Callable[[click.Context], Iterable[str]]
 
 
 class Name(click.ParamType[Any]):
-    """A name that the shell completes. The program itself rejects unknown names.
+    """An option type for names that the shell completes. The command rejects unknown names.
 
     Args:
         names: Sources of names: MODULE:ATTRIBUTE, or a function of the options given so far.
@@ -72,7 +72,7 @@ class Name(click.ParamType[Any]):
         self._names, self._several, self._files = names, several, files
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the name, or the names."""
+        """Return the name, or a tuple of names if there may be several."""
         return names_in(value) if self._several and isinstance(value, str) else value
 
     def shell_complete(
@@ -100,7 +100,7 @@ def _loaded(place: str) -> Iterable[str]:
 
 
 def _worlds(_ctx: click.Context) -> Iterable[str]:
-    """Return the worlds' names from the vehicle's side, which this side does not import."""
+    """Return the worlds' names by running `sitl.world`, which this side must not import."""
     from mavfi_cli.core.processes import PYTHON
 
     line = [*PYTHON, "-m", "sitl.world", "list", "--json"]
@@ -153,7 +153,7 @@ CAMPAIGN = Name(
 
 # Files --------------------------------------------------------------------------------------------
 
-_MOST = 1000  # maximum entries of a folder that completion reads
+_MOST = 1000  # most entries of a folder that completion reads
 
 
 class RunPath(click.Path):

@@ -1,4 +1,4 @@
-"""`mavfi vpm`: what redundant computers cost a vehicle in speed, time and energy."""
+"""`mavfi vpm`: model what redundant computers cost a vehicle in speed, time and energy."""
 
 from __future__ import annotations
 
@@ -135,10 +135,10 @@ def vpm(
 
 
 def _overheads(texts: tuple[str, ...], platform: str | None = None) -> dict[str, tuple[float, str]]:
-    """Return each detector's overhead in per cent and its source; its last option wins.
+    """Return each detector's overhead in per cent and its source; later options take precedence.
 
     Args:
-        platform: name of the modelled platform; flights on others are ignored. None uses all.
+        platform: name of the modelled platform; flights on others are ignored. None means any.
 
     Raises:
         click.UsageError: the text is neither DETECTOR=PERCENT nor a path.

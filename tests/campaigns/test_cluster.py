@@ -243,7 +243,7 @@ def test_keys_are_not_written_through_a_link(tmp_path):
 def test_keys_that_others_can_read_or_that_are_missing_are_refused(name, tmp_path):
     make_keys(tmp_path)
     (tmp_path / name).chmod(0o640)
-    with pytest.raises(ConfigError, match="nobody else can read"):
+    with pytest.raises(ConfigError, match="nobody else can access"):
         security(tmp_path)
     (tmp_path / name).unlink()
     with pytest.raises(ConfigError, match=rf"{name}: .*mavfi campaign keys"):

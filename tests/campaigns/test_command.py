@@ -230,7 +230,7 @@ def test_what_does_not_exist_gets_one_line(refused, tmp_path):
     assert "no such file" in refused("run", "none.toml")
     assert "no campaign there" in refused("status", tmp_path / "nowhere")
     assert "no campaign there" in refused("draw", tmp_path / "nowhere", "--output", "pair.svg")
-    assert "no campaign was begun there" in refused(
+    assert "holds no campaign to resume" in refused(
         "run", written(tmp_path), "--missing-only", "--out", tmp_path / "nowhere"
     )
     assert "'--scale': 0.0 is not in the range" in refused("run", "table3", "--scale", "0")

@@ -131,7 +131,7 @@ def test_an_export_without_pairs_is_reported_with_a_note(mavfi, tmp_path, change
 def test_damaged_metadata_are_refused(tmp_path, metadata):
     path = tmp_path / "strange.parquet"
     pq.write_table(pq.read_table(EXPORT).replace_schema_metadata({"mavfi": metadata}), path)
-    with pytest.raises(RecordError, match="metadata are damaged"), opened(path):
+    with pytest.raises(RecordError, match="metadata is damaged"), opened(path):
         pass
 
 

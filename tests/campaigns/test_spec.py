@@ -219,7 +219,7 @@ def test_instruction_level_and_lists_of_values():
         ("repetitions = 0", ConfigError, r"repetitions: .*at least 1, got 0"),
         ("repetitions = true", ConfigError, r"repetitions: .*got True"),
         ("keep = 'some'", UnknownName, r"Known: all, failures, none, sampled"),
-        ("setting = 3", ConfigError, r"setting: must consist of tables"),
+        ("setting = 3", ConfigError, r"setting: must be one or more"),
         ("setting = []", ConfigError, r"has no missions"),
         ("repetitions = 1_000_001", ConfigError, r"at most 1000000 missions, got 1000001"),
         (

@@ -189,7 +189,7 @@ def test_an_error_in_the_gate_fails_as_configured(gate, on_error, passed):
 
 
 def test_a_model_of_another_companion_is_refused(gate, tmp_path):
-    with pytest.raises(ModelError, match="not for 'companion:other'"):
+    with pytest.raises(ModelError, match="not to 'companion:other'"):
         gate(mark=StackMark(name="companion:other", digest="2"))
     with pytest.raises(ModelError, match="needs --model"):
         DetectorConfig(name="gad").build_for_companion(MARK)

@@ -227,7 +227,7 @@ def test_as_a_process_over_udp_until_it_is_stopped() -> None:
     ("arguments", "message"),
     [
         (["--world", "dnse"], "did you mean 'dense'"),
-        (["--link", "udpin:1.2.3.4:99"], "signing is required"),
+        (["--link", "udpin:1.2.3.4:99"], "the link must be signed"),
         (["--link", "carrier-pigeon:1"], "unknown kind of endpoint"),
         (["--size", "5000x3"], "camera size"),
         (["--rate", "900"], "camera rate"),
