@@ -331,7 +331,7 @@ def _with_stored_worlds(spec: Spec, folder: Path, *, append: bool) -> Spec:
     here, there = spec.fixed_world, stored.fixed_world if stored else None
     if append and stored and (here and here.rule()) != (there and there.rule()):
         raise ConfigError(
-            "holds a campaign with a different [fixed_world]; choose another folder", path=folder
+            "holds a campaign with another [fixed_world] rule; choose another folder", path=folder
         )
     if here is None or there is None or here.rule() != there.rule():
         return spec

@@ -70,7 +70,9 @@ def _write_new(path: Path, content: bytes) -> None:
                 file.write(content)
     except MavfiError as error:
         if isinstance(error.__context__, FileExistsError):
-            raise ConfigError("exists; choose another folder for the new keys", path=path) from None
+            raise ConfigError(
+                "already exists; choose another folder for the new keys", path=path
+            ) from None
         raise
 
 

@@ -99,7 +99,7 @@ class Keep(Enum):
         """Return True if the run folder of this mission is to be kept."""
         if self is Keep.ALL or self is Keep.NONE:
             return self is Keep.ALL
-        mixed = number  # a hash, so that sampled successes cover all settings however those alternate
+        mixed = number  # hashed, so that sampled successes cover all settings in whatever order
         for factor in (0x9E3779B1, 0x85EBCA6B):  # odd, so that no two numbers collide
             mixed = mixed * factor % _WORD
             mixed ^= mixed >> 15

@@ -1,7 +1,7 @@
 """Draws the faults of a stratified campaign in rounds, more in strata whose outcomes have varied.
 
 A stratum is defined by what the seed determines about a fault before any flight. At source level,
-this is the highest flipped bit (its field, the half of that field, and its state) and the moment, if
+this is the highest flipped bit (its field, its half of the field, and its state) and the moment, if
 that is random. At instruction level, it is the node and the moment. Every repetition has a pool of
 seeds. On average, a stratum has the same share of the pools as of the population, whatever rule
 derives a fault from its seed. A round allocates a number of missions to each stratum, and a seed

@@ -100,7 +100,7 @@ class AttemptEnd:
         if self.exit == 0 and "folder" in report:
             return _recorded(out / report["folder"], config)
         if shutil.disk_usage(out if out.is_dir() else out.parent).free < FULL_BYTES:
-            raise CampaignStopped(f"{out.parent}: the disk is full; free some space, then run again")
+            raise CampaignStopped(f"{out.parent}: the disk is full; free space and run again")
         if "error" in report:
             return _refused(report["error"], report["text"])
         if self.timeout:

@@ -69,7 +69,7 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete a command's name from the table, because importing every module would be slow."""
+        """Complete command names from the table, because importing every module would be slow."""
         items = [
             CompletionItem(name, help=text)
             for name, (_, text) in _COMMANDS.items()
@@ -90,7 +90,7 @@ class _VehicleSide(click.Command):
     """A vehicle-side command, which a separate program carries out."""
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Ask the program of `mavfi world`; `mavfi sitl` has none, because it would start flying."""
+        """Ask the program for completions, except `mavfi sitl`, which would start flying."""
         from mavfi_cli.core.processes import PYTHON
 
         if self.name != "world":

@@ -210,7 +210,9 @@ def fly(
     mission = _mission_of(config)
     if golden is not None:
         if mission.companion is None:
-            raise click.UsageError("--golden needs --companion, because other flights repeat exactly")
+            raise click.UsageError(
+                "--golden needs --companion, because other flights repeat exactly"
+            )
         from mavfi_cli.studies.spread import fly_spread
 
         with progress_view(mission, quiet=quiet) as view:

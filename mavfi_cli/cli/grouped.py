@@ -37,7 +37,7 @@ class GroupedCommand(click.Command):
     """A command whose errors name the option at fault and whose help groups the options."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call the command. Turn an error about an option's value into a usage error that names it."""
+        """Call the command; turn an error in an option's value into a usage error naming it."""
         if ctx.params.get("as_json") and ctx.params.get("as_csv"):
             raise click.UsageError("--json cannot be combined with --csv")
         try:
@@ -79,7 +79,7 @@ class GroupOfCommands(click.Group):
 
 
 def _blamed(error: MavfiError) -> tuple[str, str]:
-    """Return the option or argument that caused an error, and the problem; empty if unknown."""
+    """Return the option or argument that caused an error, and the problem; or "", ""."""
     if isinstance(error, ConfigError) and error.key and not error.path:
         return spelling(error.key), error.problem
     if isinstance(error, PlaceError):  # it names the world, which is not at fault

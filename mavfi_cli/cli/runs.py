@@ -15,7 +15,7 @@ from mavfi_cli.core.option_types import OutFile
 from mavfi_cli.core.terminal import echo, echo_lines, note
 from mavfi_cli.report.drawing import PICTURES
 
-_ACTIVATION_SECTIONS = ("events", "fault")  # record sections that also contain the fault's activation
+_ACTIVATION_SECTIONS = ("events", "fault")  # these sections contain the fault's activation
 
 
 @click.command(cls=GroupedCommand)

@@ -81,7 +81,7 @@ def _golden(run: Run) -> Run | None:
 
 
 def _again(run: Run) -> Recorder | None:
-    """Fly a run again and return the recorded flight data; None if it cannot be repeated."""
+    """Fly a run again and return its frames, clouds and maps; None if it cannot be repeated."""
     from mavfi_cli.mission.run import watch_again
 
     try:

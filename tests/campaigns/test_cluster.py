@@ -227,7 +227,7 @@ def test_keys_are_private_and_never_replaced(mavfi, tmp_path):
     written = [path.read_bytes() for path in paths]
     again = mavfi("campaign", "keys", "keys", cwd=tmp_path)
     assert again.returncode == 1
-    assert again.stderr.startswith("error: keys/key.pem: exists")
+    assert again.stderr.startswith("error: keys/key.pem: already exists")
     assert [path.read_bytes() for path in paths] == written
 
 

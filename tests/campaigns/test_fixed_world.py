@@ -112,7 +112,7 @@ def test_a_world_in_which_none_fits_is_an_error_unless_it_is_named_or_left_out(b
     rule, missions = begun(spec_of(named))
     assert rule.world_seed == {"flat": 7, "rising": 5}
     assert sum('"world_seed":7' in each for each in missions) == 6
-    assert "flat 7 (named)" in rule.describe()
+    assert "flat 7 (named)" in rule.describe(["flat", "rising"])
 
 
 def test_a_seed_of_the_mission_goes_before_the_rule(begun):
