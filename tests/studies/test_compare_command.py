@@ -142,7 +142,7 @@ def test_interrupted_and_extended_it_comes_to_the_same(flown, told, home, monkey
         (["--platform", "mine.toml"], r"mine.toml: no such file \(in setting=golden "),
         (["--detector", "gda"], "--detector: .*'gda'.* 'gad'"),
         (["--detector", ","], "--detector: .*at least one"),
-        (["--inject", ""], "--inject: .*at least one .*none, got ''"),
+        (["--inject", ""], "--inject: .*at least one target or be `none`, got ''"),
         (["--inject", "plannin"], "--inject: .*'plannin'.* 'planning'"),
         (["--world", "sparze"], "--world: .*'sparze'.* 'sparse'"),
         (["--field", "exponnt"], "--field: .*'exponnt'.* 'exponent'"),
